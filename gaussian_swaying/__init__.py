@@ -1,0 +1,1 @@
+"""Wind on captured 3D Gaussian scenes."""

@@ -1,0 +1,69 @@
+"""Checks of arguments, with one sentence that names the argument and what was expected.
+
+Shape checks are always on and never synchronise with a GPU. Value checks read the tensor, which makes a GPU wait, so
+they run only when the environment variable ``GAUSSIAN_SWAYING_CHECKS`` is 1 (the tests set it).
+"""
+
+import os
+from typing import Any
+
+import torch
+from torch import Tensor
+
+VALUE_CHECKS = os.environ.get("GAUSSIAN_SWAYING_CHECKS", "0") == "1"
+
+
+def check_shape(name: str, tensor: Tensor, *shape: int | str | None) -> None:
+    """Check the trailing dimensions of a tensor; any leading batch dimensions are accepted.
+
+    Args:
+        name: Name of the argument, for the message.
+        tensor: Tensor to check.
+        shape: Expected trailing sizes; a letter or None stands for any size.
+
+    Raises:
+        TypeError: If ``tensor`` is not a tensor.
+        ValueError: If the trailing dimensions differ, for example
+            "Expected `velocity` of shape (64, 3), but got (64, 2).".
+    """
+    if not isinstance(tensor, Tensor):
+        raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
+    actual = tuple(tensor.shape)
+    trailing = actual[len(actual) - len(shape) :] if len(actual) >= len(shape) else None
+    if trailing is None or any(isinstance(e, int) and e != a for e, a in zip(shape, trailing, strict=True)):
+        expected = ", ".join("*" if s is None else str(s) for s in shape)
+        comma = "," if len(shape) == 1 else ""
+        raise ValueError(f"Expected `{name}` of shape ({expected}{comma}), but got {actual}.")
+
+
+def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
+    """Return ``value`` as a tuple of ``length`` finite floats, or raise an error that names the field."""
+    items = value.tolist() if isinstance(value, Tensor) else value
+    if isinstance(items, (str, bytes)) or not hasattr(items, "__len__"):
+        raise TypeError(f"Expected `{name}` to be a list of {length} numbers, but got {value!r}.")
+    if len(items) != length:
+        raise ValueError(f"Expected `{name}` to have {length} numbers, but got {len(items)}: {list(items)}.")
+    result = tuple(float(item) for item in items)
+    if any(item != item or item in (float("inf"), float("-inf")) for item in result):
+        raise ValueError(f"Expected `{name}` to be finite, but got {list(result)}.")
+    return result
+
+
+def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    """Raise ValueError unless ``value`` is one of ``choices``."""
+    if value not in choices:
+        raise ValueError(f"Expected `{name}` to be one of {', '.join(choices)}, but got {value!r}.")
+
+
+def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:
+    """Raise ValueError unless ``value`` is a finite number above zero (or not below, with ``allow_zero``)."""
+    wanted = "not be negative" if allow_zero else "be positive"
+    if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
+        raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")
+
+
+def check_finite(name: str, tensor: Tensor) -> None:
+    """Raise ValueError if a value is NaN or infinite; only with ``GAUSSIAN_SWAYING_CHECKS=1``."""
+    if VALUE_CHECKS and not bool(torch.isfinite(tensor).all()):
+        count = int((~torch.isfinite(tensor)).sum())
+        raise ValueError(f"Expected `{name}` to be finite, but {count} of its values are NaN or infinite.")

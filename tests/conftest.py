@@ -1,0 +1,36 @@
+"""Fixtures and the rule for GPU tests."""
+
+import os
+
+os.environ["GAUSSIAN_SWAYING_CHECKS"] = "1"
+
+import pytest
+import torch
+
+
+def pytest_collection_modifyitems(config, items):
+    """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` tests to `-m slow`."""
+    require_gpu = os.environ.get("GS_REQUIRE_GPU") == "1"
+    marks = config.getoption("-m") or ""
+    for item in items:
+        if "gpu" in item.keywords and not torch.cuda.is_available() and not require_gpu:
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+        if "slow" in item.keywords and "slow" not in marks:
+            item.add_marker(pytest.mark.skip(reason="slow: run with -m slow"))
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    """Each device in turn."""
+    return torch.device(request.param)
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request):
+    """Each supported precision in turn."""
+    return request.param
+
+
+@pytest.fixture(autouse=True)
+def _seed():
+    torch.manual_seed(0)
