@@ -1,1 +1,1 @@
-
+"""Wind and the force it exerts on surface patches."""

@@ -1,1 +1,1 @@
-
+"""The material point method: transfers, constitutive laws, boundaries and the solver."""

@@ -1,0 +1,180 @@
+"""The force of the wind on a surface patch."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_positive, check_shape
+
+LAWS = ("paper", "projected")
+
+
+def aero_force(
+    wind: Tensor,
+    velocity: Tensor,
+    normal: Tensor,
+    area: Tensor,
+    *,
+    drag: Tensor | float,
+    friction: Tensor | float,
+    lift: Tensor | float,
+    air_density: float = 1.225,
+    law: str = "paper",
+    lift_direction: str = "side",
+    unit_tangent: bool = False,
+) -> Tensor:
+    r"""Drag, friction and lift on patches in relative wind (paper, "Aerodynamics").
+
+    .. math::
+        \mathbf{f} = \tfrac12 \rho\, v_r^2 A \bigl( C_D\, \mathbf{n} + C_F\, \mathbf{d}^t
+        + C_L\, \mathbf{d} \times \mathbf{n} \bigr), \qquad
+        \mathbf{v}_r = \mathbf{u} - \mathbf{v} = v_r \mathbf{d}, \quad
+        \mathbf{d}^t = \mathbf{d} - (\mathbf{d} \cdot \mathbf{n}) \mathbf{n}
+
+    A patch has no inside, so its normal is turned along the flow (n·d >= 0): otherwise drag could push upwind. A patch
+    exactly edge-on keeps the given sign in the ``paper`` law.
+
+    Args:
+        wind: Air velocity u [m/s], broadcastable to (..., P, 3).
+        velocity: Patch velocity v [m/s], shape (..., P, 3).
+        normal: Unit normal of either sign, shape (..., P, 3).
+        area: Patch area [m²], shape (..., P); a patch of area zero feels nothing.
+        drag: C_D.
+        friction: C_F.
+        lift: C_L.
+        air_density: Density of the air [kg/m³].
+        law: ``paper`` is literal: the full drag acts along n whatever the incidence. ``projected`` multiplies the drag
+            by n·d, as for a plate, so that it vanishes edge-on.
+        lift_direction: ``side`` is literal, d x n, a force across flow and normal; ``lift`` is (d x n) x d, in their
+            plane.
+        unit_tangent: Normalise d^t (the paper's hat can be read so) instead of the literal projection.
+
+    Returns:
+        Force [N], shape (..., P, 3).
+
+    Raises:
+        ValueError: If a shape or an option is not one of the above.
+    """
+    check_choice("law", law, LAWS)
+    check_choice("lift_direction", lift_direction, ("side", "lift"))
+    patches = velocity.shape[-2]
+    check_shape("velocity", velocity, "P", 3)
+    check_shape("normal", normal, patches, 3)
+    check_shape("area", area, patches)
+    check_shape("wind", wind, 3)
+    relative = wind.to(velocity.dtype) - velocity
+    speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
+    along = (relative * normal).sum(-1, keepdim=True)
+    sign = torch.where(along < 0, -1.0, 1.0)
+    oriented = sign * normal
+    incidence = sign * along
+    tangent = relative - along * normal
+    # each term below is v_r² times the bracket of the equation, without ever dividing by v_r
+    pressure = drag * (speed * speed if law == "paper" else speed * incidence) * oriented
+    if unit_tangent:
+        size = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
+        shear = friction * speed.square() * tangent / size.clamp(min=torch.finfo(size.dtype).tiny)
+    else:
+        shear = friction * speed * tangent
+    across = torch.linalg.cross(relative, oriented, dim=-1)
+    if lift_direction == "side":
+        lifting = lift * speed * across
+    else:
+        lifting = lift * torch.linalg.cross(across, relative, dim=-1)
+    return (0.5 * air_density) * area[..., None] * (pressure + shear + lifting)
+
+
+def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: float, air_density: float) -> Tensor:
+    r"""Rate :math:`\rho A C v_r / m` [1/s] at which drag changes a patch's velocity; explicit steps need dt < 2 / rate.
+
+    Args:
+        speed: Relative speed [m/s], shape (..., P).
+        area: Patch area [m²], shape (..., P).
+        mass: Mass [kg], shape (..., P).
+        coefficient: Sum of the coefficients.
+        air_density: Density of the air [kg/m³].
+
+    Returns:
+        Shape (..., P).
+    """
+    return air_density * coefficient * area * speed / mass
+
+
+class AeroForce(nn.Module):
+    """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
+
+    The paper's coefficients are visual parameters: a flat plate across the flow has C_D near 1.2, and skin friction is
+    near 0.005.
+
+    Args:
+        C_D: Drag coefficient.
+        C_F: Friction coefficient.
+        C_L: Lift coefficient.
+        air_density: Density of the air [kg/m³].
+        law: ``paper`` or ``projected``.
+        lift_direction: ``side`` or ``lift``.
+        unit_tangent: Normalise the tangential flow direction.
+
+    Example:
+        >>> aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=2.0)
+        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
+        >>> aero(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(1, 3), up, torch.ones(1))
+        tensor([[-0., -0., -9.]])
+    """
+
+    def __init__(
+        self,
+        C_D: float = 0.5,
+        C_F: float = 0.4,
+        C_L: float = 0.01,
+        air_density: float = 1.225,
+        law: str = "paper",
+        lift_direction: str = "side",
+        unit_tangent: bool = False,
+    ) -> None:
+        super().__init__()
+        check_choice("law", law, LAWS)
+        check_choice("lift_direction", lift_direction, ("side", "lift"))
+        for name, value in (("C_D", C_D), ("C_F", C_F), ("air_density", air_density)):
+            check_positive(name, value, allow_zero=True)
+        if not abs(C_L) < float("inf"):
+            raise ValueError(f"Expected `C_L` to be finite, but got {C_L}.")
+        # float64 scalars: they never lower the precision of a float64 run nor raise that of a float32 one
+        for name, value in (("C_D", C_D), ("C_F", C_F), ("C_L", C_L)):
+            self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
+        self.C_D: Tensor
+        self.C_F: Tensor
+        self.C_L: Tensor
+        self.air_density, self.law = float(air_density), law
+        self.lift_direction, self.unit_tangent = lift_direction, unit_tangent
+
+    def forward(self, wind: Tensor, velocity: Tensor, normal: Tensor, area: Tensor) -> Tensor:
+        """Force on each patch [N].
+
+        Args:
+            wind: Air velocity [m/s], broadcastable to (..., P, 3).
+            velocity: Patch velocity [m/s], shape (..., P, 3).
+            normal: Unit normal of either sign, shape (..., P, 3).
+            area: Patch area [m²], shape (..., P).
+
+        Returns:
+            Shape (..., P, 3).
+        """
+        return aero_force(
+            wind,
+            velocity,
+            normal,
+            area,
+            drag=self.C_D,
+            friction=self.C_F,
+            lift=self.C_L,
+            air_density=self.air_density,
+            law=self.law,
+            lift_direction=self.lift_direction,
+            unit_tangent=self.unit_tangent,
+        )
+
+    def extra_repr(self) -> str:
+        """Settings, for printing."""
+        return f"C_D={float(self.C_D):g}, C_F={float(self.C_F):g}, C_L={float(self.C_L):g}, law={self.law}"

@@ -1,0 +1,216 @@
+"""The wind: a flow, steady or scheduled, and modulations that make it sway and gust.
+
+Everything is a pure function of time and seed. Random samples are drawn at fixed times from a counter-based generator,
+so they do not depend on the substep, on the device, or on where a run was resumed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
+
+
+def _signed(value: int) -> int:
+    """A 64-bit pattern as the signed integer that torch stores."""
+    value &= (1 << 64) - 1
+    return value - (1 << 64) if value >= 1 << 63 else value
+
+
+def _mix(x: Tensor) -> Tensor:
+    """Finaliser of SplitMix64 (Steele, Lea & Flood 2014) on int64 tensors, with wrap-around arithmetic."""
+    x = (x ^ ((x >> 30) & ((1 << 34) - 1))) * _signed(0xBF58476D1CE4E5B9)
+    x = (x ^ ((x >> 27) & ((1 << 37) - 1))) * _signed(0x94D049BB133111EB)
+    return x ^ ((x >> 31) & ((1 << 33) - 1))
+
+
+def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tensor:
+    """Uniform numbers in (0, 1) that depend only on seed, stream, counter and lane.
+
+    Args:
+        seed: Seed of the run.
+        stream: Number of the generator within the run.
+        counter: Integers, shape (...), int64.
+        lanes: Independent numbers per counter.
+
+    Returns:
+        float64, shape (..., lanes).
+    """
+    key = _mix(torch.tensor(_signed(seed * 0x9E3779B97F4A7C15 + stream + 1), device=counter.device))
+    lane = torch.arange(lanes, device=counter.device)
+    bits = _mix(_mix(key + counter[..., None] * _signed(0x9E3779B97F4A7C15)) + lane * _signed(0xD1B54A32D192ED03))
+    return (((bits >> 11) & ((1 << 53) - 1)).double() + 0.5) / float(1 << 53)
+
+
+def counter_normal(seed: int, stream: int, counter: Tensor, lanes: int) -> Tensor:
+    """Standard normal numbers, shape (..., lanes), float64, by Box-Muller from :func:`counter_uniform`."""
+    u = counter_uniform(seed, stream, counter, 2 * lanes)
+    return (-2 * u[..., :lanes].log()).sqrt() * (2 * math.pi * u[..., lanes:]).cos()
+
+
+def sample_index(time: Tensor, interval: float) -> Tensor:
+    """Number of the sample that holds at a time [s]; a time within 1e-6 of the next sample counts as there."""
+    return torch.floor(time / interval + 1e-6).long()
+
+
+class Modulation(nn.Module):
+    """Base of all modulations: turns the velocity at a time into another one."""
+
+    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+        """Return the modulated velocity.
+
+        Args:
+            velocity: Air velocity [m/s], shape (..., 3), float64.
+            time: Time [s], shape (...), float64.
+            seed: Seed of the run.
+            stream: Place of this modulation in its WindField.
+        """
+        raise ValueError(f"{type(self).__name__} does not say how it changes the wind: override `forward`.")
+
+
+class SineSway(Modulation):
+    """Lets the largest component of the wind sway about its mean (paper, supplement, "More Details on Parameters").
+
+    Args:
+        amplitude: Amplitude as a share of the component; the paper's half.
+        period: Period [s]; the paper gives none.
+        phase: Phase at time zero [rad].
+    """
+
+    def __init__(self, amplitude: float = 0.5, period: float = 2.0, phase: float = 0.0) -> None:
+        super().__init__()
+        check_positive("amplitude", amplitude, allow_zero=True)
+        check_positive("period", period)
+        self.amplitude, self.period, self.phase = float(amplitude), float(period), float(phase)
+
+    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+        """Scale the largest component by ``1 + amplitude sin(2 pi t / period + phase)``."""
+        largest = nn.functional.one_hot(velocity.detach().abs().argmax(-1), 3)
+        sway = self.amplitude * torch.sin(2 * math.pi * time / self.period + self.phase)
+        return velocity * (1 + largest * sway[..., None])
+
+
+class UniformGust(Modulation):
+    """Multiplies the wind by 1 + U(-delta, delta) (paper, "Aerodynamics").
+
+    Args:
+        delta: Half width of the distribution; the paper gives none.
+        interval: Time between samples [s]; each holds until the next.
+    """
+
+    def __init__(self, delta: float = 0.3, interval: float = 0.04) -> None:
+        super().__init__()
+        check_positive("delta", delta, allow_zero=True)
+        check_positive("interval", interval)
+        self.delta, self.interval = float(delta), float(interval)
+
+    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+        """Scale all components by one random factor."""
+        u = counter_uniform(seed, stream, sample_index(time, self.interval), 1)
+        return velocity * (1 + self.delta * (2 * u - 1))
+
+
+class GaussianGust(Modulation):
+    """Adds N(0, std²) to each component (paper, supplement, "More Details on Parameters").
+
+    Args:
+        std: Standard deviation [m/s]; the paper's 0.3.
+        interval: Time between samples [s]; each holds until the next. The paper gives none. Drawn once per substep,
+            white noise would fade as the substep shrinks, so the samples are tied to time instead.
+    """
+
+    def __init__(self, std: float = 0.3, interval: float = 0.04) -> None:
+        super().__init__()
+        check_positive("std", std, allow_zero=True)
+        check_positive("interval", interval)
+        self.std, self.interval = float(std), float(interval)
+
+    def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
+        """Add independent noise to the three components."""
+        return velocity + self.std * counter_normal(seed, stream, sample_index(time, self.interval), 3)
+
+
+@dataclass
+class FlowKey:
+    """One entry of a schedule.
+
+    Args:
+        time: Time from which the flow holds [s].
+        flow: Air velocity [m/s], z up.
+    """
+
+    time: float
+    flow: list[float]
+
+
+class WindField(nn.Module):
+    """Air velocity over time, the same everywhere in the scene.
+
+    Args:
+        flow: Steady air velocity [m/s], z up.
+        schedule: Flow that changes in time, instead of the steady one; before the first entry its flow holds.
+        interpolation: Between entries of the schedule: ``step`` (hold) or ``linear``.
+        modulations: Sway and gusts, applied in order.
+        seed: Seed of the gusts.
+
+    Example:
+        >>> wind = WindField(flow=[2.0, 0.0, 0.0], modulations=[UniformGust(delta=0.0)])
+        >>> wind(0.5)
+        tensor([2., 0., 0.], dtype=torch.float64)
+    """
+
+    def __init__(
+        self,
+        flow: Sequence[float] = (0.0, 0.0, 0.0),
+        schedule: list[FlowKey] | None = None,
+        interpolation: str = "step",
+        modulations: Sequence[Modulation] = (),
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        check_choice("interpolation", interpolation, ("step", "linear"))
+        keys = schedule or [FlowKey(0.0, list(flow))]
+        times = [float(key.time) for key in keys]
+        if any(a >= b for a, b in zip(times, times[1:], strict=False)):
+            raise ValueError(f"Expected the times of `schedule` to increase, but got {times}.")
+        name = "schedule.flow" if schedule else "flow"
+        flows = [check_vector(name, key.flow) for key in keys]
+        self.register_buffer("times", torch.tensor(times, dtype=torch.float64))
+        self.register_buffer("flows", torch.tensor(flows, dtype=torch.float64))
+        self.times: Tensor
+        self.flows: Tensor
+        self.interpolation, self.seed = interpolation, int(seed)
+        self.modulations = nn.ModuleList(modulations)
+
+    def mean_flow(self, time: Tensor) -> Tensor:
+        """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""
+        last = self.times.numel() - 1
+        if last == 0:
+            return self.flows[0].expand(*time.shape, 3)
+        key = (torch.searchsorted(self.times, time.contiguous(), right=True) - 1).clamp(0, last)
+        if self.interpolation == "step":
+            return self.flows[key]
+        after = (key + 1).clamp(max=last)
+        span = (self.times[after] - self.times[key]).clamp(min=1e-12)
+        share = ((time - self.times[key]) / span).clamp(0, 1)[..., None]
+        return torch.lerp(self.flows[key], self.flows[after], share)
+
+    def forward(self, time: Tensor | float) -> Tensor:
+        """Air velocity at one or many times.
+
+        Args:
+            time: Time [s], shape (...), or a number.
+
+        Returns:
+            Velocity [m/s], z up, shape (..., 3), float64.
+        """
+        time = torch.as_tensor(time, dtype=torch.float64, device=self.times.device)
+        velocity = self.mean_flow(time)
+        for stream, modulation in enumerate(self.modulations):
+            velocity = modulation(velocity, time, self.seed, stream)
+        return velocity

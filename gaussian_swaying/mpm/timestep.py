@@ -1,0 +1,93 @@
+r"""The substep: how long it may be, and how many make a frame.
+
+For quadratic B-splines the sum :math:`\sum_i \nabla w_i \nabla w_i^T / w_i` of one particle is diagonal with entries
+between 4 and 6 over :math:`\Delta x^2`. With lumped masses this bounds the highest frequency of any arrangement of
+particles by that of a single one, :math:`\omega^2 \le 6 K / (\rho \Delta x^2)`, where K is the largest stiffness of the
+material against a deformation gradient of norm one; symplectic Euler is stable for :math:`\Delta t \le 2 / \omega`.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.constitutive import lame_parameters
+from gaussian_swaying.mpm.linalg import cofactor, determinant, symmetric_eigenvalues
+from gaussian_swaying.mpm.state import MaterialPoints
+
+
+def wave_speed(points: MaterialPoints, F: Tensor | None = None, *, spatial: bool = False) -> Tensor:
+    r"""Speed of the fastest elastic wave [m/s]: :math:`\sqrt{(\lambda + 2 \mu) / \rho}` at rest.
+
+    A stretched fixed-corotated material is stiffer: its Hessian holds :math:`\lambda \operatorname{cof} F \otimes
+    \operatorname{cof} F`, so lambda is multiplied by the square of the largest singular value of the cofactor matrix.
+
+    Args:
+        points: Material, shapes (..., P).
+        F: Deformation gradient, shape (..., P, 3, 3); None for the rest state.
+        spatial: Also account for the stretch of space (``updated`` formulation: waves cross a stretched cell sooner).
+
+    Returns:
+        Shape (..., P).
+    """
+    mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
+    density = points.mass / points.volume
+    if F is None:
+        return ((lam + 2 * mu) / density).sqrt()
+    cof = cofactor(F)
+    area_stretch = symmetric_eigenvalues(cof.mT @ cof)[..., 0].clamp(min=1.0)
+    squared = (lam * area_stretch + 2 * mu) / density
+    if spatial:
+        squared = squared * symmetric_eigenvalues(F.mT @ F)[..., 0].clamp(min=1.0)
+    return squared.sqrt()
+
+
+def stable_limit(points: MaterialPoints, dx: float, F: Tensor | None = None, *, spatial: bool = False) -> Tensor:
+    r"""Longest substep [s] that is stable for every arrangement of particles (see the head of this file).
+
+    :math:`K = 2 \mu + \lambda (\lVert \operatorname{cof} F \rVert^2 + |J - 1| \lVert F \rVert)`, which is
+    :math:`2 \mu + 3 \lambda` at rest.
+
+    Args:
+        points: Material, shapes (..., P).
+        dx: Grid spacing [m].
+        F: Deformation gradient, shape (..., P, 3, 3); None for the rest state.
+        spatial: As in :func:`wave_speed`.
+
+    Returns:
+        Shape (..., P).
+    """
+    mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
+    density = points.mass / points.volume
+    if F is None:
+        stiffness = 2 * mu + 3 * lam.clamp(min=0)
+    else:
+        cof = cofactor(F)
+        volume_change = (determinant(F, cof) - 1).abs()
+        norm = F.square().sum((-1, -2))
+        growth = cof.square().sum((-1, -2)) + volume_change * norm.sqrt()
+        stiffness = 2 * mu + lam.clamp(min=0) * growth
+        if spatial:
+            stiffness = stiffness * (norm / 3).clamp(min=1.0)
+    return dx * (density / stiffness).sqrt() * (2 / math.sqrt(6))
+
+
+def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
+    """Number of equal substeps in a frame.
+
+    Args:
+        frame_dt: Length of a frame [s].
+        substep: Longest allowed substep [s] or, with ``exact``, the wanted one.
+        exact: Round to the nearest number (``int(frame_dt / substep)`` loses a step to rounding) instead of up.
+
+    Returns:
+        At least 1.
+    """
+    ratio = frame_dt / substep
+    return max(1, round(ratio) if exact else math.ceil(ratio - 1e-6))
+
+
+def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | None) -> Tensor:
+    """Largest Courant number ``dt (c + |v|) / dx``; leave out ``velocity`` where stencils do not move."""
+    total = speed if velocity is None else speed + torch.linalg.vector_norm(velocity, dim=-1)
+    return (dt * total / dx).amax()
