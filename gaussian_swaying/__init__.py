@@ -1,1 +1,102 @@
-"""Wind on captured 3D Gaussian scenes."""
+"""Wind on captured 3D Gaussian scenes: aerodynamics on the normals and areas of Gaussians, in PyTorch.
+
+Public names are imported when they are first used, so importing the package needs torch and numpy only.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from gaussian_swaying.aero.force import AeroForce, aero_force
+    from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
+    from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
+    from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
+    from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+    from gaussian_swaying.mpm.boundary import EnclosingBox, PinnedRegion, Plane, VelocityBox
+    from gaussian_swaying.mpm.solver import MPMSolver
+    from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+    from gaussian_swaying.rendering.camera import Camera, LookAtCamera, OrbitCamera, TransformsCamera
+    from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+    from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
+    from gaussian_swaying.rendering.torch_renderer import TorchRenderer
+    from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+    from gaussian_swaying.simulation.frame import SimFrame
+    from gaussian_swaying.simulation.pipeline import SimulationPipeline
+    from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
+    from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+
+_HOMES = {
+    "aero.force": ("AeroForce", "aero_force"),
+    "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "UniformGust", "WindField"),
+    "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
+    "gaussians.selection": ("Box", "Cylinder", "Sphere"),
+    "gaussians.surface": ("GaussianSurfaceModel",),
+    "mpm.boundary": ("EnclosingBox", "PinnedRegion", "Plane", "VelocityBox"),
+    "mpm.solver": ("MPMSolver",),
+    "mpm.state": ("GridSpec", "MPMState", "MaterialPoints"),
+    "rendering.camera": ("Camera", "LookAtCamera", "OrbitCamera", "TransformsCamera"),
+    "rendering.gsplat_renderer": ("GsplatRenderer",),
+    "rendering.shading": ("DiffuseShader", "PhongShader"),
+    "rendering.torch_renderer": ("TorchRenderer",),
+    "simulation.diagnostics": ("SimulationDiverged",),
+    "simulation.frame": ("SimFrame",),
+    "simulation.pipeline": ("SimulationPipeline",),
+    "simulation.recorder": ("Recorder", "load_trajectory"),
+    "simulation.scene": ("Material", "Scene", "SimulatedScene"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "AeroForce",
+    "Box",
+    "Camera",
+    "Cylinder",
+    "DiffuseShader",
+    "EnclosingBox",
+    "FlowKey",
+    "GaussianCloud",
+    "GaussianGust",
+    "GaussianSurfaceModel",
+    "GridSpec",
+    "GsplatRenderer",
+    "LookAtCamera",
+    "MPMSolver",
+    "MPMState",
+    "Material",
+    "MaterialPoints",
+    "OrbitCamera",
+    "PhongShader",
+    "PinnedRegion",
+    "Plane",
+    "Recorder",
+    "Scene",
+    "SimFrame",
+    "SimulatedScene",
+    "SimulationDiverged",
+    "SimulationPipeline",
+    "SineSway",
+    "Sphere",
+    "TorchRenderer",
+    "TransformsCamera",
+    "UniformGust",
+    "VelocityBox",
+    "WindField",
+    "aero_force",
+    "load_trajectory",
+    "read_ply",
+    "write_ply",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

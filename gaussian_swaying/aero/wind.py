@@ -7,6 +7,7 @@ so they do not depend on the substep, on the device, or on where a run was resum
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -58,9 +59,10 @@ def sample_index(time: Tensor, interval: float) -> Tensor:
     return torch.floor(time / interval + 1e-6).long()
 
 
-class Modulation(nn.Module):
+class Modulation(nn.Module, ABC):
     """Base of all modulations: turns the velocity at a time into another one."""
 
+    @abstractmethod
     def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
         """Return the modulated velocity.
 
@@ -70,7 +72,6 @@ class Modulation(nn.Module):
             seed: Seed of the run.
             stream: Place of this modulation in its WindField.
         """
-        raise ValueError(f"{type(self).__name__} does not say how it changes the wind: override `forward`.")
 
 
 class SineSway(Modulation):

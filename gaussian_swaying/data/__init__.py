@@ -1,1 +1,1 @@
-
+"""Scenes made in code and readers of other people's data."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -15,14 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-
-
-class RegionLike(Protocol):
-    """Anything that tells which points it contains (``gaussian_swaying.gaussians.selection``)."""
-
-    def contains(self, points: Tensor) -> Tensor:
-        """Whether each point (..., 3) lies inside; bool, shape (...)."""
-        ...
+from gaussian_swaying.gaussians.selection import Region
 
 
 class FrameLike(Protocol):
@@ -41,10 +35,10 @@ class FrameLike(Protocol):
         ...
 
 
-class RegionInFrame:
+class RegionInFrame(Region):
     """A region given in scene units, asked about points in metres."""
 
-    def __init__(self, region: RegionLike, frame: FrameLike) -> None:
+    def __init__(self, region: Region, frame: FrameLike) -> None:
         self.region, self.frame = region, frame
 
     def contains(self, points: Tensor) -> Tensor:
@@ -81,7 +75,7 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
     return tangential + (along - removed) * normal
 
 
-class Boundary(nn.Module):
+class Boundary(nn.Module, ABC):
     """Base of all conditions.
 
     Args:
@@ -115,6 +109,7 @@ class Boundary(nn.Module):
         """Whether the condition acts at a time [s]; scalar bool tensor, so that no GPU has to wait."""
         return (time >= self.start) & (time < self.end)
 
+    @abstractmethod
     def forward(self, velocity: Tensor, position: Tensor | None, held: Tensor | None, time: Tensor) -> Tensor:
         """Return the node velocity (..., G, 3) [m/s] with the condition applied.
 
@@ -124,7 +119,6 @@ class Boundary(nn.Module):
             held: Nodes that the particles of the condition hold, bool, shape (..., G), if it has any.
             time: Time [s], scalar tensor.
         """
-        raise ValueError(f"{type(self).__name__} does not say what it does to the nodes: override `forward`.")
 
 
 class PinnedRegion(Boundary):
@@ -142,7 +136,7 @@ class PinnedRegion(Boundary):
     """
 
     def __init__(
-        self, region: RegionLike, held_share: float = 0.3, start: float = 0.0, end: float | None = None
+        self, region: Region, held_share: float = 0.3, start: float = 0.0, end: float | None = None
     ) -> None:
         super().__init__(start, end)
         if not 0 <= held_share < 1:
@@ -285,7 +279,7 @@ class VelocityBox(Boundary):
     needs_position = True
 
     def __init__(
-        self, region: RegionLike, velocity: Sequence[float], start: float = 0.0, end: float | None = None
+        self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None
     ) -> None:
         super().__init__(start, end)
         self.region = region

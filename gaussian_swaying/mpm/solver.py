@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -80,6 +79,7 @@ class MPMSolver(nn.Module):
         self._points: MaterialPoints | None = None
         self._static: dict[str, Tensor] = {}
         self._stencil: Stencil | None = None
+        self._grid = GridSpec(self.dx, (0, 0, 0), (0, 0, 0))
 
     # ---- the object at rest
 
@@ -134,7 +134,6 @@ class MPMSolver(nn.Module):
                     f"{share:g} of the mass of a node; enlarge `region` of the PinnedRegion or lower its `held_share`."
                 )
             self._static[f"held_{k}"] = held
-        self._static["grid_offset"] = torch.tensor(grid.offset)
         self._grid = grid
 
     def _bounding_grid(self, position: Tensor, margin: int) -> GridSpec:
@@ -329,7 +328,7 @@ class MPMSolver(nn.Module):
         if any(self.gravity):
             velocity = velocity + dt * velocity.new_tensor(self.gravity)
         if self.damping > 0:
-            velocity = velocity * torch.exp(torch.tensor(-self.damping * dt)).item()
+            velocity = velocity * math.exp(-self.damping * dt)
         return velocity
 
     def _constrain(
@@ -359,9 +358,6 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__.copy()
 
 
 def _safe_inverse(mass: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-
+"""From a scene and its settings to recorded frames."""

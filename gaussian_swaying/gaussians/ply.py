@@ -1,0 +1,279 @@
+"""Gaussians as stored by 3D Gaussian Splatting, and the binary .ply file that holds them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_shape
+
+_DEGREE_OF_COEFFICIENTS = {1: 0, 4: 1, 9: 2, 16: 3}
+_MEANS = ("x", "y", "z")
+_NORMALS = ("nx", "ny", "nz")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
+_OPAQUE_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, as opaque as float32 tells apart from 1
+
+
+@dataclass(frozen=True, slots=True)
+class GaussianCloud:
+    """3D Gaussians in storage form, as a 3DGS .ply file holds them.
+
+    Attributes:
+        means: Centres [scene units], shape (N, 3).
+        quats: Rotations as quaternions wxyz, not normalised, shape (N, 4).
+        scales: Natural logarithm of the standard deviations [scene units] along the axes, shape (N, 3).
+        opacities: Logit of the opacity, shape (N,).
+        sh: Spherical harmonics coefficients of the colour, constant first, shape (N, K, 3) with K = 1, 4, 9 or 16.
+        normals: Surface normals that came with the Gaussians, shape (N, 3), or None.
+
+    Raises:
+        ValueError: If a tensor does not have the shape above.
+        TypeError: If one is not a tensor.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    normals: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_shape("means", self.means, None, 3)
+        count = self.means.shape[0]
+        sizes: dict[str, tuple[int | None, ...]] = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3)}
+        sizes |= {"opacities": (count,), "sh": (count, None, 3)}
+        if self.normals is not None:
+            sizes["normals"] = (count, 3)
+        for name, size in sizes.items():
+            tensor = getattr(self, name)
+            check_shape(name, tensor, *size)
+            if tensor.ndim != len(size):
+                raise ValueError(f"Expected `{name}` to have {len(size)} dimensions, but got {tuple(tensor.shape)}.")
+        if self.sh.shape[1] not in _DEGREE_OF_COEFFICIENTS:
+            raise ValueError(f"Expected `sh` to have 1, 4, 9 or 16 coefficients, but got {self.sh.shape[1]}.")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return _DEGREE_OF_COEFFICIENTS[self.sh.shape[1]]
+
+    def to(self, *args: Any, **kwargs: Any) -> GaussianCloud:
+        """Copy with every tensor moved or cast by :meth:`torch.Tensor.to`."""
+        return GaussianCloud(*(None if t is None else t.to(*args, **kwargs) for t in self._tensors()))
+
+    def select(self, mask: Tensor) -> GaussianCloud:
+        """The Gaussians that a boolean mask (N,) or an index tensor (M,) picks."""
+        if mask.dtype == torch.bool:
+            check_shape("mask", mask, len(self))
+        return GaussianCloud(*(None if t is None else t[mask] for t in self._tensors()))
+
+    def _tensors(self) -> list[Any]:
+        return [getattr(self, field.name) for field in dataclasses.fields(self)]
+
+
+def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
+    """Read a binary 3D Gaussian Splatting .ply file.
+
+    Takes the layout of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering") with its
+    properties in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to
+    3. Normals that are all zero, as most tools write them, count as none. An opacity of exactly 0 or 1, stored as an
+    infinite logit, becomes a logit of -16 or 16 with a warning.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The Gaussians as float32 tensors on the CPU.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is not a usable 3DGS file; the message names the file, the field and the remedy.
+
+    Warns:
+        UserWarning: Once, naming the properties that were ignored; once, if infinite opacity logits were replaced.
+    """
+    path = Path(path)
+    data = _read_vertices(path)
+    names = data.dtype.names or ()
+    if "packed_position" in names:
+        raise ValueError(f"{path} is a compressed .ply; export it as an uncompressed 3DGS .ply.")
+    for name in _REQUIRED:
+        if name not in names:
+            raise ValueError(
+                f"{path} has no property `{name}`, so it is not a 3D Gaussian Splatting file; export it from a 3DGS tool."
+            )
+    rest = _rest_names(path, names)
+    has_normals = all(name in names for name in _NORMALS)
+    known = {*_REQUIRED, *rest, *(_NORMALS if has_normals else ())}
+    ignored = [name for name in names if name not in known]
+    if ignored:
+        warnings.warn(f"{path}: ignored the properties {', '.join(ignored)}.", UserWarning, stacklevel=2)
+    if len(data) == 0:
+        raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
+
+    def columns(fields: tuple[str, ...]) -> np.ndarray:
+        table = np.empty((len(data), len(fields)), dtype=np.float32)
+        for index, field in enumerate(fields):
+            if data.dtype[field].hasobject:
+                raise ValueError(f"{path}: property `{field}` is a list; export it as one float per Gaussian.")
+            with np.errstate(over="ignore"):
+                table[:, index] = data[field]
+        bad = ~np.isfinite(table)
+        if bad.any():
+            column = int(bad.any(axis=0).argmax())
+            first, total = int(bad[:, column].argmax()), int(bad[:, column].sum())
+            raise ValueError(
+                f"{path}: property `{fields[column]}` is NaN or infinite for {total} of {len(data)} Gaussians, first at "
+                f"index {first}; remove them or train again."
+            )
+        return table
+
+    opacities = _read_opacities(path, data)
+    means, quats, scales = columns(_MEANS), columns(_QUATS), columns(_SCALES)
+    with np.errstate(over="ignore", under="ignore"):
+        size = np.exp(scales)
+    _reject(
+        path,
+        ((size == 0) | ~np.isfinite(size)).any(axis=1),
+        "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
+        "remove them or store the logarithm of the size",
+    )
+    with np.errstate(under="ignore"):
+        zero_quats = np.square(quats).sum(axis=1) == 0
+    _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
+    sh = columns(_DC)[:, None, :]
+    if rest:
+        sh = np.concatenate([sh, columns(rest).reshape(len(data), 3, -1).transpose(0, 2, 1)], axis=1)
+    normals = columns(_NORMALS) if has_normals else None
+    if normals is not None and not normals.any():
+        normals = None
+    return GaussianCloud(
+        means=torch.from_numpy(means),
+        quats=torch.from_numpy(quats),
+        scales=torch.from_numpy(scales),
+        opacities=torch.from_numpy(opacities),
+        sh=torch.from_numpy(np.ascontiguousarray(sh)),
+        normals=None if normals is None else torch.from_numpy(normals),
+    )
+
+
+def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
+    """Write Gaussians as a binary little-endian 3DGS .ply file, with the properties in their usual order.
+
+    The file appears under its name only when it is complete. Values are stored as float32, so reading the file gives
+    a float32 cloud back exactly. Without normals in the cloud, those of the smallest axes are written.
+
+    Args:
+        path: File to write; an existing one is replaced.
+        cloud: Gaussians to write.
+
+    Raises:
+        FileNotFoundError: If the folder does not exist.
+        ValueError: If the cloud is empty.
+    """
+    from plyfile import PlyData, PlyElement
+
+    from gaussian_swaying.gaussians.surface import smallest_axis_normal
+
+    path = Path(path)
+    if len(cloud) == 0:
+        raise ValueError(f"{path} was not written because the cloud holds zero Gaussians; select at least one.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
+    normals = smallest_axis_normal(cloud.quats, cloud.scales) if cloud.normals is None else cloud.normals
+    count, rest_count = len(cloud), 3 * (cloud.sh.shape[1] - 1)
+    parts = [cloud.means, normals, cloud.sh[:, 0], cloud.sh[:, 1:].transpose(1, 2).reshape(count, rest_count)]
+    parts += [cloud.opacities[:, None], cloud.scales, cloud.quats]
+    table = torch.cat([part.detach().to("cpu", torch.float32) for part in parts], dim=1).contiguous().numpy()
+    rest = tuple(f"f_rest_{index}" for index in range(rest_count))
+    names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
+    rows = table.astype("<f4", copy=False).view([(name, "<f4") for name in names]).reshape(count)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read_vertices(path: Path) -> np.ndarray:
+    """The vertex table of a binary .ply file as a structured array, or an error that names what is wrong."""
+    from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; check the path of the .ply file.")
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory; give the .ply file inside it, such as point_cloud.ply.")
+    with path.open("rb") as stream:
+        head = stream.read(256)
+    if not re.match(rb"ply\r?\n", head):
+        raise ValueError(f"{path} is not a .ply file (it does not start with `ply`); export the scene as .ply.")
+    if re.search(rb"^format ascii", head, re.MULTILINE):
+        raise ValueError(f"{path} is an ASCII .ply (format ascii); export as binary.")
+    try:
+        ply = PlyData.read(str(path))
+    except PlyElementParseError as error:
+        raise ValueError(f"{path} is truncated: {error}; copy or export the file again.") from error
+    except (PlyHeaderParseError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} has a broken .ply header: {error}; export the file again.") from error
+    if "vertex" not in ply:
+        found = ", ".join(element.name for element in ply.elements) or "none"
+        raise ValueError(f"{path} has no element `vertex` (elements: {found}); export it from a 3DGS tool.")
+    data: np.ndarray = ply["vertex"].data
+    return data
+
+
+def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The f_rest properties in order, once their number is known to be that of a degree from 0 to 3."""
+    found = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
+    if len(found) not in (0, 9, 24, 45):
+        raise ValueError(
+            f"{path} has {len(found)} properties `f_rest_*`, but spherical harmonics of degree 0, 1, 2 or 3 have 0, 9, 24 "
+            "or 45; export it with one of these degrees."
+        )
+    rest = tuple(f"f_rest_{index}" for index in range(len(found)))
+    for name in rest:
+        if name not in found:
+            raise ValueError(f"{path} has no property `{name}` among its {len(found)} `f_rest_*`; export it again.")
+    return rest
+
+
+def _read_opacities(path: Path, data: np.ndarray) -> np.ndarray:
+    """Opacity logits (N,) with infinite ones, that is opacities of exactly 0 or 1, made finite."""
+    with np.errstate(over="ignore"):
+        logits = np.array(data["opacity"], dtype=np.float32)
+    _reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")
+    infinite = np.isinf(logits)
+    if infinite.any():
+        logits[infinite] = np.copysign(np.float32(_OPAQUE_LOGIT), logits[infinite])
+        warnings.warn(
+            f"{path}: property `opacity` is infinite for {int(infinite.sum())} of {len(data)} Gaussians (an opacity of "
+            f"exactly 0 or 1), first at index {int(infinite.argmax())}; read as logits of ±{_OPAQUE_LOGIT:g}.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return logits
+
+
+def _reject(path: Path, bad: np.ndarray, what: str, remedy: str) -> None:
+    """Raise ValueError if any Gaussian of the mask (N,) is bad."""
+    if bad.any():
+        raise ValueError(
+            f"{path}: {what} for {int(bad.sum())} of {len(bad)} Gaussians, first at index {int(bad.argmax())}; {remedy}."
+        )

@@ -1,0 +1,229 @@
+"""Which Gaussians move: regions of space, in scene units, and a threshold on opacity."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape, check_vector
+
+
+class Region(ABC):
+    """A part of space. Subclasses can be named in a configuration."""
+
+    @abstractmethod
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+
+
+class Everything(Region):
+    """All of space."""
+
+    def __repr__(self) -> str:
+        return "Everything()"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
+
+
+class Box(Region):
+    """A box with sides along the axes, its faces included.
+
+    Args:
+        min: Lower corner [scene units], 3 numbers; null leaves that side open.
+        max: Upper corner [scene units], 3 numbers; null leaves that side open.
+
+    Raises:
+        ValueError: If a corner has not 3 finite numbers, or ``min`` is not below ``max`` along an axis.
+        TypeError: If a corner is not a list.
+    """
+
+    def __init__(self, min: Sequence[float | None], max: Sequence[float | None]) -> None:
+        self.min = _corner("min", min, -float("inf"))
+        self.max = _corner("max", max, float("inf"))
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if not low < high:
+                raise ValueError(f"Expected `min` to be below `max` of the box along {axis}, but got {low} and {high}.")
+
+    def __repr__(self) -> str:
+        return f"Box(min={list(self.min)}, max={list(self.max)})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        return ((points >= points.new_tensor(self.min)) & (points <= points.new_tensor(self.max))).all(-1)
+
+
+class Sphere(Region):
+    """A ball, its surface included.
+
+    Args:
+        center: Centre [scene units], 3 numbers.
+        radius: Radius [scene units], above zero.
+
+    Raises:
+        ValueError: If ``center`` has not 3 finite numbers or ``radius`` is not positive.
+        TypeError: If ``center`` is not a list.
+    """
+
+    def __init__(self, center: Sequence[float], radius: float) -> None:
+        self.center = check_vector("center", center)
+        check_positive("radius", radius)
+        self.radius = float(radius)
+
+    def __repr__(self) -> str:
+        return f"Sphere(center={list(self.center)}, radius={self.radius})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        return (points - points.new_tensor(self.center)).square().sum(-1) <= self.radius**2
+
+
+class Cylinder(Region):
+    """A straight round cylinder, its surface included.
+
+    Args:
+        center: Middle of its axis [scene units], 3 numbers.
+        axis: Direction of its axis, 3 numbers of any length above zero.
+        radius: Radius [scene units], above zero.
+        height: Length along the axis [scene units], above zero; half of it lies on each side of ``center``.
+
+    Raises:
+        ValueError: If a vector has not 3 finite numbers, ``axis`` is zero, or a size is not positive.
+        TypeError: If a vector is not a list.
+    """
+
+    def __init__(self, center: Sequence[float], axis: Sequence[float], radius: float, height: float) -> None:
+        self.center = check_vector("center", center)
+        direction = check_vector("axis", axis)
+        length = sum(component**2 for component in direction) ** 0.5
+        if length == 0:
+            raise ValueError(f"Expected `axis` to have a length above zero, but got {list(direction)}.")
+        self.axis = tuple(component / length for component in direction)
+        check_positive("radius", radius)
+        check_positive("height", height)
+        self.radius, self.height = float(radius), float(height)
+
+    def __repr__(self) -> str:
+        return (
+            f"Cylinder(center={list(self.center)}, axis={list(self.axis)}, radius={self.radius}, height={self.height})"
+        )
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        axis = points.new_tensor(self.axis)
+        offset = points - points.new_tensor(self.center)
+        along = (offset * axis).sum(-1)
+        across = (offset - along[..., None] * axis).square().sum(-1)
+        return (along.abs() <= 0.5 * self.height) & (across <= self.radius**2)
+
+
+class Union(Region):
+    """What lies in at least one of several regions.
+
+    Args:
+        regions: Regions to join, at least one.
+
+    Raises:
+        ValueError: If the list is empty.
+        TypeError: If an entry is not a region.
+    """
+
+    def __init__(self, regions: list[Region]) -> None:
+        if not isinstance(regions, (list, tuple)):
+            raise TypeError(f"Expected `regions` to be a list of regions, but got {type(regions).__name__}.")
+        if not regions:
+            raise ValueError("Expected `regions` to hold at least one region, but got an empty list.")
+        for region in regions:
+            _check_region("regions", region)
+        self.regions = list(regions)
+
+    def __repr__(self) -> str:
+        return f"Union(regions={self.regions})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        inside = self.regions[0].contains(points)
+        for region in self.regions[1:]:
+            inside = inside | region.contains(points)
+        return inside
+
+
+class Not(Region):
+    """All of space outside a region.
+
+    Args:
+        region: Region to leave out.
+
+    Raises:
+        TypeError: If ``region`` is not a region.
+    """
+
+    def __init__(self, region: Region) -> None:
+        _check_region("region", region)
+        self.region = region
+
+    def __repr__(self) -> str:
+        return f"Not(region={self.region})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        return ~self.region.contains(points)
+
+
+def select_simulated(
+    means: Tensor, opacities: Tensor, region: Region | None = None, opacity_threshold: float = 0.02
+) -> Tensor:
+    """Choose the Gaussians to simulate: those in a region that are not nearly transparent.
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        opacities: Opacities from 0 to 1, after the sigmoid, shape (N,).
+        region: Part of space to simulate; None for all of it.
+        opacity_threshold: Smallest opacity to simulate, 0 to 1.
+
+    Returns:
+        Booleans, shape (N,).
+
+    Raises:
+        ValueError: If no Gaussian is selected, or an argument does not have the shape or range above.
+    """
+    check_shape("means", means, None, 3)
+    check_shape("opacities", opacities, means.shape[0])
+    if not 0 <= opacity_threshold <= 1:
+        raise ValueError(f"Expected `opacity_threshold` to lie from 0 to 1, but got {opacity_threshold}.")
+    if means.shape[0] == 0:
+        raise ValueError("Expected `means` to hold at least one Gaussian, but got none.")
+    region = Everything() if region is None else region
+    inside = region.contains(means)
+    selected = inside & (opacities >= opacity_threshold)
+    if not bool(selected.any()):
+        low, high = ([round(v, 4) for v in t.tolist()] for t in (means.amin(0).double(), means.amax(0).double()))
+        raise ValueError(
+            f"No Gaussian is selected: the {means.shape[0]} centres span {low} to {high}, {int(inside.sum())} lie in "
+            f"{region!r}, and none of these reaches the opacity threshold {opacity_threshold}; move the region into "
+            f"these bounds or lower the threshold (the largest opacity is {float(opacities.max()):.3g})."
+        )
+    return selected
+
+
+def _corner(name: str, values: Sequence[float | None], unbounded: float) -> tuple[float, ...]:
+    """A corner as 3 floats, with ``unbounded`` in place of None."""
+    if isinstance(values, Tensor):
+        values = values.tolist()
+    if isinstance(values, (str, bytes)) or not hasattr(values, "__len__"):
+        raise TypeError(f"Expected `{name}` to be a list of 3 numbers or nulls, but got {values!r}.")
+    finite = check_vector(name, [0.0 if value is None else value for value in values])
+    return tuple(unbounded if value is None else item for value, item in zip(values, finite, strict=True))
+
+
+def _check_region(name: str, region: Region) -> None:
+    if not isinstance(region, Region) or isinstance(region, type):
+        raise TypeError(f"Expected `{name}` to be a Region, but got {region!r}.")

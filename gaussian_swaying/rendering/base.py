@@ -1,0 +1,95 @@
+"""What every renderer takes and returns."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.rendering.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderOutput:
+    r"""Picture of a Gaussian scene.
+
+    With the weights :math:`w_k = T_k \alpha_k` of the Gaussians at a pixel, from front to back:
+
+    Attributes:
+        color: :math:`\sum_k w_k c_k`, plus the background times :math:`1 - \sum_k w_k`, shape (H, W, 3).
+        alpha: Opacity :math:`\sum_k w_k`, shape (H, W, 1).
+        depth: Accumulated depth :math:`\sum_k w_k z_k` [scene units], shape (H, W, 1). Divide by ``alpha`` for the
+            expected depth.
+    """
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+class Renderer(Protocol):
+    """Draws Gaussians with explicit covariances."""
+
+    def __call__(
+        self,
+        means: Tensor,
+        covariances: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one picture.
+
+        Args:
+            means: Centres [scene units], shape (N, 3).
+            covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
+            opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
+            colors: Colours as they are to be seen (no spherical harmonics), shape (N, 3).
+            camera: The camera, on any device and in any precision.
+            background: Colour behind the Gaussians, shape (3,); black when None.
+
+        Returns:
+            The picture, on the device and in the precision of ``means``. A Gaussian that is not finite is not drawn.
+        """
+        ...
+
+
+def make_renderer(device: torch.device | str) -> Renderer:
+    """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise."""
+    if torch.device(device).type == "cuda" and torch.cuda.is_available():
+        from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+
+        return GsplatRenderer()
+    from gaussian_swaying.rendering.torch_renderer import TorchRenderer
+
+    return TorchRenderer()
+
+
+def check_gaussians(
+    means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor, background: Tensor | None
+) -> None:
+    """Raise TypeError or ValueError unless the arguments of a :class:`Renderer` have the documented shapes."""
+    count = means.shape[0] if isinstance(means, Tensor) and means.dim() == 2 else "N"
+    wanted: tuple[tuple[str, Tensor | None, tuple[int | str, ...]], ...] = (
+        ("means", means, (count, 3)),
+        ("covariances", covariances, (count, 3, 3)),
+        ("opacities", opacities, (count,)),
+        ("colors", colors, (count, 3)),
+        ("background", background, (3,)),
+    )
+    for name, tensor, shape in wanted:
+        if name == "background" and tensor is None:
+            continue
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
+        actual = tuple(tensor.shape)
+        if len(actual) != len(shape) or any(isinstance(s, int) and s != a for s, a in zip(shape, actual, strict=True)):
+            expected = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
+            raise ValueError(f"Expected `{name}` of shape ({expected}), but got {actual}.")
+
+
+def finite_gaussians(means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+    """Return which Gaussians have only finite values, shape (N,), without a wait for the GPU."""
+    finite = torch.isfinite(means).all(-1) & torch.isfinite(covariances).flatten(-2).all(-1)
+    return finite & torch.isfinite(opacities) & torch.isfinite(colors).all(-1)

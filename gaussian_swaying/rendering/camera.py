@@ -1,0 +1,535 @@
+"""Pinhole cameras in the OpenCV convention, and the camera paths that a configuration can name."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape, check_vector
+
+
+def _check_pixels(name: str, value: Any) -> int:
+    """Return ``value`` if it is a positive integer, or raise an error that names the field."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"Expected `{name}` to be a whole number of pixels, but got {value!r}.")
+    if value <= 0:
+        raise ValueError(f"Expected `{name}` to be a positive number of pixels, but got {value}.")
+    return value
+
+
+def _check_fov(name: str, value: float) -> float:
+    """Return ``value`` if it is a field of view in degrees, or raise an error that names the field."""
+    if not 0.0 < value < 180.0:
+        raise ValueError(f"Expected `{name}` to be between 0 and 180 degrees (both excluded), but got {value}.")
+    return float(value)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """Pinhole camera in the OpenCV convention: x to the right, y down, z forward.
+
+    The centre of the pixel in row i and column j is at (j + 0.5, i + 0.5).
+
+    Attributes:
+        world_to_camera: Matrix that takes world points to camera points [scene units], shape (4, 4).
+        intrinsics: Matrix with fx, fy, cx, cy [pixels], shape (3, 3). Skew is ignored.
+        width: Image width [pixels].
+        height: Image height [pixels].
+        near: Gaussians whose centre has a smaller depth are not drawn [scene units].
+
+    Raises:
+        TypeError: If a matrix is not a tensor or the image size is not an integer.
+        ValueError: If a matrix has another shape, or the image size or ``near`` is not positive.
+    """
+
+    world_to_camera: Tensor
+    intrinsics: Tensor
+    width: int
+    height: int
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_shape("world_to_camera", self.world_to_camera, 4, 4)
+        check_shape("intrinsics", self.intrinsics, 3, 3)
+        _check_pixels("width", self.width)
+        _check_pixels("height", self.height)
+        check_positive("near", self.near)
+
+    @property
+    def position(self) -> Tensor:
+        """Eye in world coordinates [scene units], shape (3,)."""
+        inverse, _ = torch.linalg.inv_ex(self.world_to_camera)
+        return inverse[:3, 3]
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Camera":
+        """Return the camera with its matrices on another device or in another precision."""
+        return replace(
+            self,
+            world_to_camera=self.world_to_camera.to(device=device, dtype=dtype),
+            intrinsics=self.intrinsics.to(device=device, dtype=dtype),
+        )
+
+
+def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
+    """Minimal rotation that takes +z to ``up``; its transpose takes ``up`` to +z.
+
+    For the one direction where the minimal rotation is not unique, (0, 0, -1), it is the half turn about x.
+
+    Args:
+        up: Direction of any length, shape (3,).
+
+    Returns:
+        Rotation matrix in float64 on the CPU, shape (3, 3).
+
+    Raises:
+        ValueError: If ``up`` is zero or not finite.
+    """
+    x, y, z = _unit("up", up).tolist()
+    if z < -1.0 + 1e-12:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    f = 1.0 / (1.0 + z)  # Rodrigues' formula with axis (-y, x, 0) and cosine z
+    rows = [[1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _vector(name: str, value: Sequence[float] | Tensor) -> Tensor:
+    """Return a checked 3-vector in float64 on the CPU."""
+    return torch.tensor(check_vector(name, value), dtype=torch.float64)
+
+
+def _unit(name: str, value: Sequence[float] | Tensor) -> Tensor:
+    """Return a checked 3-vector of length one in float64 on the CPU."""
+    vector = _vector(name, value)
+    length = float(vector.norm())
+    if length < 1e-12:
+        raise ValueError(f"Expected `{name}` to be a direction, but got the zero vector.")
+    return vector / length
+
+
+def look_at_camera(
+    eye: Sequence[float] | Tensor,
+    target: Sequence[float] | Tensor,
+    up: Sequence[float] | Tensor,
+    fov_y_degrees: float,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    *,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype | None = None,
+) -> Camera:
+    """Camera at ``eye`` that has ``target`` at the image centre and ``up`` towards the top of the image.
+
+    Args:
+        eye: Position of the camera [scene units], shape (3,).
+        target: Point seen at the image centre [scene units], shape (3,).
+        up: Direction seen upwards in the image, any length, shape (3,).
+        fov_y_degrees: Vertical field of view [degrees]. Pixels are square.
+        width: Image width [pixels].
+        height: Image height [pixels].
+        near: Near plane [scene units].
+        device: Device of the matrices.
+        dtype: Precision of the matrices; the default precision of torch when None.
+
+    Returns:
+        The camera.
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If ``eye`` and ``target`` coincide, ``up`` is zero or along the line of sight, or a number is
+            out of range.
+
+    Example:
+        >>> look_at_camera((0, -2, 0), (0, 0, 0), (0, 0, 1), 40.0, 480, 270).position[1]
+        tensor(-2.)
+    """
+    width, height = _check_pixels("width", width), _check_pixels("height", height)
+    tangent = math.tan(math.radians(0.5 * _check_fov("fov_y_degrees", fov_y_degrees)))
+    eye_point, up_axis = _vector("eye", eye), _unit("up", up)
+    forward = _vector("target", target) - eye_point
+    distance = float(forward.norm())
+    if distance < 1e-12:
+        raise ValueError(f"Expected `eye` and `target` to differ, but both are {eye_point.tolist()}.")
+    forward = forward / distance
+    right = torch.linalg.cross(forward, up_axis)
+    if float(right.norm()) < 1e-6:
+        raise ValueError(f"Expected `up` not to lie along the line of sight, but got {up_axis.tolist()}.")
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    world_to_camera = torch.eye(4, dtype=torch.float64)
+    world_to_camera[:3, :3] = rotation
+    world_to_camera[:3, 3] = -(rotation @ eye_point) + 0.0  # + 0.0 turns -0.0 into 0.0
+    focal = 0.5 * height / tangent
+    intrinsics = torch.tensor(
+        [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
+    camera = Camera(world_to_camera, intrinsics, width, height, near)
+    return camera.to(device, dtype or torch.get_default_dtype())
+
+
+def orbit_camera(
+    center: Sequence[float] | Tensor,
+    up: Sequence[float] | Tensor,
+    radius: float,
+    azimuth_degrees: float,
+    elevation_degrees: float,
+    fov_y_degrees: float,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    *,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype | None = None,
+) -> Camera:
+    """Camera on a sphere around ``center`` that looks at ``center``.
+
+    Azimuth turns counter-clockwise about ``up``. For ``up = (0, 0, 1)`` the eye is on the +x side at azimuth 0, the
+    +y side at 90 and the -y side at -90. For any other ``up`` these directions are carried along by the minimal
+    rotation that takes +z to ``up`` (:func:`rotation_from_z`): for ``up = (0, -1, 0)`` the eye is on the +x side at
+    azimuth 0, the +z side at 90 and the -z side at -90.
+
+    Args:
+        center: Centre of the sphere [scene units], shape (3,).
+        up: Direction seen upwards in the image, any length, shape (3,).
+        radius: Distance of the eye from ``center`` [scene units].
+        azimuth_degrees: Angle about ``up`` [degrees].
+        elevation_degrees: Angle above the plane across ``up`` [degrees], between -90 and 90 (both excluded).
+        fov_y_degrees: Vertical field of view [degrees].
+        width: Image width [pixels].
+        height: Image height [pixels].
+        near: Near plane [scene units].
+        device: Device of the matrices.
+        dtype: Precision of the matrices; the default precision of torch when None.
+
+    Returns:
+        The camera.
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a number is out of range.
+    """
+    check_positive("radius", radius)
+    _check_elevation("elevation_degrees", elevation_degrees)
+    azimuth, elevation = math.radians(azimuth_degrees), math.radians(elevation_degrees)
+    horizontal = math.cos(elevation)
+    local = [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)]
+    offset = rotation_from_z(up) @ torch.tensor(local, dtype=torch.float64)
+    center_point = _vector("center", center)
+    eye = center_point + radius * offset
+    return look_at_camera(eye, center_point, up, fov_y_degrees, width, height, near, device=device, dtype=dtype)
+
+
+def _check_elevation(name: str, value: float) -> float:
+    """Return ``value`` if it is an elevation in degrees that leaves the up direction defined."""
+    if not -90.0 < value < 90.0:
+        raise ValueError(f"Expected `{name}` to be between -90 and 90 degrees (both excluded), but got {value}.")
+    return float(value)
+
+
+def camera_from_transforms(
+    path: str | Path,
+    frame: int,
+    width: int | None = None,
+    height: int | None = None,
+    near: float = 0.01,
+) -> Camera:
+    """Read one camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
+
+    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). The intrinsics come from
+    ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
+    the frame wins over the one at the top of the file. Missing ``cx`` and ``cy`` are the image centre, missing
+    ``fl_y`` makes square pixels (or comes from ``camera_angle_y``). Lens distortion (``k1``, ``p1``, ...) is ignored:
+    undistort the images first.
+
+    Args:
+        path: The file.
+        frame: Index in its list ``frames``, from 0.
+        width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
+            the one that keeps the file's aspect ratio when only ``height`` is given.
+        height: Height of the image to render [pixels], likewise.
+        near: Near plane [scene units].
+
+    Returns:
+        The camera, in the default precision of torch.
+
+    Raises:
+        TypeError: If ``frame``, ``width`` or ``height`` is not an integer.
+        ValueError: If the file is missing, is not JSON, lacks a field or has a bad one. The message names the file,
+            the field and the remedy.
+    """
+    where = f"`{path}`"
+    if isinstance(frame, bool) or not isinstance(frame, int):
+        raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
+    for name, size in (("width", width), ("height", height)):
+        if size is not None:
+            _check_pixels(name, size)
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"Cannot read the camera file {where} ({error.strerror}): check `path`.") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"The camera file {where} is not valid JSON ({error}): export it again.") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
+        raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")
+    if not 0 <= frame < len(frames):
+        raise ValueError(f"The camera file {where} has no frame {frame}: set `frame` between 0 and {len(frames) - 1}.")
+    fields = {**data, **frames[frame]}
+    pixels = _read_intrinsics(where, fields, width, height)
+    native_width, native_height, fx, fy, cx, cy = pixels
+    if width is None and height is None:
+        width, height = round(native_width), round(native_height)
+    elif width is None and height is not None:
+        width = max(1, round(height * native_width / native_height))
+    elif width is not None and height is None:
+        height = max(1, round(width * native_height / native_width))
+    assert width is not None
+    assert height is not None
+    scale_x, scale_y = width / native_width, height / native_height
+    intrinsics = torch.tensor(
+        [[fx * scale_x, 0.0, cx * scale_x], [0.0, fy * scale_y, cy * scale_y], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
+    camera_to_world = _read_matrix(where, frame, frames[frame])
+    world_to_camera = torch.linalg.inv(camera_to_world)
+    return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
+
+
+def _read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
+    """Return a finite number of a transforms.json, or None if the field is missing."""
+    value = fields.get(name)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"The field `{name}` of the camera file {where} is {value!r}: set it to a number.")
+    return float(value)
+
+
+def _read_intrinsics(
+    where: str, fields: dict[str, Any], width: int | None, height: int | None
+) -> tuple[float, float, float, float, float, float]:
+    """Return width, height, fx, fy, cx, cy [pixels] at the resolution of a transforms.json."""
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+    w, h, fx, fy, cx, cy, angle_x, angle_y = (_read_number(where, fields, name) for name in names)
+    if fx is not None and (w is None or h is None):
+        raise ValueError(f"The camera file {where} has `fl_x` but no `w` and `h`: add the size of its images [pixels].")
+    w = float(width) if w is None and width is not None else w
+    h = float(height) if h is None and height is not None else h
+    if w is None or h is None:
+        raise ValueError(f"The camera file {where} has no image size `w` and `h`: set both `width` and `height`.")
+    for name, angle in (("camera_angle_x", angle_x), ("camera_angle_y", angle_y)):
+        if angle is not None and not 0.0 < angle < math.pi:
+            raise ValueError(
+                f"The field `{name}` of the camera file {where} is {angle}: set it in radians, above 0 and below pi."
+            )
+    if fx is None and angle_x is None:
+        raise ValueError(
+            f"The camera file {where} has no focal length: add `fl_x` [pixels] or `camera_angle_x` [radians]."
+        )
+    if fx is None and angle_x is not None:
+        fx = 0.5 * w / math.tan(0.5 * angle_x)
+    assert fx is not None
+    if fy is None:
+        fy = fx if angle_y is None else 0.5 * h / math.tan(0.5 * angle_y)
+    for name, value in (("w", w), ("h", h), ("fl_x", fx), ("fl_y", fy)):
+        if value <= 0:
+            raise ValueError(f"The field `{name}` of the camera file {where} is {value}: set it to a positive number.")
+    return w, h, fx, fy, 0.5 * w if cx is None else cx, 0.5 * h if cy is None else cy
+
+
+def _read_matrix(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
+    """Return the camera-to-world matrix of a frame with OpenCV axes, in float64, shape (4, 4)."""
+    name = f"frames[{frame}].transform_matrix"
+    if "transform_matrix" not in fields:
+        raise ValueError(f"The camera file {where} has no `{name}`: add the camera-to-world matrix, 4 rows of 4.")
+    try:
+        matrix = torch.tensor(fields["transform_matrix"], dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"The field `{name}` of the camera file {where} must be 4 rows of 4 numbers.") from error
+    if tuple(matrix.shape) != (4, 4) or not bool(torch.isfinite(matrix).all()):
+        raise ValueError(
+            f"The field `{name}` of the camera file {where} must be 4 rows of 4 finite numbers, "
+            f"but has shape {tuple(matrix.shape)}."
+        )
+    if abs(float(torch.linalg.det(matrix))) < 1e-9:
+        raise ValueError(f"The field `{name}` of the camera file {where} is singular: export the camera again.")
+    return matrix * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenGL y, z -> OpenCV y, z
+
+
+class CameraPath:
+    """Base class of the camera paths that a configuration can name."""
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame.
+
+        Args:
+            frame: Index of the frame.
+            time: Time of the frame [s].
+            center: Centre of the object [scene units], shape (3,).
+            up: Up direction of the scene, shape (3,).
+            size: Longest side of the object [scene units].
+
+        Returns:
+            The camera, on the device and in the precision of ``center``.
+        """
+        raise NotImplementedError
+
+
+class OrbitCamera(CameraPath):
+    """Camera that looks at the object from a sphere around it, and may travel about the up direction.
+
+    See :func:`orbit_camera` for what azimuth and elevation mean.
+
+    Args:
+        width: Image width [pixels].
+        height: Image height [pixels].
+        fov_y: Vertical field of view [degrees].
+        azimuth: Angle about the up direction at time 0 [degrees].
+        elevation: Angle above the horizontal plane [degrees], between -90 and 90 (both excluded).
+        radius: Distance from the target, in multiples of the object's longest side.
+        degrees_per_second: Speed of the azimuth [degrees/s].
+        target_offset: From the object's centre to the point looked at, along the scene's axes, in multiples of the
+            object's longest side.
+        near: Near plane [scene units].
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a number is out of range.
+    """
+
+    def __init__(
+        self,
+        width: int = 480,
+        height: int = 270,
+        fov_y: float = 40.0,
+        azimuth: float = -60.0,
+        elevation: float = 15.0,
+        radius: float = 2.0,
+        degrees_per_second: float = 0.0,
+        target_offset: Sequence[float] = (0.0, 0.0, 0.0),
+        near: float = 0.01,
+    ) -> None:
+        self.width, self.height = _check_pixels("width", width), _check_pixels("height", height)
+        self.fov_y = _check_fov("fov_y", fov_y)
+        self.azimuth = check_vector("azimuth", [azimuth], 1)[0]
+        self.elevation = _check_elevation("elevation", elevation)
+        check_positive("radius", radius)
+        self.radius = float(radius)
+        self.degrees_per_second = check_vector("degrees_per_second", [degrees_per_second], 1)[0]
+        self.target_offset = check_vector("target_offset", target_offset)
+        check_positive("near", near)
+        self.near = float(near)
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame, see :meth:`CameraPath.__call__`."""
+        check_positive("size", size)
+        offset = torch.tensor(self.target_offset, dtype=torch.float64)
+        return orbit_camera(
+            _vector("center", center) + size * offset,
+            up,
+            size * self.radius,
+            self.azimuth + self.degrees_per_second * time,
+            self.elevation,
+            self.fov_y,
+            self.width,
+            self.height,
+            self.near,
+            device=center.device,
+            dtype=center.dtype,
+        )
+
+
+class LookAtCamera(CameraPath):
+    """Camera that stands still at a given point.
+
+    Args:
+        eye: Position [scene units], 3 numbers.
+        target: Point at the image centre [scene units], 3 numbers.
+        up: Direction seen upwards in the image, 3 numbers; that of the scene when None.
+        width: Image width [pixels].
+        height: Image height [pixels].
+        fov_y: Vertical field of view [degrees].
+        near: Near plane [scene units].
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a number is out of range, or the line of sight is not defined.
+    """
+
+    def __init__(
+        self,
+        eye: Sequence[float],
+        target: Sequence[float],
+        up: Sequence[float] | None = None,
+        width: int = 480,
+        height: int = 270,
+        fov_y: float = 40.0,
+        near: float = 0.01,
+    ) -> None:
+        self.eye, self.target = check_vector("eye", eye), check_vector("target", target)
+        if self.eye == self.target:
+            raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(self.eye)}.")
+        self.up = None if up is None else tuple(_unit("up", up).tolist())
+        self.width, self.height = _check_pixels("width", width), _check_pixels("height", height)
+        self.fov_y = _check_fov("fov_y", fov_y)
+        check_positive("near", near)
+        self.near = float(near)
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame, see :meth:`CameraPath.__call__`."""
+        return look_at_camera(
+            self.eye,
+            self.target,
+            up if self.up is None else self.up,
+            self.fov_y,
+            self.width,
+            self.height,
+            self.near,
+            device=center.device,
+            dtype=center.dtype,
+        )
+
+
+class TransformsCamera(CameraPath):
+    """Captured camera of a ``transforms.json``; the file is read at the first frame.
+
+    Args:
+        path: The file, see :func:`camera_from_transforms`.
+        frame: Index of the camera in the file, from 0. It is the same camera in every frame of the video.
+        width: Image width [pixels]; by default that of the file.
+        height: Image height [pixels]; by default that of the file.
+        near: Near plane [scene units].
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a number is out of range; at the first frame, if the file is bad.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        frame: int = 0,
+        width: int | None = None,
+        height: int | None = None,
+        near: float = 0.01,
+    ) -> None:
+        if isinstance(frame, bool) or not isinstance(frame, int):
+            raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
+        if frame < 0:
+            raise ValueError(f"Expected `frame` not to be negative, but got {frame}.")
+        self.path, self.frame = path, frame
+        self.width = None if width is None else _check_pixels("width", width)
+        self.height = None if height is None else _check_pixels("height", height)
+        check_positive("near", near)
+        self.near = float(near)
+        self._camera: Camera | None = None
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame, see :meth:`CameraPath.__call__`."""
+        if self._camera is None:
+            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, self.near)
+        return self._camera.to(center.device, center.dtype)

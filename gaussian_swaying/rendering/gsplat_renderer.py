@@ -1,0 +1,112 @@
+"""Renderer on top of the CUDA rasterizer of gsplat."""
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.rendering.base import RenderOutput, check_gaussians, finite_gaussians
+from gaussian_swaying.rendering.camera import Camera
+
+
+def render_gsplat(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    eps2d: float = 0.3,
+) -> RenderOutput:
+    """Draw Gaussians with ``gsplat.rasterization`` (Ye et al. 2025, arXiv 2409.06765) in float32.
+
+    gsplat compiles its kernels at the first call, which takes minutes once.
+
+    Args:
+        means: Centres [scene units], on a CUDA device, shape (N, 3).
+        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
+        opacities: Opacities in [0, 1], shape (N,).
+        colors: Colours as they are to be seen, shape (N, 3).
+        camera: The camera.
+        background: Colour behind the Gaussians, shape (3,); black when None.
+        eps2d: Added to the diagonal of the projected covariances [pixels^2].
+
+    Returns:
+        The picture, in the precision of ``means``.
+
+    Raises:
+        RuntimeError: If there is no CUDA device, or ``means`` is not on it.
+        TypeError: If an argument is not a tensor.
+        ValueError: If a tensor does not have the shape above.
+    """
+    check_gaussians(means, covariances, opacities, colors, background)
+    if not torch.cuda.is_available():
+        raise RuntimeError("GsplatRenderer needs CUDA, but torch finds no CUDA device: use TorchRenderer instead.")
+    if means.device.type != "cuda":
+        raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
+    from gsplat import rasterization
+
+    dtype = means.dtype
+    if means.shape[0] == 0:
+        pixels = means.new_zeros(camera.height, camera.width, 5)
+        return _compose(pixels[..., :4], pixels[..., 4:], background, dtype)
+    # gsplat drops what has opacity below 1/255, but would draw a mean or covariance that is not finite.
+    finite = finite_gaussians(means, covariances, opacities, colors)
+    opacities = torch.where(finite, opacities, 0.0)
+    view = camera.to(means.device, torch.float32)
+    pixels, alpha, _ = rasterization(
+        means=means.float(),
+        quats=None,  # not used with covars
+        scales=None,
+        opacities=opacities.float(),
+        colors=colors.float(),
+        viewmats=view.world_to_camera[None],
+        Ks=view.intrinsics[None],
+        width=camera.width,
+        height=camera.height,
+        near_plane=camera.near,
+        eps2d=eps2d,
+        packed=True,
+        render_mode="RGB+D",
+        rasterize_mode="classic",
+        covars=covariances.float(),
+    )
+    return _compose(pixels[0], alpha[0], background, dtype)
+
+
+def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: torch.dtype) -> RenderOutput:
+    """Split colour and depth and add the background, which gsplat 1.5.3 refuses together with packed=True."""
+    color, depth = pixels[..., :3], pixels[..., 3:].clone()
+    if background is not None:
+        color = color + (1.0 - alpha) * background.to(color)
+    return RenderOutput(color.to(dtype), alpha.to(dtype), depth.to(dtype))
+
+
+class GsplatRenderer(nn.Module):
+    """Renderer for CUDA devices, see :func:`render_gsplat`.
+
+    Args:
+        eps2d: Added to the diagonal of the projected covariances [pixels^2].
+
+    Raises:
+        RuntimeError: If there is no CUDA device.
+        ValueError: If ``eps2d`` is negative.
+    """
+
+    def __init__(self, eps2d: float = 0.3) -> None:
+        super().__init__()
+        check_positive("eps2d", eps2d, allow_zero=True)
+        if not torch.cuda.is_available():
+            raise RuntimeError("GsplatRenderer needs CUDA, but torch finds no CUDA device: use TorchRenderer instead.")
+        self.eps2d = float(eps2d)
+
+    def forward(
+        self,
+        means: Tensor,
+        covariances: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one picture, see :class:`~gaussian_swaying.rendering.base.Renderer`."""
+        return render_gsplat(means, covariances, opacities, colors, camera, background, self.eps2d)

@@ -1,0 +1,303 @@
+"""Shading of captured colours from the moving normals of the surface patches.
+
+"Gaussian Swaying" (arXiv 2512.01306), section "Lightweight Shading": the diffuse term scales the colour of a patch by
+the cosine between its normal and the light, and the Phong model (Phong 1975, "Illumination for computer generated
+pictures") adds a highlight.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive, check_shape, check_vector
+
+REST_FLOOR = 0.1
+"""Relative shading raises the factors of the moving and of the rest normal to at least this before it divides them."""
+
+
+def _lambert(normal: Tensor, light: Tensor, two_sided: bool) -> Tensor:
+    """Return max(0, n.L), or abs(n.L) for two-sided surfaces, shape (..., 1)."""
+    cosine = (normal * light).sum(-1, keepdim=True)
+    return cosine.abs() if two_sided else cosine.clamp_min(0.0)
+
+
+def _relative(factor: Tensor, rest_factor: Tensor) -> Tensor:
+    """Return the ratio of two factors, both raised to at least ``REST_FLOOR``: exactly 1 where they are equal."""
+    return factor.clamp_min(REST_FLOOR) / rest_factor.clamp_min(REST_FLOOR)
+
+
+def diffuse_shading(
+    color: Tensor,
+    normal: Tensor,
+    light: Tensor,
+    two_sided: bool = False,
+    ambient: float = 0.0,
+    rest_normal: Tensor | None = None,
+) -> Tensor:
+    r"""Scale colours by the cosine between normal and light.
+
+    .. math::
+        L_o = s\,c, \qquad s = a + (1 - a) \max(0, \mathbf{n} \cdot \mathbf{L})
+
+    (arXiv 2512.01306, "Lightweight Shading", with a = 0 there). Captured colours already hold the light of the
+    capture. With ``rest_normal`` the factor is therefore
+    :math:`\max(s, 0.1) / \max(s_\text{rest}, 0.1)`, which leaves the picture of the rest shape as it was captured and
+    never divides by zero where the rest shape faces away from the light.
+
+    Args:
+        color: Colours, shape (..., 3).
+        normal: Unit normals, shape (..., 3).
+        light: Unit vector towards the light, in the frame of the normals, shape (3,).
+        two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|`, for normals without a known outside.
+        ambient: Part a of the light that comes from everywhere, in [0, 1].
+        rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
+
+    Returns:
+        Shaded colours, not negative, shape (..., 3).
+
+    Raises:
+        TypeError: If an argument is not a tensor.
+        ValueError: If a tensor does not have the shape above.
+
+    Example:
+        >>> color, light = torch.ones(3), torch.tensor([0.0, 0.0, 1.0])
+        >>> diffuse_shading(color, torch.tensor([0.6, 0.0, 0.8]), light)
+        tensor([0.8000, 0.8000, 0.8000])
+    """
+    check_shape("color", color, 3)
+    check_shape("normal", normal, 3)
+    check_shape("light", light, 3)
+    factor = ambient + (1.0 - ambient) * _lambert(normal, light, two_sided)
+    if rest_normal is not None:
+        check_shape("rest_normal", rest_normal, 3)
+        factor = _relative(factor, ambient + (1.0 - ambient) * _lambert(rest_normal, light, two_sided))
+    return (color * factor).clamp_min(0.0)
+
+
+def phong_shading(
+    color: Tensor,
+    normal: Tensor,
+    light: Tensor,
+    view_direction: Tensor,
+    k_a: float = 0.3,
+    k_d: float = 0.7,
+    k_s: float = 0.2,
+    shininess: float = 32.0,
+    two_sided: bool = False,
+    rest_normal: Tensor | None = None,
+) -> Tensor:
+    r"""Shade colours with the Phong model.
+
+    .. math::
+        L_o = k_a c + k_d \max(0, \mathbf{n} \cdot \mathbf{L})\, c + k_s \max(0, \mathbf{r} \cdot \mathbf{v})^\alpha,
+        \qquad \mathbf{r} = 2 (\mathbf{n} \cdot \mathbf{L})\, \mathbf{n} - \mathbf{L}
+
+    (arXiv 2512.01306, "Lightweight Shading"). The highlight is white and is the same for **n** and **-n**. With
+    ``rest_normal`` the factor of the colour is divided by that of the rest normal, both raised to at least 0.1, and
+    the highlight of the rest normal is subtracted, which leaves the picture of the rest shape as it was captured.
+
+    Args:
+        color: Colours, shape (..., 3).
+        normal: Unit normals, shape (..., 3).
+        light: Unit vector towards the light, in the frame of the normals, shape (3,).
+        view_direction: Unit vectors from the surface to the eye, in the same frame, shape (..., 3).
+        k_a: Ambient coefficient.
+        k_d: Diffuse coefficient.
+        k_s: Specular coefficient.
+        shininess: Exponent :math:`\alpha` of the highlight.
+        two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|` in the diffuse term.
+        rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
+
+    Returns:
+        Shaded colours, not negative, shape (..., 3).
+
+    Raises:
+        TypeError: If an argument is not a tensor.
+        ValueError: If a tensor does not have the shape above.
+    """
+    check_shape("color", color, 3)
+    check_shape("normal", normal, 3)
+    check_shape("light", light, 3)
+    check_shape("view_direction", view_direction, 3)
+    factor = k_a + k_d * _lambert(normal, light, two_sided)
+    highlight = _highlight(normal, light, view_direction, shininess)
+    if rest_normal is not None:
+        check_shape("rest_normal", rest_normal, 3)
+        factor = _relative(factor, k_a + k_d * _lambert(rest_normal, light, two_sided))
+        highlight = highlight - _highlight(rest_normal, light, view_direction, shininess)
+    return (color * factor + k_s * highlight).clamp_min(0.0)
+
+
+def _highlight(normal: Tensor, light: Tensor, view_direction: Tensor, shininess: float) -> Tensor:
+    """Return max(0, r.v)^shininess, shape (..., 1)."""
+    reflected = 2.0 * (normal * light).sum(-1, keepdim=True) * normal - light
+    return (reflected * view_direction).sum(-1, keepdim=True).clamp_min(0.0) ** shininess
+
+
+def _unit_light(light: Sequence[float]) -> Tensor:
+    """Return a checked light direction of length one, shape (3,)."""
+    direction = torch.tensor(check_vector("light", light), dtype=torch.float64)
+    if float(direction.norm()) < 1e-12:
+        raise ValueError("Expected `light` to be a direction, but got the zero vector.")
+    return direction / direction.norm()
+
+
+def _check_rest(relative: bool, rest_normal: Tensor | None) -> Tensor | None:
+    """Return the rest normal to use: none unless the shading is relative."""
+    if relative and rest_normal is None:
+        raise ValueError("Expected `rest_normal` to be given, because the shading is relative to the rest shape.")
+    return rest_normal if relative else None
+
+
+class Shader(nn.Module):
+    """Base class of the shaders that a configuration can name."""
+
+    def forward(
+        self,
+        color: Tensor,
+        normal: Tensor,
+        rest_normal: Tensor | None = None,
+        view_direction: Tensor | None = None,
+    ) -> Tensor:
+        """Shade colours.
+
+        Args:
+            color: Colours, shape (..., 3).
+            normal: Unit normals in the metric frame, shape (..., 3).
+            rest_normal: Unit normals of the rest shape, shape (..., 3); needed when the shading is relative.
+            view_direction: Unit vectors from the surface to the eye in the metric frame, shape (..., 3).
+
+        Returns:
+            Shaded colours, shape (..., 3).
+        """
+        raise NotImplementedError
+
+
+class DiffuseShader(Shader):
+    """Diffuse shading, see :func:`diffuse_shading`.
+
+    Args:
+        light: Direction towards the light in the metric frame (z up), of any length.
+        two_sided: Shade both sides of the surface alike.
+        ambient: Part of the light that comes from everywhere, in [0, 1].
+        relative: Shade relative to the rest shape, which then looks as captured.
+
+    Raises:
+        TypeError: If ``light`` is not a list of numbers.
+        ValueError: If ``light`` is zero or ``ambient`` is out of range.
+    """
+
+    light: Tensor
+
+    def __init__(
+        self,
+        light: Sequence[float] = (0.0, 0.0, 1.0),
+        two_sided: bool = False,
+        ambient: float = 0.0,
+        relative: bool = False,
+    ) -> None:
+        super().__init__()
+        if not 0.0 <= ambient <= 1.0:
+            raise ValueError(f"Expected `ambient` to be between 0 and 1, but got {ambient}.")
+        self.register_buffer("light", _unit_light(light), persistent=False)
+        self.two_sided, self.ambient, self.relative = bool(two_sided), float(ambient), bool(relative)
+
+    def forward(
+        self,
+        color: Tensor,
+        normal: Tensor,
+        rest_normal: Tensor | None = None,
+        view_direction: Tensor | None = None,
+    ) -> Tensor:
+        """Shade colours.
+
+        Args:
+            color: Colours, shape (..., 3).
+            normal: Unit normals in the metric frame, shape (..., 3).
+            rest_normal: Unit normals of the rest shape, shape (..., 3); needed when the shading is relative.
+            view_direction: Not used.
+
+        Returns:
+            Shaded colours, shape (..., 3).
+
+        Raises:
+            ValueError: If ``rest_normal`` is missing although the shading is relative, or a shape is wrong.
+        """
+        rest = _check_rest(self.relative, rest_normal)
+        return diffuse_shading(color, normal, self.light.to(normal), self.two_sided, self.ambient, rest)
+
+
+class PhongShader(Shader):
+    """Phong shading, see :func:`phong_shading`.
+
+    Args:
+        light: Direction towards the light in the metric frame (z up), of any length.
+        k_a: Ambient coefficient, not negative.
+        k_d: Diffuse coefficient, not negative.
+        k_s: Specular coefficient, not negative.
+        shininess: Exponent of the highlight, positive.
+        two_sided: Shade both sides of the surface alike.
+        relative: Shade relative to the rest shape, which then looks as captured.
+
+    Raises:
+        TypeError: If ``light`` is not a list of numbers.
+        ValueError: If ``light`` is zero or a coefficient is out of range.
+    """
+
+    light: Tensor
+
+    def __init__(
+        self,
+        light: Sequence[float] = (0.0, 0.0, 1.0),
+        k_a: float = 0.3,
+        k_d: float = 0.7,
+        k_s: float = 0.2,
+        shininess: float = 32.0,
+        two_sided: bool = False,
+        relative: bool = False,
+    ) -> None:
+        super().__init__()
+        for name, value in (("k_a", k_a), ("k_d", k_d), ("k_s", k_s)):
+            check_positive(name, value, allow_zero=True)
+        check_positive("shininess", shininess)
+        self.register_buffer("light", _unit_light(light), persistent=False)
+        self.k_a, self.k_d, self.k_s, self.shininess = float(k_a), float(k_d), float(k_s), float(shininess)
+        self.two_sided, self.relative = bool(two_sided), bool(relative)
+
+    def forward(
+        self,
+        color: Tensor,
+        normal: Tensor,
+        rest_normal: Tensor | None = None,
+        view_direction: Tensor | None = None,
+    ) -> Tensor:
+        """Shade colours.
+
+        Args:
+            color: Colours, shape (..., 3).
+            normal: Unit normals in the metric frame, shape (..., 3).
+            rest_normal: Unit normals of the rest shape, shape (..., 3); needed when the shading is relative.
+            view_direction: Unit vectors from the surface to the eye in the metric frame, shape (..., 3).
+
+        Returns:
+            Shaded colours, shape (..., 3).
+
+        Raises:
+            ValueError: If ``view_direction`` is missing, ``rest_normal`` is missing although the shading is relative,
+                or a shape is wrong.
+        """
+        if view_direction is None:
+            raise ValueError("Expected `view_direction` to be given, because the highlight depends on it.")
+        return phong_shading(
+            color,
+            normal,
+            self.light.to(normal),
+            view_direction,
+            self.k_a,
+            self.k_d,
+            self.k_s,
+            self.shininess,
+            self.two_sided,
+            _check_rest(self.relative, rest_normal),
+        )

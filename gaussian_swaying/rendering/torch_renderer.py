@@ -1,0 +1,329 @@
+"""Renderer in plain torch, for any device; the reference on machines without CUDA.
+
+Elliptical weighted averaging (Zwicker et al. 2001, "EWA volume splatting") with front-to-back compositing (Kerbl et
+al. 2023, arXiv 2308.04079), in the conventions of ``gsplat.rasterization(rasterize_mode="classic")``.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.rendering.base import RenderOutput, check_gaussians, finite_gaussians
+from gaussian_swaying.rendering.camera import Camera
+
+MIN_ALPHA = 1.0 / 255.0
+"""A Gaussian adds nothing to a pixel where its alpha is smaller."""
+MAX_ALPHA = 0.999
+"""Upper bound of alpha, so that the transmittance stays positive."""
+MIN_TRANSMITTANCE = 1e-4
+"""A pixel is finished before the Gaussian that would take its transmittance to this value or below."""
+_SLACK = 0.01
+"""Added to pixel extents [pixels], against round-off; the exact test is on alpha."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectedGaussians:
+    """Gaussians that may touch the image, from front to back.
+
+    Attributes:
+        index: Index of each in the input, shape (V,).
+        means2d: Centres [pixels], shape (V, 2).
+        covariances2d: Entries xx, xy, yy of the blurred covariances [pixels^2], shape (V, 3).
+        depths: Depth of the centres [scene units], shape (V,).
+        log_opacities: Logarithm of the opacities, shape (V,).
+    """
+
+    index: Tensor
+    means2d: Tensor
+    covariances2d: Tensor
+    depths: Tensor
+    log_opacities: Tensor
+
+
+def project_gaussians(
+    means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera, eps2d: float = 0.3
+) -> ProjectedGaussians:
+    r"""Project Gaussians to the image with the local affine approximation of the perspective.
+
+    With camera points :math:`(x, y, z)`, the world-to-camera rotation :math:`W` and :math:`\hat x = x / z`,
+    :math:`\hat y = y / z` clamped to the image widened by 15 % of its size on each side,
+
+    .. math::
+        \Sigma' = J W \Sigma W^\top J^\top + \epsilon I, \qquad
+        J = \frac{1}{z} \begin{pmatrix} f_x & 0 & -f_x \hat x \\ 0 & f_y & -f_y \hat y \end{pmatrix}.
+
+    A Gaussian is left out if it is not finite, its centre is in front of the near plane, its opacity is below 1/255
+    or the ellipse where its alpha reaches 1/255 misses the image. That ellipse has
+    :math:`\sqrt{2 \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
+        opacities: Opacities in [0, 1], shape (N,).
+        camera: The camera, on the device and in the precision of ``means``.
+        eps2d: Added to the diagonal of the projected covariances [pixels^2].
+
+    Returns:
+        The V Gaussians left, by depth; Gaussians of equal depth keep their order.
+    """
+    rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    (fx, fy), (cx, cy) = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
+    with torch.no_grad():
+        depth = means @ rotation[2] + translation[2]
+        in_front = (depth >= camera.near) & (depth < math.inf) & (opacities >= MIN_ALPHA)
+        index = in_front.nonzero().squeeze(-1)
+        index = index[torch.argsort(depth[index], stable=True)]
+    means, covariances, opacities = means[index], covariances[index], opacities[index]
+    x, y, z = (means @ rotation.T + translation).unbind(-1)
+    x_ratio, y_ratio = x / z, y / z
+    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    x_hat = torch.clamp(x_ratio, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    y_hat = torch.clamp(y_ratio, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    row_x = (fx / z)[:, None] * (rotation[0] - x_hat[:, None] * rotation[2])
+    row_y = (fy / z)[:, None] * (rotation[1] - y_hat[:, None] * rotation[2])
+    sigma_x = (covariances @ row_x[..., None]).squeeze(-1)
+    sigma_y = (covariances @ row_y[..., None]).squeeze(-1)
+    xx = (row_x * sigma_x).sum(-1) + eps2d
+    xy = (row_x * sigma_y).sum(-1)
+    yy = (row_y * sigma_y).sum(-1) + eps2d
+    means2d = torch.stack([fx * x_ratio + cx, fy * y_ratio + cy], -1)
+    covariances2d = torch.stack([xx, xy, yy], -1)
+    log_opacities = opacities.log()
+    with torch.no_grad():
+        extent = _extent(covariances2d, log_opacities)
+        size = means2d.new_tensor([camera.width, camera.height])
+        inside = ((means2d + extent > 0) & (means2d - extent < size)).all(-1)
+        determinant = xx * yy - xy * xy
+        keep = (inside & (determinant > 0) & (determinant < math.inf) & (yy > 0)).nonzero().squeeze(-1)
+    return ProjectedGaussians(
+        index=index[keep],
+        means2d=means2d[keep],
+        covariances2d=covariances2d[keep],
+        depths=z[keep],
+        log_opacities=log_opacities[keep],
+    )
+
+
+def _extent(covariances2d: Tensor, log_opacities: Tensor) -> Tensor:
+    """Half width and height [pixels] of the ellipse where alpha reaches 1/255, shape (V, 2)."""
+    reach = 2.0 * (log_opacities - math.log(MIN_ALPHA)).clamp_min(0.0)
+    return (reach[:, None] * covariances2d[:, [0, 2]]).sqrt() + _SLACK
+
+
+def _blocks(counts: Tensor, limit: int) -> tuple[Tensor, list[tuple[int, int]]]:
+    """Split consecutive items into blocks whose counts sum to about ``limit``.
+
+    Returns:
+        Inclusive running sum of the counts, and the first and last (excluded) item of each block. The sum of a block
+        exceeds ``limit`` by less than the largest count.
+    """
+    running = counts.cumsum(0)
+    total = int(running[-1]) if len(running) else 0
+    marks = torch.arange(limit, total + limit, limit, device=counts.device)
+    ends = [0, *(torch.searchsorted(running, marks).clamp_max(len(running) - 1) + 1).tolist()] if total else []
+    return running, [(start, end) for start, end in pairwise(ends) if end > start]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Spans:
+    """Runs of pixels in one image row that a Gaussian covers, from front to back.
+
+    With the distance u of a pixel from the start of the run, alpha = exp(peak - curvature * (u + offset)^2).
+    """
+
+    gaussian: Tensor
+    pixel: Tensor
+    count: Tensor
+    offset: Tensor
+    peak: Tensor
+    curvature: Tensor
+
+
+def _row_spans(projected: ProjectedGaussians, width: int, height: int, limit: int) -> Iterator[_Spans]:
+    r"""Split each Gaussian into the rows it covers, about ``limit`` rows at a time.
+
+    In the row at height dy over the centre, the exponent of the Gaussian splits into a square in x and a rest,
+
+    .. math::
+        \tfrac12 d^\top \Sigma'^{-1} d = \frac{\sigma_{yy}}{2 \det \Sigma'}
+        \Bigl(d_x - \frac{\sigma_{xy}}{\sigma_{yy}} d_y\Bigr)^2 + \frac{d_y^2}{2 \sigma_{yy}},
+
+    which gives the run of pixels with alpha of at least 1/255, however thin and slanted the ellipse is, and has no
+    cancellation.
+    """
+    xx, xy, yy = projected.covariances2d.unbind(-1)
+    per_gaussian = torch.stack(
+        [projected.means2d[:, 0], projected.means2d[:, 1], xy / yy, 0.5 / yy, 0.5 * yy / (xx * yy - xy * xy)], -1
+    )
+    with torch.no_grad():
+        reach = _extent(projected.covariances2d, projected.log_opacities)[:, 1]
+        center = projected.means2d[:, 1] - 0.5
+        first = (center - reach).ceil().clamp(0, height).long()
+        rows = ((center + reach).floor().clamp(-1, height - 1).long() - first + 1).clamp_min(0)
+        running, blocks = _blocks(rows, limit)
+        shift = first - running + rows
+    for start, end in blocks:
+        with torch.no_grad():
+            gaussian = torch.arange(start, end, device=rows.device).repeat_interleave(rows[start:end])
+            begin = int(running[start] - rows[start])
+            row = torch.arange(begin, begin + len(gaussian), device=rows.device) + shift[gaussian]
+        mean_x, mean_y, slope, falloff, curvature = per_gaussian.index_select(0, gaussian).unbind(-1)
+        dy = row + 0.5 - mean_y
+        middle = mean_x + slope * dy - 0.5
+        peak = projected.log_opacities.index_select(0, gaussian) - falloff * dy * dy
+        with torch.no_grad():
+            half = ((peak - math.log(MIN_ALPHA)).clamp_min(0.0) / curvature).sqrt() + _SLACK
+            left = (middle - half).ceil().clamp(0, width)
+            count = ((middle + half).floor().clamp(-1, width - 1) - left + 1).clamp_min(0).long()
+        yield _Spans(gaussian.int(), (row * width + left.long()).int(), count, left - middle, peak, curvature)
+
+
+def composite_gaussians(
+    projected: ProjectedGaussians, features: Tensor, width: int, height: int, max_pairs: int = 1 << 18
+) -> tuple[Tensor, Tensor]:
+    r"""Blend projected Gaussians from front to back.
+
+    .. math::
+        \alpha_k = \min(0.999, o_k e^{-\frac12 d^\top \Sigma_k'^{-1} d}), \qquad
+        T_k = \prod_{j < k} (1 - \alpha_j), \qquad f = \sum_k T_k \alpha_k f_k
+
+    (Kerbl et al. 2023, equation 3), without the Gaussians with :math:`\alpha_k < 1/255` and from the first with
+    :math:`T_{k+1} \le 10^{-4}` on. The logarithm of the transmittance is summed in float64. Deterministic bit for bit
+    on the CPU.
+
+    Args:
+        projected: Gaussians from :func:`project_gaussians`.
+        features: Values to blend, shape (V, D).
+        width: Image width [pixels].
+        height: Image height [pixels].
+        max_pairs: About how many pairs of a Gaussian and a pixel are in memory at a time (autograd keeps them all).
+
+    Returns:
+        Blended features, shape (H, W, D), and opacity :math:`\sum_k T_k \alpha_k`, shape (H, W, 1).
+    """
+    pixel_count = width * height
+    log_stop = math.log(MIN_TRANSMITTANCE)
+    blended = features.new_zeros(pixel_count, features.shape[-1] + 1)
+    log_transmittance = torch.zeros(pixel_count, dtype=torch.float64, device=features.device)
+    features = torch.cat([features, torch.ones_like(features[:, :1])], -1)
+    started = False
+    for spans in _row_spans(projected, width, height, max_pairs):
+        running, blocks = _blocks(spans.count, max_pairs)
+        before = running - spans.count
+        for start, end in blocks:
+            with torch.no_grad():
+                local = torch.arange(end - start, dtype=torch.int32, device=running.device)
+                span = local.repeat_interleave(spans.count[start:end])
+                # Pixels from the start of the span: a running number, less that of the span's first pair.
+                step = torch.arange(len(span), dtype=torch.int32, device=running.device)
+                step -= (before[start:end] - before[start]).int().index_select(0, span)
+                pixel = step + spans.pixel[start:end].index_select(0, span)
+                if started:
+                    keep = (log_transmittance > log_stop).index_select(0, pixel).nonzero().squeeze(-1)
+                    span, step, pixel = (item.index_select(0, keep) for item in (span, step, pixel))
+                pixel, order = torch.sort(pixel, stable=True)
+                span, step = span.index_select(0, order), step.index_select(0, order)
+                bounds = functional.pad(torch.bincount(pixel, minlength=pixel_count).cumsum(0), (1, 0)).int()
+            distance = step + spans.offset[start:end].index_select(0, span)
+            falloff = spans.curvature[start:end].index_select(0, span) * distance.square()
+            exponent = spans.peak[start:end].index_select(0, span) - falloff
+            alpha = exponent.exp().clamp_max(MAX_ALPHA)
+            alpha = torch.where(alpha >= MIN_ALPHA, alpha, 0.0)
+            log_factor = torch.log1p(-alpha).double()
+            summed = functional.pad(log_factor.cumsum(0), (1, 0))
+            at_bounds = summed.index_select(0, bounds)
+            entry = log_transmittance - at_bounds[:-1]
+            transmittance = (summed[:-1] + entry.index_select(0, pixel)).to(alpha.dtype).exp()
+            weight = torch.where(transmittance * (1.0 - alpha) > MIN_TRANSMITTANCE, transmittance * alpha, 0.0)
+            blended = blended + functional.embedding_bag(
+                spans.gaussian[start:end].index_select(0, span),
+                features,
+                bounds,
+                mode="sum",
+                per_sample_weights=weight,
+                include_last_offset=True,
+            )
+            log_transmittance = entry + at_bounds[1:]
+            started = True
+    image = blended.reshape(height, width, -1)
+    return image[..., :-1], image[..., -1:]
+
+
+def render_torch(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    eps2d: float = 0.3,
+    max_pairs: int = 1 << 18,
+) -> RenderOutput:
+    """Draw Gaussians, see :func:`project_gaussians` and :func:`composite_gaussians`.
+
+    Differentiable with respect to ``means``, ``covariances``, ``opacities``, ``colors`` and ``background``.
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
+        opacities: Opacities in [0, 1], shape (N,).
+        colors: Colours as they are to be seen, shape (N, 3).
+        camera: The camera.
+        background: Colour behind the Gaussians, shape (3,); black when None.
+        eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        max_pairs: About how many pairs of a Gaussian and a pixel are in memory at a time.
+
+    Returns:
+        The picture, on the device and in the precision of ``means``.
+
+    Raises:
+        TypeError: If an argument is not a tensor.
+        ValueError: If a tensor does not have the shape above.
+    """
+    check_gaussians(means, covariances, opacities, colors, background)
+    camera = camera.to(means.device, means.dtype)
+    opacities = torch.where(finite_gaussians(means, covariances, opacities, colors), opacities, 0.0)
+    projected = project_gaussians(means, covariances, opacities, camera, eps2d)
+    features = torch.cat([colors[projected.index], projected.depths[:, None]], -1)
+    blended, alpha = composite_gaussians(projected, features, camera.width, camera.height, max_pairs)
+    color = blended[..., :3]
+    if background is not None:
+        color = color + (1.0 - alpha) * background.to(color)
+    return RenderOutput(color, alpha, blended[..., 3:])
+
+
+class TorchRenderer(nn.Module):
+    """Renderer for any device, see :func:`render_torch`.
+
+    Args:
+        eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        max_pairs: About how many pairs of a Gaussian and a pixel are in memory at a time; bounds the memory and does
+            not change the picture beyond round-off.
+
+    Raises:
+        ValueError: If ``eps2d`` is negative or ``max_pairs`` is not positive.
+    """
+
+    def __init__(self, eps2d: float = 0.3, max_pairs: int = 1 << 18) -> None:
+        super().__init__()
+        check_positive("eps2d", eps2d, allow_zero=True)
+        check_positive("max_pairs", max_pairs)
+        self.eps2d, self.max_pairs = float(eps2d), int(max_pairs)
+
+    def forward(
+        self,
+        means: Tensor,
+        covariances: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one picture, see :class:`~gaussian_swaying.rendering.base.Renderer`."""
+        return render_torch(means, covariances, opacities, colors, camera, background, self.eps2d, self.max_pairs)

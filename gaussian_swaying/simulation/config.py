@@ -1,0 +1,153 @@
+"""From a YAML file and the command line to a run. The constructors of the components are the schema."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+
+from gaussian_swaying._checks import check_vector
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.camera import CameraPath, OrbitCamera
+from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+# what may change between a run and the one that resumes it
+RUN_ONLY = ("config", "output", "device", "frames", "resume")
+
+
+def build_parser() -> ArgumentParser:
+    """The parser of ``tools/sim.py``: one group of options per component, typos are errors."""
+    from jsonargparse import ActionYesNo, ArgumentParser
+
+    parser = ArgumentParser(
+        prog="sim.py",
+        description="Let the wind move a 3D Gaussian scene: splat in, video out. Lengths that say where something is "
+        "are in scene units and axes; velocities, gravity and light are in metres, z up.",
+    )
+    parser.add_argument("--config", action="config", help="YAML file; options given after it override it.")
+    parser.add_argument("--output", type=str | None, help="Folder of the results. Default: outputs/<config name>.")
+    parser.add_argument(
+        "--device", type=Literal["auto", "cpu", "cuda"], default="auto", help="auto takes a CUDA GPU if there is one."
+    )
+    parser.add_argument("--frames", type=int, default=250, help="Number of frames, the first at rest.")
+    parser.add_argument("--frame_dt", type=float, default=0.04, help="Time between frames [s].")
+    parser.add_argument("--dtype", type=Literal["float32", "float64"], default="float32", help="Precision of the solver.")
+    parser.add_argument("--background", type=list[float], default=[0.0, 0.0, 0.0], help="Background colour in [0, 1].")
+    parser.add_argument(
+        "--resume", action=ActionYesNo(no_prefix=None), default=False, help="Continue the run found in the output folder."
+    )
+    parser.add_class_arguments(Scene, "scene")
+    parser.add_class_arguments(Material, "material")
+    parser.add_class_arguments(MPMSolver, "solver")
+    parser.add_class_arguments(WindField, "wind")
+    parser.add_class_arguments(AeroForce, "aero")
+    parser.add_subclass_arguments(Shader, "shader", required=False, help="Shading; null keeps the splat's colours.")
+    parser.add_subclass_arguments(CameraPath, "camera", required=False, help="Where each frame is seen from.")
+    parser.add_class_arguments(Recorder, "recorder")
+    return parser
+
+
+def resolve_device(name: str) -> torch.device:
+    """``auto``, ``cpu`` or ``cuda`` as a device; ValueError if CUDA is asked for and missing."""
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
+        raise ValueError(
+            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, and torch finds none: use --device auto or cpu."
+        )
+    return torch.device("cuda" if name != "cpu" and available else "cpu")
+
+
+def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[SimulationPipeline, Recorder]:
+    """Build the components from parsed settings.
+
+    Args:
+        parser: From :func:`build_parser`.
+        settings: What it parsed.
+
+    Returns:
+        Pipeline and recorder.
+
+    Raises:
+        ValueError: If a value is out of range; the message names the field.
+    """
+    device = resolve_device(settings.device)
+    if settings.frames < 1:
+        raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
+    parts = parser.instantiate_classes(settings)
+    solver = parts.solver
+    scene = SimulatedScene(parts.scene, parts.material, solver.dx, getattr(torch, settings.dtype))
+    pipeline = SimulationPipeline(
+        scene,
+        solver,
+        parts.wind,
+        parts.aero,
+        parts.get("shader"),
+        parts.get("camera") or OrbitCamera(),
+        background=check_vector("background", settings.background),
+        frame_dt=settings.frame_dt,
+        device=device,
+    )
+    return pipeline, parts.recorder
+
+
+def config_text(parser: ArgumentParser, settings: Namespace) -> str:
+    """The settings that decide the result, as YAML."""
+    kept = settings.clone()
+    for name in RUN_ONLY:
+        kept.pop(name, None)
+    return str(parser.dump(kept, skip_validation=True))
+
+
+def output_folder(settings: Namespace) -> Path:
+    """The folder asked for, or one named after the config file."""
+    if settings.output:
+        return Path(settings.output)
+    files = [str(file) for file in settings.config or []]
+    return Path("outputs") / (Path(files[-1]).stem if files else "run")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse, build, run.
+
+    Args:
+        arguments: Command line; that of the process if None.
+
+    Returns:
+        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C. With the
+        environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+    """
+    parser = build_parser()
+    settings = parser.parse_args(arguments)
+    try:
+        pipeline, recorder = build_pipeline(parser, settings)
+        folder = output_folder(settings)
+        scene = pipeline.scene
+        print(f"{len(scene.simulated):,} of {len(scene.model.means):,} Gaussians simulated on {pipeline.device}")
+        print(scene.frame.describe())
+        extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
+        text = config_text(parser, settings)
+        pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
+    except KeyboardInterrupt:
+        print("Stopped; what was recorded is kept. Continue with --resume.", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, OSError, SimulationDiverged) as error:
+        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    for file in pipeline.files:
+        print(f"wrote {file}")
+    return 0

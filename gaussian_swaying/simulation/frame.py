@@ -1,0 +1,143 @@
+"""Scene units to metres with z up, and back: the only place that scales."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape, check_vector
+
+
+def rotation_to_z(up: Sequence[float]) -> Tensor:
+    """The smallest rotation that takes a direction to +z (Rodrigues' formula).
+
+    Args:
+        up: Direction, of any length but zero.
+
+    Returns:
+        Rotation, shape (3, 3), float64. A direction of -z is turned about x.
+
+    Raises:
+        ValueError: If ``up`` is zero or does not have three numbers.
+    """
+    u = torch.tensor(check_vector("up", up), dtype=torch.float64)
+    if float(u.norm()) == 0:
+        raise ValueError("Expected `up` not to be zero, for example [0, 0, 1] or [0, -1, 0].")
+    u = u / u.norm()
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    cosine = float(u @ z)
+    if cosine < -1 + 1e-12:
+        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    axis = torch.linalg.cross(u, z)
+    x, y, w = axis.tolist()
+    skew = torch.tensor([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
+
+
+@dataclass(frozen=True, slots=True)
+class SimFrame:
+    """Similarity between scene coordinates and the simulation's: metres, z up, origin at the object's centre.
+
+    Attributes:
+        origin: Scene point that becomes the origin, shape (3,), float64.
+        rotation: Scene axes to simulation axes, shape (3, 3), float64.
+        metres_per_unit: Length of a scene unit [m].
+    """
+
+    origin: Tensor
+    rotation: Tensor
+    metres_per_unit: float
+
+    @classmethod
+    def fit(
+        cls,
+        points: Tensor,
+        up: Sequence[float] = (0.0, 0.0, 1.0),
+        longest_side: float | None = None,
+        metres_per_unit: float | None = None,
+    ) -> SimFrame:
+        """The frame for an object.
+
+        Args:
+            points: Points of the object in scene units, shape (N, 3).
+            up: Direction in the scene that points up.
+            longest_side: Longest side of the object's box, along the simulation axes [m]; PhysGaussian's normalisation
+                is 1. Excludes ``metres_per_unit``.
+            metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
+
+        Returns:
+            The frame, its origin at the centre of the box.
+
+        Raises:
+            ValueError: If both or an impossible size is given, or the object has no extent.
+        """
+        check_shape("points", points, "N", 3)
+        if longest_side is not None and metres_per_unit is not None:
+            raise ValueError("Give either `longest_side` or `metres_per_unit`, not both.")
+        rotation = rotation_to_z(up)
+        turned = points.detach().cpu().double() @ rotation.T
+        low, high = turned.amin(0), turned.amax(0)
+        scale = 1.0
+        if metres_per_unit is not None:
+            check_positive("metres_per_unit", metres_per_unit)
+            scale = float(metres_per_unit)
+        elif longest_side is not None:
+            check_positive("longest_side", longest_side)
+            extent = float((high - low).amax())
+            if extent <= 0:
+                raise ValueError("The object has no extent, so `longest_side` cannot set its size: use metres_per_unit.")
+            scale = float(longest_side) / extent
+        return cls((0.5 * (low + high)) @ rotation, rotation, scale)
+
+    def _turn(self, vectors: Tensor, rotation: Tensor) -> Tensor:
+        return (vectors.double() @ rotation.to(vectors.device).T).to(vectors.dtype)
+
+    def point_to_sim(self, points: Tensor) -> Tensor:
+        """Scene points (..., 3) to metres, z up. Computed in float64, so far-away scenes keep their detail."""
+        centred = (points.double() - self.origin.to(points.device)) * self.metres_per_unit
+        return (centred @ self.rotation.to(points.device).T).to(points.dtype)
+
+    def point_to_scene(self, points: Tensor) -> Tensor:
+        """Points in metres, z up (..., 3) to scene coordinates."""
+        turned = (points.double() / self.metres_per_unit) @ self.rotation.to(points.device)
+        return (turned + self.origin.to(points.device)).to(points.dtype)
+
+    def displacement_to_scene(self, displacement: Tensor) -> Tensor:
+        """Displacements in metres, z up (..., 3) to scene units and axes."""
+        return self._turn(displacement, self.rotation.T) / self.metres_per_unit
+
+    def direction_to_sim(self, directions: Tensor) -> Tensor:
+        """Turn directions (..., 3) from scene axes to the z-up frame, without scaling."""
+        return self._turn(directions, self.rotation)
+
+    def direction_to_scene(self, directions: Tensor) -> Tensor:
+        """Turn directions (..., 3) from the z-up frame to scene axes, without scaling."""
+        return self._turn(directions, self.rotation.T)
+
+    def area_to_sim(self, area: Tensor) -> Tensor:
+        """Areas in square scene units to m²."""
+        return area * self.metres_per_unit**2
+
+    def covariance_to_sim(self, covariance: Tensor) -> Tensor:
+        """Covariances (..., 3, 3) in square scene units to m², z up."""
+        rotation = self.rotation.to(covariance)
+        return rotation @ covariance @ rotation.T * self.metres_per_unit**2
+
+    def covariance_to_scene(self, covariance: Tensor) -> Tensor:
+        """Covariances (..., 3, 3) in m², z up, to scene units and axes."""
+        rotation = self.rotation.to(covariance)
+        return rotation.T @ covariance @ rotation / self.metres_per_unit**2
+
+    def gradient_to_scene(self, F: Tensor) -> Tensor:
+        """Deformation gradients (..., 3, 3) from the z-up frame to scene axes: Rᵀ F R."""
+        rotation = self.rotation.to(F)
+        return rotation.T @ F @ rotation
+
+    def describe(self) -> str:
+        """One line for people who place boxes and cameras."""
+        origin = [round(v, 4) for v in self.origin.tolist()]
+        up = [round(v, 3) for v in self.rotation[2].tolist()]
+        return f"1 scene unit = {self.metres_per_unit:.6g} m; origin {origin}; up {up} (scene units)"

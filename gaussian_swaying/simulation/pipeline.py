@@ -1,0 +1,403 @@
+"""The whole run: wind, solver, shading, rendering and recording, frame by frame."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+import gaussian_swaying
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.aero.force import AeroForce, drag_rate
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
+from gaussian_swaying.gaussians.surface import covariance_to_quat_scale, deform_area, deform_normal
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
+from gaussian_swaying.rendering.camera import Camera, CameraPath
+from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, check_state, diagnose
+from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.scene import SceneGaussians, SimulatedScene
+
+MAX_RETRIES = 4
+CFL_LIMIT = 0.5  # an adaptive frame that ends above it is done again with shorter substeps
+
+
+class SimulationPipeline(nn.Module):
+    """Composes the components into frames; every component can be used without it.
+
+    Args:
+        scene: Gaussians, material points and patches.
+        solver: Moves the material; its boundaries are given in scene units.
+        wind: Air velocity over time.
+        aero: Force of the wind on patches.
+        shader: Colours from normals and light; None leaves the colours of the splat.
+        camera: Where each frame is seen from.
+        background: Background colour, in [0, 1].
+        frame_dt: Time between frames [s].
+        device: Where to run.
+        renderer: Draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
+    """
+
+    def __init__(
+        self,
+        scene: SimulatedScene,
+        solver: MPMSolver,
+        wind: WindField,
+        aero: AeroForce,
+        shader: Shader | None,
+        camera: CameraPath,
+        background: tuple[float, ...] = (0.0, 0.0, 0.0),
+        frame_dt: float = 0.04,
+        device: torch.device | str = "cpu",
+        renderer: Renderer | None = None,
+    ) -> None:
+        super().__init__()
+        check_positive("frame_dt", frame_dt)
+        self.scene, self.solver, self.wind, self.aero, self.shader = scene, solver, wind, aero, shader
+        self.camera, self.frame_dt = camera, float(frame_dt)
+        solver.boundaries = nn.ModuleList([b.in_frame(scene.frame) for b in solver.boundaries])
+        self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
+        self.background: Tensor
+        self.to(device)
+        self.device = torch.device(device)
+        self.renderer = renderer if renderer is not None else make_renderer(self.device)
+        self._windless = not bool(self.wind.flows.any()) and len(self.wind.modulations) == 0
+
+    # ---- simulation
+
+    def start(self) -> MPMState:
+        """The state at rest, time zero."""
+        return self.solver.init_state(self.scene.points)
+
+    def force(self, state: MPMState, wind: Tensor) -> Tensor:
+        """Wind force on every particle [N], shape (..., P, 3), at an air velocity [m/s] of shape (3,)."""
+        normal = deform_normal(state.F_total, self.scene.patch_normal)
+        area = deform_area(state.F_total, self.scene.patch_normal, self.scene.patch_area)
+        return self.aero(wind, state.velocity, normal, area)
+
+    def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
+        """Advance by one frame.
+
+        A frame whose material stiffened so much that its substep was too long is thrown away and done again with a
+        shorter one.
+
+        Args:
+            state: The state at the start of the frame.
+
+        Returns:
+            The state at its end, and its diagnostics.
+
+        Raises:
+            SimulationDiverged: If the frame does not end well.
+        """
+        try:
+            steps = max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
+            for retry in range(MAX_RETRIES + 1):
+                dt = self.frame_dt / steps
+                end = self._roll(self.solver.fit_grid(state, self.frame_dt), steps)
+                if self.solver.substep is not None or retry == MAX_RETRIES:
+                    break
+                cfl = float(self.solver.cfl_number(end, dt))
+                if cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl):
+                    break
+                growth = cfl / self.solver.cfl if np.isfinite(cfl) else 4.0
+                steps = int(steps * min(growth * 1.1, 4.0)) + 1
+        except FloatingPointError as error:
+            raise SimulationDiverged(float(state.time), None, str(error), "lower `solver.cfl`") from error
+        check_state(self.solver, end)
+        return end, diagnose(self.solver, end, steps, dt)
+
+    def _roll(self, state: MPMState, steps: int) -> MPMState:
+        dt = self.frame_dt / steps
+        if self._windless:
+            return self.solver.rollout(state, dt, steps)
+        offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
+        winds = self.wind(state.time + offsets)
+        for k in range(steps):
+            state = self.solver.step(state, dt, self.force(state, winds[k]))
+        return state
+
+    def _drag_substeps(self, state: MPMState) -> int:
+        """Substeps that keep explicit drag on light patches stable."""
+        if self._windless:
+            return 1
+        times = state.time + torch.linspace(0, self.frame_dt, 5, dtype=torch.float64, device=self.device)
+        wind = torch.linalg.vector_norm(self.wind(times), dim=-1).amax().to(state.velocity.dtype)
+        speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
+        coefficient = float(self.aero.C_D + self.aero.C_F + self.aero.C_L.abs())
+        mass = self.solver.points.mass
+        rate = drag_rate(speed, self.scene.patch_area, mass, coefficient, self.aero.air_density).amax()
+        return int(float(rate) * self.frame_dt) + 1
+
+    # ---- picture
+
+    def camera_at(self, frame: int) -> Camera:
+        """The camera of a frame, on the device.
+
+        Raises:
+            ValueError: If it lies inside the box of the object at rest.
+        """
+        scene = self.scene
+        up = scene.frame.rotation[2]
+        camera = self.camera(frame, frame * self.frame_dt, scene.center, up, scene.size)
+        low, high = scene.bounds()
+        eye = camera.position.to(low)
+        if bool(((eye > low) & (eye < high)).all()):
+            raise ValueError(
+                f"The camera at {[round(v, 3) for v in eye.tolist()]} lies inside the object, whose box reaches from "
+                f"{[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene units): move "
+                "it out with `camera.init_args.radius` or `eye`."
+            )
+        return camera.to(self.device)
+
+    def colours(self, gaussians: SceneGaussians, camera: Camera) -> Tensor:
+        """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
+        scene = self.scene
+        view = torch.nn.functional.normalize(gaussians.means - camera.position.to(gaussians.means), dim=-1)
+        at_rest = (view[:, None, :] @ gaussians.rotations)[:, 0, :]
+        colours = scene.model.colors(at_rest)
+        if self.shader is None:
+            return colours
+        moving = torch.cat([scene.simulated, scene.carried])
+        normal = scene.frame.direction_to_sim(gaussians.normals[moving])
+        rest = scene.frame.direction_to_sim(scene.rest_normals[moving])
+        to_eye = -scene.frame.direction_to_sim(view[moving])
+        colours = colours.clone()
+        colours[moving] = self.shader(colours[moving], normal, rest_normal=rest, view_direction=to_eye)
+        return colours
+
+    def shade(self, state: MPMState, camera: Camera) -> tuple[SceneGaussians, Tensor]:
+        """Deformed Gaussians in scene units and their colours (N, 3)."""
+        gaussians = self.scene.deformed(state)
+        return gaussians, self.colours(gaussians, camera)
+
+    def draw(self, gaussians: SceneGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
+        """Draw Gaussians given in scene units."""
+        opacity = self.scene.model.opacity()
+        return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
+
+    def render(self, state: MPMState, frame: int) -> RenderOutput:
+        """The picture of a state from the camera of a frame."""
+        camera = self.camera_at(frame)
+        gaussians, colours = self.shade(state, camera)
+        return self.draw(gaussians, colours, camera)
+
+    def export(self, gaussians: SceneGaussians, path: Path) -> None:
+        """Write deformed Gaussians as a 3DGS .ply that any splat viewer opens, harmonics turned with the patches."""
+        from gaussian_swaying.gaussians.spherical_harmonics import rotate_sh
+
+        cloud = self.scene.model.to_cloud()
+        quats, scales = covariance_to_quat_scale(gaussians.covariances)
+        write_ply(
+            path,
+            GaussianCloud(
+                means=gaussians.means,
+                quats=quats,
+                scales=scales,
+                opacities=cloud.opacities,
+                sh=rotate_sh(cloud.sh, gaussians.rotations),
+                normals=gaussians.normals,
+            ).to("cpu"),
+        )
+
+    # ---- the run
+
+    @torch.inference_mode()
+    def run(
+        self,
+        recorder: Recorder,
+        output: str | Path,
+        frames: int,
+        config: str = "",
+        resume: bool = False,
+        settings: dict[str, Any] | None = None,
+        progress: bool = True,
+    ) -> dict[str, Any]:
+        """Simulate, render and record.
+
+        Args:
+            recorder: Writes the results.
+            output: Folder for them.
+            frames: Number of frames, the first one the state at rest.
+            config: The whole configuration as YAML, kept with the results.
+            resume: Continue the run found in ``output`` after its last complete frame.
+            settings: Further entries for the summary.
+            progress: Show a progress bar.
+
+        Returns:
+            The summary, as in ``summary.json``.
+
+        Raises:
+            SimulationDiverged: After everything recorded so far was saved.
+            ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
+        """
+        check_positive("frames", frames)
+        self.camera_at(0)
+        state = self.start()
+        self.solver.substeps(state, self.frame_dt)  # a substep that is too long is refused before anything is written
+        checkpoint = recorder.open(output, config, resume)
+        first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
+        if checkpoint is not None:
+            state = MPMState.from_state_dict(checkpoint["state"], self.device)
+            first, log = checkpoint["frame"] + 1, checkpoint["log"]
+            walls.seconds.update(checkpoint["wall_s"])
+        status, reason, done = "complete", None, first
+        bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
+        try:
+            for frame in range(first, frames):
+                with walls("simulation"):
+                    if frame > 0:
+                        state, health = self.advance(state)
+                    else:
+                        health = diagnose(self.solver, state, 0, 0.0)
+                log.append(health.as_dict())
+                self._record(recorder, state, frame, walls)
+                with walls("writing"):
+                    if recorder.checkpoint_every and (frame + 1) % recorder.checkpoint_every == 0:
+                        recorder.write_checkpoint(
+                            {
+                                "frame": frame,
+                                "state": state.state_dict(),
+                                "log": log,
+                                "config": config,
+                                "wall_s": dict(walls.seconds),
+                            }
+                        )
+                done = frame + 1
+                bar.update()
+                bar.set_postfix(substeps=health.substeps, moved=f"{health.displacement_mean:.3f} m")
+        except SimulationDiverged as error:
+            status, reason = "diverged", str(error)
+            raise
+        except KeyboardInterrupt:
+            status, reason = "interrupted", "stopped by the user; continue with --resume"
+            raise
+        finally:
+            bar.close()
+            summary = {"status": status if done >= frames or status != "complete" else "failed", "reason": reason}
+            summary |= self._summary(state, log, frames, walls, peak) | (settings or {})
+            # the video of a run that was stopped early is made too: nothing that was recorded is lost
+            with walls("writing"):
+                files = recorder.close(done, summary)
+            summary["wall_s"] = dict(walls.seconds)
+            self.files = files
+        recorder.write_summary(summary)
+        return summary
+
+    def _record(self, recorder: Recorder, state: MPMState, frame: int, walls: _Walls) -> None:
+        exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
+        if recorder.images or exporting:
+            with walls("shading"):
+                camera = self.camera_at(frame)
+                gaussians, colours = self.shade(state, camera)
+        if recorder.images:
+            with walls("rendering"):
+                image = self.draw(gaussians, colours, camera).color
+            with walls("writing"):
+                recorder.write_image(frame, image)
+        with walls("writing"):
+            if exporting:
+                recorder.write_ply(frame, lambda path: self.export(gaussians, path))
+            if recorder.trajectory:
+                recorder.write_trajectory(frame, state.position, state.F_total)
+
+    def _summary(
+        self, state: MPMState, log: list[dict[str, float]], frames: int, walls: _Walls, peak: _PeakMemory
+    ) -> dict[str, Any]:
+        moved = [entry["displacement_mean"] for entry in log]
+        energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
+        return {
+            "device": describe_device(self.device),
+            "versions": versions(),
+            "seed": self.wind.seed,
+            "particles": self.solver.points.count,
+            "gaussians": len(self.scene.model.means),
+            "formulation": self.solver.formulation,
+            "dtype": str(state.position.dtype).removeprefix("torch."),
+            "grid": {"dx_m": self.solver.dx, "resolution": list(state.grid.resolution)},
+            "frame": self.scene.frame.describe(),
+            "frames": len(log),
+            "frames_wanted": frames,
+            "frame_dt_s": self.frame_dt,
+            "substeps": int(sum(entry["substeps"] for entry in log)),
+            "simulated_s": float(state.time),
+            "wall_s": dict(walls.seconds),
+            "peak_memory_bytes": peak.read(),
+            "energy_start_J": energy[0] if energy else None,
+            "energy_end_J": energy[-1] if energy else None,
+            "largest_cfl": max((entry["cfl"] for entry in log), default=None),
+            "lost_particles": int(log[-1]["lost"]) if log else 0,
+            "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
+            "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
+            "displacement_mean_max_m": max(moved, default=None),
+            "per_frame": log,
+        }
+
+
+class _Walls:
+    """Seconds spent in each part of the run; waits for the GPU at the borders."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.seconds = {"simulation": 0.0, "shading": 0.0, "rendering": 0.0, "writing": 0.0}
+
+    @contextmanager
+    def __call__(self, part: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            if self.device.type == "cuda":
+                torch.cuda.synchronize(self.device)
+            self.seconds[part] += time.perf_counter() - start
+
+
+class _PeakMemory:
+    """Largest memory of the process and, on a GPU, of torch's allocator."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device)
+
+    def read(self) -> dict[str, int | None]:
+        unit = 1 if sys.platform == "darwin" else 1024
+        host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+        device = torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
+        return {"host": host, "device": device}
+
+
+def describe_device(device: torch.device) -> str:
+    """Name of the processor or GPU, with the number of threads."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
+
+
+def versions() -> dict[str, str]:
+    """Versions that a number depends on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version(), "gaussian_swaying": gaussian_swaying.__version__}
+    for name in ("torch", "gsplat", "numpy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+__all__ = ["SimulationPipeline", "describe_device", "versions"]

@@ -1,0 +1,284 @@
+"""The scene of a run: which Gaussians move, what they are made of, and how they follow the material."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying.data.procedural import ProceduralScene
+from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
+from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, deform_covariance, deform_normal
+from gaussian_swaying.mpm.linalg import polar_rotation
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.frame import SimFrame
+
+
+@dataclass
+class MaterialRegion:
+    """Different material in a part of the object.
+
+    Args:
+        region: Where, in scene units.
+        E: Young's modulus [Pa]; unchanged if null.
+        nu: Poisson's ratio; unchanged if null.
+        density: Density [kg/m³]; unchanged if null.
+        thickness: Thickness of the surface [m]; unchanged if null.
+    """
+
+    region: Region
+    E: float | None = None
+    nu: float | None = None
+    density: float | None = None
+    thickness: float | None = None
+
+
+@dataclass
+class Material:
+    """What the object is made of.
+
+    Args:
+        E: Young's modulus [Pa].
+        nu: Poisson's ratio, below 0.5.
+        density: Density [kg/m³].
+        thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
+        volume: ``patch`` (area x thickness) or ``cell`` (PhysGaussian's rule for solids: cell volume / particles in it).
+        regions: Parts made of something else; later entries win.
+    """
+
+    E: float = 1e5
+    nu: float = 0.3
+    density: float = 200.0
+    thickness: float = 0.01
+    volume: str = "patch"
+    regions: list[MaterialRegion] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        check_choice("material.volume", self.volume, ("patch", "cell"))
+        for entry in (self, *self.regions):
+            for name in ("E", "density", "thickness"):
+                if getattr(entry, name) is not None:
+                    check_positive(f"material.{name}", getattr(entry, name))
+            if entry.nu is not None and not -1 < entry.nu < 0.5:
+                raise ValueError(
+                    f"Expected `material.nu` (Poisson's ratio) to lie between -1 and 0.5, both excluded, but got "
+                    f"{entry.nu}: use 0.49 for something like rubber."
+                )
+
+
+class Scene:
+    """Where the Gaussians come from and which of them are simulated.
+
+    Args:
+        ply: A 3DGS .ply file; takes precedence over ``generator``.
+        generator: A scene made in code.
+        region: Part that is simulated, in scene units; the rest stays as it is and is rendered with it.
+        opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
+        faint: What those do: ``carry`` (follow their nearest simulated neighbour), ``static`` or ``drop``.
+        up: Direction in the scene that points up, for example [0, -1, 0].
+        longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
+        metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
+        area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface) or ``paper`` (pi s1 s2).
+    """
+
+    def __init__(
+        self,
+        ply: str | os.PathLike[str] | None = None,
+        generator: ProceduralScene | None = None,
+        region: Region | None = None,
+        opacity_threshold: float = 0.1,
+        faint: str = "carry",
+        up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
+        longest_side: float | None = None,
+        metres_per_unit: float | None = None,
+        area: str = "coverage",
+    ) -> None:
+        check_choice("scene.faint", faint, ("carry", "static", "drop"))
+        check_choice("scene.area", area, ("coverage", "paper"))
+        check_vector("scene.up", up)
+        if not 0 <= opacity_threshold < 1:
+            raise ValueError(f"Expected `scene.opacity_threshold` to lie in [0, 1), but got {opacity_threshold}.")
+        if ply is None and generator is None:
+            raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
+        self.ply, self.generator, self.region = ply, generator, region or Everything()
+        self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
+        self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
+
+    def cloud(self) -> GaussianCloud:
+        """Read the file or run the generator."""
+        if self.ply is not None:
+            return read_ply(self.ply)
+        assert self.generator is not None
+        return self.generator.generate()
+
+
+@dataclass(frozen=True)
+class SceneGaussians:
+    """All Gaussians of the picture at one moment, in scene units and axes.
+
+    Attributes:
+        means: Positions, shape (N, 3).
+        covariances: Covariances, shape (N, 3, 3).
+        normals: Unit normals, shape (N, 3).
+        rotations: Rotation of each from rest, shape (N, 3, 3).
+    """
+
+    means: Tensor
+    covariances: Tensor
+    normals: Tensor
+    rotations: Tensor
+
+
+class SimulatedScene(nn.Module):
+    """Gaussians, material points and patches of one scene, and how the first follow the second.
+
+    Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
+    simulated one, static ones stay.
+
+    Args:
+        scene: Where the Gaussians come from.
+        material: What they are made of.
+        dx: Grid spacing [m], for ``material.volume = "cell"``.
+        dtype: Precision of the simulation.
+    """
+
+    def __init__(self, scene: Scene, material: Material, dx: float, dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        cloud = scene.cloud()
+        opacity = torch.sigmoid(cloud.opacities)
+        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold)
+        faint = scene.region.contains(cloud.means) & ~chosen
+        if scene.faint == "drop" and bool(faint.any()):
+            cloud, chosen, faint = cloud.select(~faint), chosen[~faint], faint[~faint]
+        self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
+        simulated = chosen.nonzero()[:, 0]
+        self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
+        normals = self.model.normals()
+        areas = GaussianSurfaceModel.from_cloud(cloud.select(chosen), requires_grad=False).areas(scene.area)
+        self.register_buffer("simulated", simulated)
+        carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
+        self.register_buffer("carried", carried)
+        self.register_buffer("anchor", nearest(cloud.means[carried], cloud.means[simulated]))
+        self.register_buffer("rest_covariances", self.model.covariance())
+        self.register_buffer("rest_normals", normals)
+        position = self.frame.point_to_sim(cloud.means[simulated].double())
+        self.register_buffer("patch_normal", self.frame.direction_to_sim(normals[simulated]).to(dtype))
+        self.register_buffer("patch_area", self.frame.area_to_sim(areas).to(dtype))
+        self.simulated: Tensor
+        self.carried: Tensor
+        self.anchor: Tensor
+        self.rest_covariances: Tensor
+        self.rest_normals: Tensor
+        self.patch_normal: Tensor
+        self.patch_area: Tensor
+        fields = {name: torch.full((len(simulated),), getattr(material, name)) for name in _MATERIAL_FIELDS}
+        for entry in material.regions:
+            inside = entry.region.contains(cloud.means[simulated])
+            if not bool(inside.any()):
+                raise ValueError(f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian.")
+            for name in _MATERIAL_FIELDS:
+                if getattr(entry, name) is not None:
+                    fields[name][inside] = getattr(entry, name)
+        if material.volume == "patch":
+            volume = self.patch_area * fields["thickness"].to(dtype)
+        else:
+            volume = cell_volume(position, dx).to(dtype)
+        self.points = MaterialPoints.create(
+            position.to(dtype),
+            volume=volume,
+            density=fields["density"].to(dtype),
+            youngs_modulus=fields["E"].to(dtype),
+            poisson_ratio=fields["nu"].to(dtype),
+        )
+
+    def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
+        super()._apply(fn, recurse)
+        self.points = self.points.map(fn)
+        return self
+
+    @property
+    def center(self) -> Tensor:
+        """Centre of the simulated part at rest, scene units, shape (3,)."""
+        return self.frame.origin
+
+    @property
+    def size(self) -> float:
+        """Longest side of the simulated part at rest, scene units."""
+        low, high = self.bounds()
+        return float((high - low).amax())
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Smallest and largest corner of the simulated part at rest, scene units, each of shape (3,)."""
+        means = self.model.means[self.simulated]
+        return means.amin(0), means.amax(0)
+
+    def rest(self) -> SceneGaussians:
+        """The Gaussians at rest."""
+        means = self.model.means.detach()
+        eye = torch.eye(3, dtype=means.dtype, device=means.device).expand(len(means), 3, 3)
+        return SceneGaussians(means, self.rest_covariances, self.rest_normals, eye)
+
+    def deformed(self, state: MPMState) -> SceneGaussians:
+        """The Gaussians where the material has taken them: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
+
+        Args:
+            state: State of one scene, fields of shape (P, ·).
+
+        Returns:
+            All Gaussians, the static ones at rest.
+        """
+        rest = self.rest()
+        kind = rest.means.dtype
+        move = self.frame.displacement_to_scene((state.position - self.points.position).to(kind))
+        F = self.frame.gradient_to_scene(state.F_total.to(kind))
+        index, gradient = self.simulated, F
+        means = rest.means.clone()
+        means[index] = rest.means[index] + move
+        if len(self.carried):
+            anchor = self.simulated[self.anchor]
+            arm = rest.means[self.carried] - rest.means[anchor]
+            means[self.carried] = means[anchor] + (F[self.anchor] @ arm[..., None])[..., 0]
+            index, gradient = torch.cat([index, self.carried]), torch.cat([F, F[self.anchor]])
+        covariances, normals, rotations = rest.covariances.clone(), rest.normals.clone(), rest.rotations.clone()
+        covariances[index] = deform_covariance(gradient, rest.covariances[index])
+        normals[index] = deform_normal(gradient, rest.normals[index])
+        rotations[index] = polar_rotation(gradient)
+        return SceneGaussians(means, covariances, normals, rotations)
+
+
+_MATERIAL_FIELDS = ("E", "nu", "density", "thickness")
+
+
+def nearest(queries: Tensor, points: Tensor, chunk: int = 2**26) -> Tensor:
+    """Index of the nearest point for each query, by exhaustive search in chunks.
+
+    Args:
+        queries: Shape (M, 3).
+        points: Shape (P, 3).
+        chunk: Largest number of distances in memory.
+
+    Returns:
+        Shape (M,), int64.
+    """
+    rows = max(1, chunk // max(len(points), 1))
+    parts = [torch.cdist(part, points).argmin(1) for part in queries.split(rows)] if len(queries) else []
+    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.long, device=points.device)
+
+
+def cell_volume(position: Tensor, dx: float) -> Tensor:
+    """PhysGaussian's rule for solids: the volume of the grid cell over the number of particles in it.
+
+    Args:
+        position: Rest position [m], shape (P, 3).
+        dx: Grid spacing [m].
+
+    Returns:
+        Volume [m³], shape (P,).
+    """
+    cell = torch.floor(position / dx).long()
+    _, inverse, counts = torch.unique(cell, dim=0, return_inverse=True, return_counts=True)
+    return dx**3 / counts[inverse].to(position.dtype)

@@ -1,0 +1,328 @@
+"""Whole steps of both formulations against exact laws of motion."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+
+FORMULATIONS = ["total", "updated"]
+
+
+def _block(*batch, dtype=torch.float64, device="cpu", count=200, e=1e4, density=100.0):
+    generator = torch.Generator().manual_seed(3)
+    position = 0.4 * torch.rand(*batch, count, 3, generator=generator, dtype=torch.float64)
+    return MaterialPoints.create(
+        position.to(device, dtype), volume=0.4**3 / count, density=density, youngs_modulus=e, poisson_ratio=0.3
+    )
+
+
+def _sheet(width=0.6, height=0.4, spacing=0.025, dtype=torch.float32, e=3e3, density=30.0):
+    x = (torch.arange(round(width / spacing), dtype=dtype) + 0.5) * spacing
+    z = (torch.arange(round(height / spacing), dtype=dtype) + 0.5) * spacing
+    gx, gz = (g.reshape(-1) for g in torch.meshgrid(x, z, indexing="ij"))
+    position = torch.stack([gx, 0.003 * torch.sin(9 * gx), gz], dim=-1)
+    return MaterialPoints.create(
+        position, volume=spacing**2 * 0.01, density=density, youngs_modulus=e, poisson_ratio=0.3
+    )
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_free_fall_follows_the_symplectic_sum(formulation, device, dtype):
+    """x_n = x0 + g dt² n (n + 1) / 2 for every particle, and no strain."""
+    points = _block(dtype=dtype, device=device)
+    solver = MPMSolver(dx=0.1, formulation=formulation)
+    dt, steps = 1e-3, 50
+    state = solver.rollout(solver.init_state(points), dt, steps)
+    fall = -9.8 * dt * dt * steps * (steps + 1) / 2
+    # round-off: each of the steps may err by a few ulp of the largest coordinate
+    tol = 4 * steps * torch.finfo(dtype).eps
+    expected = points.position + torch.tensor([0.0, 0.0, fall], dtype=dtype, device=device)
+    torch.testing.assert_close(state.position, expected, rtol=0, atol=tol)
+    assert float((state.F_elastic - torch.eye(3, dtype=dtype, device=device)).abs().max()) < 10 * tol / 0.1
+    assert float(state.time) == pytest.approx(steps * dt)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_free_body_conserves_both_momenta(formulation):
+    """Whole steps of a deforming, spinning body with stress, 1e-12 relative over 200 steps."""
+    points = _block()
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    centre = points.position.mean(0)
+    omega = torch.tensor([0.3, -0.5, 0.8], dtype=torch.float64)
+    velocity = torch.linalg.cross(omega.expand_as(points.position), points.position - centre) + 0.2
+    velocity = velocity + 0.5 * (points.position - centre)
+    state = solver.init_state(points, velocity)
+
+    def momenta(s):
+        if s.node_velocity is not None:
+            mass = solver._static["node_mass"]
+            place = s.grid.node_positions(points.position) + s.node_displacement
+            linear = (mass[:, None] * s.node_velocity).sum(0)
+            return linear, torch.linalg.cross(place, mass[:, None] * s.node_velocity).sum(0)
+        linear = (points.mass[:, None] * s.velocity).sum(0)
+        spin = s.affine * points.mass[:, None, None] * solver.dx**2 / 4
+        spin = torch.stack(
+            [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]], -1
+        )
+        return linear, (torch.linalg.cross(s.position, points.mass[:, None] * s.velocity) + spin).sum(0)
+
+    if formulation == "updated":
+        affine = 0.5 * torch.eye(3, dtype=torch.float64) + torch.tensor(
+            [[0, -omega[2], omega[1]], [omega[2], 0, -omega[0]], [-omega[1], omega[0], 0]], dtype=torch.float64
+        )
+        state = state.replace(affine=affine.expand_as(state.affine))
+    before = momenta(state)
+    after = momenta(solver.rollout(state, 1e-3, 200))
+    for a, b in zip(before, after, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12 * float(before[0].norm() + before[1].norm()))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_uniform_strain_gives_uniform_motion(formulation):
+    """An affine velocity field is reproduced: F follows I + dt A exactly in the first step."""
+    points = _block()
+    a = torch.tensor([[0.1, 0.4, 0.0], [-0.3, 0.2, 0.1], [0.0, 0.2, -0.1]], dtype=torch.float64)
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    state = solver.init_state(points, points.position @ a.T)
+    if formulation == "updated":
+        state = state.replace(affine=a.expand_as(state.affine))
+    else:
+        state = state.replace(node_velocity=state.grid.node_positions(points.position) @ a.T)
+    end = solver.step(state, 1e-3)
+    expected = torch.eye(3, dtype=torch.float64) + 1e-3 * a
+    torch.testing.assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
+    torch.testing.assert_close(end.position, points.position @ expected.T, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_external_force_moves_the_centre_of_mass(formulation):
+    points = _block()
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    force = torch.rand(200, 3, dtype=torch.float64) * 1e-2
+    state = solver.rollout(solver.init_state(points), 1e-3, 20, lambda _: force)
+    momentum = (points.mass[:, None] * state.velocity).sum(0)
+    torch.testing.assert_close(momentum, force.sum(0) * 0.02, rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_damping_is_a_rate_and_not_per_substep(formulation):
+    points = _block()
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), damping=3.0)
+    velocity = torch.ones(200, 3, dtype=torch.float64)
+    for steps in (10, 40):
+        end = solver.rollout(solver.init_state(points, velocity), 0.1 / steps, steps)
+        torch.testing.assert_close(end.velocity, velocity * torch.exp(torch.tensor(-0.3, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_batch_equals_scenes_alone(formulation, device):
+    """(B, P, 3) is B independent scenes, each with its own material and wind."""
+    points = _block(2, 2, device=device)
+    points = dataclasses.replace(
+        points, youngs_modulus=points.youngs_modulus * torch.tensor([[1.0, 2.0], [3.0, 4.0]], device=device)[..., None]
+    )
+    force = 1e-3 * torch.randn(2, 2, 200, 3, dtype=torch.float64, device=device)
+    pin = [PinnedRegion(Box([None, None, 0.35], [None, None, None]))]
+    together = MPMSolver(dx=0.1, formulation=formulation, boundaries=pin)
+    state = together.rollout(together.init_state(points), 1e-3, 10, lambda _: force)
+    assert state.position.shape == (2, 2, 200, 3)
+    for i in range(2):
+        for j in range(2):
+            alone = MPMSolver(dx=0.1, formulation=formulation, boundaries=pin)
+            single = alone.init_state(points.map(lambda t, i=i, j=j: t[i, j]))
+            end = alone.rollout(single, 1e-3, 10, lambda _, i=i, j=j: force[i, j])
+            torch.testing.assert_close(state.position[i, j], end.position, rtol=0, atol=1e-12)
+            torch.testing.assert_close(state.F_total[i, j], end.F_total, rtol=0, atol=1e-12)
+
+
+def test_formulations_agree_on_a_vibrating_block():
+    """A free block in its first stretching mode, over most of a period, within the discretisation error of either."""
+    axis = (torch.arange(12, dtype=torch.float64) + 0.5) / 30
+    position = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points = MaterialPoints.create(
+        position, volume=1 / 27000, density=100.0, youngs_modulus=2e4, poisson_ratio=0.3
+    )
+    velocity = torch.zeros_like(position)
+    velocity[:, 0] = -torch.cos(torch.pi * position[:, 0] / 0.4)
+    ends = []
+    for formulation in FORMULATIONS:
+        solver = MPMSolver(dx=1 / 15, formulation=formulation, gravity=(0, 0, 0))
+        ends.append(solver.rollout(solver.init_state(points, velocity), 5e-4, 50).position)
+    moved = (ends[0] - position).norm(dim=-1).max()
+    assert float(moved) > 0.005
+    assert float((ends[0] - ends[1]).norm(dim=-1).max()) < 0.25 * float(moved)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_flag_hung_by_one_row_does_not_slide_off(formulation):
+    """Ten seconds: a pin that only resets its particles lets the sheet fall at 70 % of free fall."""
+    points = _sheet(spacing=0.05, e=1e4)
+    pin = PinnedRegion(Box([None, None, 0.37], [None, None, None]))
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[pin], damping=0.5)
+    state = solver.init_state(points)
+    row = points.position[:, 2] > 0.37
+    assert int(row.sum()) == 12
+    with torch.inference_mode():
+        for _ in range(250):
+            steps = solver.substeps(state, 0.04)
+            state = solver.rollout(solver.fit_grid(state, 0.04), 0.04 / steps, steps)
+    # static stretch: rho g L² / (2 E) = 2.4 mm; free fall would be 490 m, sliding off 340 m
+    assert float((state.position - points.position)[row].norm(dim=-1).max()) < 0.01
+    assert float((state.position - points.position).norm(dim=-1).max()) < 0.05
+    assert not bool(state.lost.any())
+
+
+def test_total_moves_with_particles_on_half_cell_planes():
+    """A layer exactly on a half-cell plane gives nodes of zero mass; an unguarded division gives NaN."""
+    x = torch.arange(8, dtype=torch.float64) * 0.05 + 0.05
+    position = torch.stack(torch.meshgrid(x, torch.tensor([0.05], dtype=torch.float64), x, indexing="ij"), -1)
+    points = MaterialPoints.create(
+        position.reshape(-1, 3), volume=1e-5, density=30.0, youngs_modulus=3e3, poisson_ratio=0.3
+    )
+    for dtype in (torch.float32, torch.float64):
+        for shift in (0.0, 1e-9, -1e-8, 1e-5):
+            moved = points.map(lambda t, dtype=dtype: t.to(dtype))
+            moved = dataclasses.replace(moved, position=moved.position + shift)
+            solver = MPMSolver(dx=0.1, boundaries=[PinnedRegion(Box([None, None, 0.35], [None, None, None]))])
+            state = solver.rollout(solver.init_state(moved), 1e-3, 200)
+            assert bool(torch.isfinite(state.position).all())
+            assert float((state.F_elastic - torch.eye(3, dtype=dtype)).abs().max()) < 0.5
+
+
+def test_grid_follows_the_object_without_changing_the_motion():
+    points = _block(count=50)
+    velocity = torch.tensor([5.0, -3.0, 0.0], dtype=torch.float64).expand(50, 3)
+    solver = MPMSolver(dx=0.1, formulation="updated")
+    following = fixed = solver.init_state(points, velocity, margin=40)
+    for _ in range(5):
+        following = solver.rollout(solver.fit_grid(following, 0.04), 2e-3, 20)
+        fixed = solver.rollout(fixed, 2e-3, 20)
+    assert following.grid != fixed.grid
+    assert following.grid.node_count < 0.1 * fixed.grid.node_count
+    torch.testing.assert_close(following.position, fixed.position, rtol=0, atol=1e-13)
+    assert not bool(following.lost.any())
+
+
+def test_particle_that_outruns_its_grid_is_marked_lost():
+    points = _block(count=20)
+    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0))
+    state = solver.init_state(points, torch.full((20, 3), 50.0, dtype=torch.float64), margin=1)
+    state = solver.rollout(state, 2e-3, 20)
+    assert bool(state.lost.any())
+
+
+def test_grid_that_grows_too_large_is_refused():
+    points = _block(count=20)
+    with pytest.raises(ValueError, match=r"more than `max_nodes` = 100"):
+        MPMSolver(dx=0.05, max_nodes=100).init_state(points)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_state_dict_round_trip(formulation, tmp_path):
+    solver = MPMSolver(dx=0.1, formulation=formulation)
+    state = solver.rollout(solver.init_state(_block()), 1e-3, 5)
+    torch.save(state.state_dict(), tmp_path / "state.pt")
+    back = MPMState.from_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert back.grid == state.grid
+    for field in dataclasses.fields(MPMState):
+        a, b = getattr(state, field.name), getattr(back, field.name)
+        assert (a is None and b is None) or isinstance(a, GridSpec) or torch.equal(a, b), field.name
+    one, two = solver.step(state, 1e-3), solver.step(back, 1e-3)
+    assert torch.equal(one.position, two.position)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_same_run_twice_is_bit_identical_on_the_cpu(formulation):
+    ends = []
+    for _ in range(2):
+        points = _block(dtype=torch.float32, count=4000)
+        solver = MPMSolver(dx=0.05, formulation=formulation)
+        ends.append(solver.rollout(solver.init_state(points, 0.1 * points.position), 1e-3, 20))
+    assert torch.equal(ends[0].position, ends[1].position)
+    assert torch.equal(ends[0].F_elastic, ends[1].F_elastic)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_step_is_differentiable(formulation):
+    """Gradient of a few steps with respect to the initial velocity and a force, against finite differences."""
+    points = _block(count=4)
+    solver = MPMSolver(dx=0.2, formulation=formulation)
+
+    def run(velocity, force):
+        state = solver.rollout(solver.init_state(points, velocity), 1e-3, 3, lambda _: force)
+        return state.position, state.F_elastic
+
+    velocity = torch.randn(4, 3, dtype=torch.float64).requires_grad_()
+    force = (1e-2 * torch.randn(4, 3, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(run, (velocity, force), fast_mode=True)
+
+
+def test_energies_of_known_states():
+    points = _block()
+    solver = MPMSolver(dx=0.1)
+    state = solver.init_state(points, torch.tensor([1.0, 2.0, 2.0], dtype=torch.float64).expand(200, 3))
+    energies = solver.energies(state)
+    mass = float(points.mass.sum())
+    assert float(energies["kinetic"]) == pytest.approx(0.5 * mass * 9)
+    assert float(energies["elastic"]) == pytest.approx(0.0, abs=1e-20)
+    assert float(energies["potential"]) == pytest.approx(9.8 * float((points.mass * points.position[:, 2]).sum()))
+
+
+def test_module_moves_its_material(dtype):
+    solver = MPMSolver(dx=0.1)
+    solver.init_state(_block())
+    solver.to(dtype)
+    assert solver.points.position.dtype == dtype
+    assert solver._static["node_mass"].dtype == dtype
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"dx": 0.0}, "`dx` to be positive"),
+        ({"formulation": "lagrange"}, "`formulation` to be one of total, updated"),
+        ({"gravity": (0, 0)}, "`gravity` to have 3 numbers, but got 2"),
+        ({"damping": -1.0}, "`damping` to not be negative"),
+        ({"cfl": 0.0}, "`cfl` to be positive"),
+        ({"substep": -1e-3}, "`substep` to be positive"),
+    ],
+)
+def test_bad_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        MPMSolver(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"poisson_ratio": 0.5}, "`nu` .* between -1 and 0.5, both excluded, but got 0.5"),
+        ({"youngs_modulus": 0.0}, "`E` .* positive and finite"),
+        ({"density": -3.0}, "`density` to be positive .* but got -3"),
+        ({"volume": -1e-3}, "`volume` to be positive"),
+        ({"density": float("nan")}, "`density` to be positive"),
+    ],
+)
+def test_bad_material_is_refused(arguments, message):
+    good = {"volume": 1e-3, "density": 1.0, "youngs_modulus": 1e3, "poisson_ratio": 0.3}
+    with pytest.raises(ValueError, match=message):
+        MaterialPoints.create(torch.rand(5, 3), **(good | arguments))
+
+
+def test_shapes_are_checked():
+    solver = MPMSolver(dx=0.1)
+    state = solver.init_state(_block(count=64))
+    with pytest.raises(ValueError, match=r"Expected `force` of shape \(64, 3\), but got \(64, 2\)"):
+        solver.step(state, 1e-3, torch.zeros(64, 2))
+    with pytest.raises(ValueError, match=r"Expected `velocity` of shape \(64, 3\), but got \(63, 3\)"):
+        solver.init_state(_block(count=64), torch.zeros(63, 3))
+    with pytest.raises(TypeError, match="Expected `points` to be a MaterialPoints"):
+        solver.init_state(torch.zeros(3, 3))
+    with pytest.raises(ValueError, match=r"Expected `mass` of shape \(5,\)"):
+        MaterialPoints(torch.rand(5, 3), torch.rand(4), *(torch.rand(5) for _ in range(3)))
+    with pytest.raises(RuntimeError, match="call `init_state"):
+        MPMSolver().points  # noqa: B018

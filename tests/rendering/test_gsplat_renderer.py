@@ -1,0 +1,82 @@
+"""The gsplat renderer against the torch renderer."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.rendering.base import make_renderer
+from gaussian_swaying.rendering.camera import look_at_camera
+from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, render_gsplat
+from gaussian_swaying.rendering.torch_renderer import render_torch
+
+
+def _camera():
+    return look_at_camera((0.2, -3.0, 0.4), (0, 0, 0), (0, 0, 1), 40.0, 480, 270)
+
+
+def _scene(count=10_000, device="cuda"):
+    generator = torch.Generator().manual_seed(1)
+    means = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([3.0, 8.0, 2.0])
+    factors = torch.randn(count, 3, 3, generator=generator) * 0.02 * torch.tensor([1.0, 1.0, 0.05])
+    opacities, colors = torch.rand(count, generator=generator), torch.rand(count, 3, generator=generator)
+    return tuple(item.to(device) for item in (means, factors @ factors.mT, opacities, colors))
+
+
+@pytest.mark.gpu
+def test_matches_the_torch_renderer():
+    """Same conventions; single pixels differ where alpha or transmittance is at a threshold."""
+    background = torch.tensor([0.3, 0.6, 0.9], device="cuda")
+    result = GsplatRenderer()(*_scene(), _camera(), background)
+    expected = render_torch(*_scene(), _camera(), background)
+    assert 0.3 < float(expected.alpha.mean()) < 0.99
+    for name in ("color", "alpha", "depth"):
+        difference = (getattr(result, name) - getattr(expected, name)).abs().flatten()
+        scale = 1.0 if name != "depth" else 7.0
+        assert float(difference.mean()) <= 1e-3 * scale, name
+        assert float(difference.quantile(0.999)) <= 1e-2 * scale, name
+
+
+@pytest.mark.gpu
+def test_gradients_match_the_torch_renderer():
+    gradients = []
+    for render in (render_gsplat, render_torch):
+        scene = [item.clone().requires_grad_() for item in _scene(500)]
+        render(*scene, _camera()).color.square().sum().backward()
+        gradients.append([scene[0].grad, scene[2].grad, scene[3].grad])
+    for actual, expected in zip(*gradients, strict=True):
+        assert float((actual - expected).norm() / expected.norm()) < 0.02
+
+
+@pytest.mark.gpu
+def test_nothing_visible_and_bad_gaussians():
+    background = torch.tensor([0.2, 0.5, 1.0], device="cuda")
+    scene = _scene(100)
+    empty = tuple(item[:0] for item in scene)
+    behind = (scene[0] - torch.tensor([0.0, 50.0, 0.0], device="cuda"), *scene[1:])
+    for gaussians in (empty, behind):
+        result = render_gsplat(*gaussians, _camera(), background)
+        assert result.color.eq(background).all()
+        assert result.alpha.eq(0).all()
+        assert result.depth.eq(0).all()
+    expected = render_gsplat(*scene, _camera(), background)
+    for field in range(4):
+        extra = [item[:1].clone() for item in scene]
+        extra[field].fill_(math.nan)
+        result = render_gsplat(*(torch.cat(pair) for pair in zip(scene, extra, strict=True)), _camera(), background)
+        torch.testing.assert_close(result.color, expected.color)
+
+
+@pytest.mark.gpu
+def test_make_renderer_with_cuda():
+    assert isinstance(make_renderer("cuda:0"), GsplatRenderer)
+    with pytest.raises(RuntimeError, match="CUDA device"):
+        GsplatRenderer()(*_scene(5, "cpu"), _camera())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without CUDA")
+def test_missing_cuda_is_named():
+    with pytest.raises(RuntimeError, match=r"needs CUDA.*TorchRenderer"):
+        GsplatRenderer()
+    with pytest.raises(RuntimeError, match="needs CUDA"):
+        render_gsplat(*_scene(5, "cpu"), _camera())

@@ -1,0 +1,133 @@
+"""Shading against closed-form values."""
+
+import math
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader, diffuse_shading, phong_shading
+
+COLOR = (0.2, 0.4, 0.8)
+
+
+def _case(dtype, device="cpu"):
+    color = torch.tensor(COLOR, dtype=dtype, device=device)
+    light = torch.tensor([0.0, 0.0, 1.0], dtype=dtype, device=device)
+    angle = math.radians(30.0)
+    normal = torch.tensor([math.sin(angle), 0.0, math.cos(angle)], dtype=dtype, device=device)
+    return color, normal, light
+
+
+def _random_normals(count=50):
+    return normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+
+
+def test_diffuse_is_the_cosine(device, dtype):
+    color, normal, light = _case(dtype, device)
+    shaded = diffuse_shading(color, normal, light)
+    assert shaded.dtype == dtype
+    torch.testing.assert_close(shaded, color * math.cos(math.radians(30.0)))
+
+
+def test_diffuse_is_black_when_it_faces_away_unless_two_sided():
+    color, normal, light = _case(torch.float64)
+    assert diffuse_shading(color, -normal, light).eq(0).all()
+    torch.testing.assert_close(
+        diffuse_shading(color, -normal, light, two_sided=True), diffuse_shading(color, normal, light)
+    )
+
+
+def test_ambient_blends_linearly():
+    color, normal, light = _case(torch.float64)
+    cosine = math.cos(math.radians(30.0))
+    torch.testing.assert_close(diffuse_shading(color, normal, light, ambient=0.25), color * (0.25 + 0.75 * cosine))
+    torch.testing.assert_close(diffuse_shading(color, -normal, light, ambient=0.25), color * 0.25)
+    torch.testing.assert_close(diffuse_shading(color, -normal, light, ambient=1.0), color)
+
+
+def test_relative_diffuse_is_the_ratio_of_the_factors():
+    color, normal, light = _case(torch.float64)
+    rest = torch.tensor([math.sin(1.0), 0.0, math.cos(1.0)], dtype=torch.float64)
+    expected = color * math.cos(math.radians(30.0)) / math.cos(1.0)
+    torch.testing.assert_close(diffuse_shading(color, normal, light, rest_normal=rest), expected)
+    grazing = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)  # factor 0, raised to 0.1
+    torch.testing.assert_close(diffuse_shading(color, light, light, rest_normal=grazing), 10.0 * color)
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+def test_relative_leaves_the_rest_picture_unchanged(two_sided):
+    normal, color, view = _random_normals(), torch.rand(50, 3, dtype=torch.float64), _random_normals()
+    for shader in (
+        DiffuseShader((1.0, -2.0, 0.5), two_sided=two_sided, relative=True),
+        PhongShader((1.0, -2.0, 0.5), k_a=0.0, two_sided=two_sided, relative=True),
+    ):
+        torch.testing.assert_close(shader(color, normal, normal, view), color, rtol=0, atol=1e-15)
+        assert (shader(color, _random_normals(), normal, view) - color).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("shader", [DiffuseShader((0, 1, 1), True, 0.2), PhongShader((0, 1, 1), two_sided=True)])
+def test_two_sided_does_not_see_the_sign_of_the_normal(shader):
+    normal, color, view = _random_normals(), torch.rand(50, 3, dtype=torch.float64), _random_normals()
+    torch.testing.assert_close(shader(color, normal, None, view), shader(color, -normal, None, view))
+
+
+def test_phong_closed_form(dtype):
+    """Normal at 30 degrees from the light: the mirror direction is at 60 degrees; the eye is 10 degrees off it."""
+    color, normal, light = _case(dtype)
+    eye = math.radians(50.0)
+    view = torch.tensor([math.sin(eye), 0.0, math.cos(eye)], dtype=dtype)
+    shaded = phong_shading(color, normal, light, view, 0.1, 0.5, 0.3, 8.0)
+    expected = color * (0.1 + 0.5 * math.cos(math.radians(30.0))) + 0.3 * math.cos(math.radians(10.0)) ** 8
+    torch.testing.assert_close(shaded, expected)
+    away = phong_shading(color, normal, light, -view, 0.1, 0.5, 0.3, 8.0)
+    torch.testing.assert_close(away, color * (0.1 + 0.5 * math.cos(math.radians(30.0))))
+
+
+def test_phong_relative_subtracts_the_rest_highlight():
+    color, normal, light = _case(torch.float64)
+    shader = PhongShader((0, 0, 3), 0.2, 0.6, 0.5, 4.0, relative=True)
+    shaded = shader(color, normal, light, light)  # at rest: normal, light and eye coincide, highlight 1
+    cosine = math.cos(math.radians(30.0))
+    expected = color * (0.2 + 0.6 * cosine) / 0.8 + 0.5 * (math.cos(math.radians(60.0)) ** 4 - 1.0)
+    torch.testing.assert_close(shaded, expected.clamp_min(0.0))
+    assert shaded.min() == 0.0
+    assert shaded.max() > 0.0
+
+
+def test_light_is_normalised_and_negative_colours_are_clamped():
+    color, normal, _ = _case(torch.float32)
+    torch.testing.assert_close(DiffuseShader((0, 0, 7.0))(color, normal), DiffuseShader()(color, normal))
+    assert DiffuseShader()(-color, normal).eq(0).all()
+
+
+def test_gradients():
+    color, normal, view = torch.rand(5, 3, dtype=torch.float64), _random_normals(5), _random_normals(5)
+    color.requires_grad_()
+    normal.requires_grad_()
+    rest = _random_normals(5)
+    for shader in (DiffuseShader((1, 1, 1), True, 0.3, True), PhongShader((1, 1, 1), shininess=3.0, relative=True)):
+        assert torch.autograd.gradcheck(lambda c, n, shader=shader: shader(c, n, rest, view), (color, normal))
+
+
+@pytest.mark.parametrize("shader", [DiffuseShader, PhongShader])
+def test_bad_arguments(shader):
+    with pytest.raises(ValueError, match="`light`"):
+        shader(light=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="`light`"):
+        shader(light=(0.0, 1.0))
+    with pytest.raises(ValueError, match="`rest_normal`"):
+        shader(relative=True)(torch.ones(3), torch.ones(3), view_direction=torch.ones(3))
+    with pytest.raises(ValueError, match="`normal`"):
+        shader()(torch.ones(3), torch.ones(2), view_direction=torch.ones(3))
+
+
+def test_bad_coefficients():
+    with pytest.raises(ValueError, match="`ambient`"):
+        DiffuseShader(ambient=1.5)
+    with pytest.raises(ValueError, match="`k_s`"):
+        PhongShader(k_s=-0.1)
+    with pytest.raises(ValueError, match="`shininess`"):
+        PhongShader(shininess=0.0)
+    with pytest.raises(ValueError, match="`view_direction`"):
+        PhongShader()(torch.ones(3), torch.ones(3))

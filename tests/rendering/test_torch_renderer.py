@@ -1,0 +1,254 @@
+"""The torch renderer against a loop over pixels and Gaussians written from the equations."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.rendering.base import make_renderer
+from gaussian_swaying.rendering.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
+
+WIDTH, HEIGHT = 20, 14
+
+
+def _camera(dtype=torch.float64, near=0.2):
+    camera = look_at_camera((0.1, -2.0, 0.2), (0, 0, 0), (0, 0, 1), 50.0, WIDTH, HEIGHT, near, dtype=dtype)
+    intrinsics = camera.intrinsics.clone()
+    intrinsics[0, 2] += 1.3  # principal point off the centre
+    intrinsics[0, 0] *= 1.1  # pixels that are not square
+    return Camera(camera.world_to_camera, intrinsics, WIDTH, HEIGHT, near)
+
+
+def _scene(count=40, dtype=torch.float64, device="cpu"):
+    """Overlapping, opaque, faint, thin and diagonal, partly off-screen and near-plane Gaussians."""
+    generator = torch.Generator().manual_seed(3)
+    means = (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5) * 2.6
+    factors = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64) * 0.15
+    opacities = torch.rand(count, generator=generator, dtype=torch.float64)
+    colors = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    opacities[:6] = 1.0
+    opacities[6] = 0.003  # below 1/255
+    factors[7:10] = torch.tensor([[0.6, 0, 0], [0, 0.6, 0], [0.6, 0, 0]]) * torch.tensor([1.0, 0.01, 1.0])  # needles
+    means[10] = torch.tensor([0.1, -1.9, 0.2])  # in front of the near plane
+    means[11] = torch.tensor([0.3, -4.0, 0.2])  # behind the camera
+    means[12] = torch.tensor([0.25, -1.7, 0.3])  # just behind the near plane, beyond the field of view
+    means[13] = torch.tensor([1.5, 0.0, 0.0])  # centre off-screen
+    factors[13] = torch.eye(3, dtype=torch.float64) * 0.4
+    means[14:18] *= 0.3  # large and opaque: they end the pixels behind them
+    factors[14:18] = torch.eye(3, dtype=torch.float64) * 0.3
+    opacities[14:18] = 1.0
+    covariances = factors @ factors.mT + 1e-6 * torch.eye(3, dtype=torch.float64)
+    return tuple(item.to(device, dtype) for item in (means, covariances, opacities, colors))
+
+
+def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3):
+    """One pixel and one Gaussian at a time."""
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    tan_x, tan_y = camera.width / (2 * fx), camera.height / (2 * fy)
+    splats = []
+    for mean, covariance, opacity, color in zip(means, covariances, opacities.tolist(), colors, strict=True):
+        x, y, z = (rotation @ mean + shift).tolist()
+        if z < camera.near:
+            continue
+        u = min((camera.width - cx) / fx + 0.3 * tan_x, max(-cx / fx - 0.3 * tan_x, x / z))
+        v = min((camera.height - cy) / fy + 0.3 * tan_y, max(-cy / fy - 0.3 * tan_y, y / z))
+        jacobian = torch.tensor([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]], dtype=torch.float64)
+        image = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + eps2d * torch.eye(2, dtype=torch.float64)
+        splats.append((z, fx * x / z + cx, fy * y / z + cy, torch.linalg.inv(image).tolist(), opacity, color))
+    splats.sort(key=lambda splat: splat[0])
+    color_image = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
+    alpha_image, depth_image = color_image[..., :1].clone(), color_image[..., :1].clone()
+    stopped = 0
+    for row in range(camera.height):
+        for column in range(camera.width):
+            transmittance = 1.0
+            for z, center_x, center_y, inverse, opacity, color in splats:
+                dx, dy = column + 0.5 - center_x, row + 0.5 - center_y
+                power = inverse[0][0] * dx * dx + 2 * inverse[0][1] * dx * dy + inverse[1][1] * dy * dy
+                alpha = min(0.999, opacity * math.exp(-0.5 * power))
+                if alpha < 1 / 255:
+                    continue
+                if transmittance * (1 - alpha) <= 1e-4:
+                    stopped += 1
+                    break
+                color_image[row, column] += transmittance * alpha * color
+                depth_image[row, column] += transmittance * alpha * z
+                transmittance *= 1 - alpha
+            alpha_image[row, column] = 1 - transmittance
+            color_image[row, column] += transmittance * background
+    return color_image, alpha_image, depth_image, stopped
+
+
+def test_matches_the_loop_over_pixels(device, dtype):
+    """Every rule of compositing occurs in the scene: see the assertions on the loop."""
+    background = torch.tensor([0.9, 0.1, 0.4], dtype=torch.float64)
+    color, alpha, depth, stopped = _oracle(*_scene(), _camera(), background)
+    assert stopped > 10
+    assert alpha.min() < 0.3
+    assert alpha.max() > 0.99
+    result = TorchRenderer()(*_scene(dtype=dtype, device=device), _camera(), background)
+    assert result.color.dtype == dtype
+    assert result.color.device.type == device.type
+    tolerance = 1e-10 if dtype == torch.float64 else 2e-4
+    torch.testing.assert_close(result.color.cpu().double(), color, atol=tolerance, rtol=0)
+    torch.testing.assert_close(result.alpha.cpu().double(), alpha, atol=tolerance, rtol=0)
+    torch.testing.assert_close(result.depth.cpu().double(), depth, atol=tolerance * 4, rtol=0)
+
+
+@pytest.mark.parametrize("index", [0, 7, 8, 12, 13])
+def test_matches_the_loop_for_one_gaussian(index):
+    """Alone: opaque, needles, beyond the clamp of the Jacobian, partly off-screen."""
+    scene = tuple(item[index : index + 1] for item in _scene())
+    color, alpha, _, _ = _oracle(*scene, _camera(), torch.zeros(3, dtype=torch.float64))
+    result = render_torch(*scene, _camera())
+    torch.testing.assert_close(result.color, color, atol=1e-10, rtol=0)
+    torch.testing.assert_close(result.alpha, alpha, atol=1e-10, rtol=0)
+    assert index == 12 or alpha.max() > 0.05
+
+
+def test_single_gaussian_closed_form():
+    """One pixel from the centre of a round splat with variance (f s / z)^2 + 0.3."""
+    camera = Camera(torch.eye(4).double(), torch.tensor([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]).double(), 9, 9)
+    means = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
+    covariances = 0.04 * torch.eye(3, dtype=torch.float64)[None]
+    result = render_torch(means, covariances, torch.tensor([0.6]).double(), torch.ones(1, 3).double(), camera)
+    assert float(result.alpha[4, 4]) == pytest.approx(0.6, abs=1e-7)
+    assert float(result.alpha[4, 5]) == pytest.approx(0.6 * math.exp(-0.5 / 1.3), abs=1e-7)
+    assert float(result.depth[4, 4]) == pytest.approx(1.2, abs=1e-7)
+
+
+def test_alpha_is_cut_at_both_ends():
+    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 4.5], [0, 10, 4.5], [0, 0, 1]]), 9, 9)
+    means, covariances = torch.tensor([[0.0, 0.0, 2.0]]), 0.02 * torch.eye(3)[None]
+    alpha = render_torch(means, covariances, torch.ones(1), torch.ones(1, 3), camera).alpha
+    assert float(alpha.max()) == pytest.approx(0.999, abs=1e-6)
+    assert float(alpha[alpha > 0].min()) >= 1 / 255
+    assert int((alpha > 0).sum()) < 81
+    assert render_torch(means, covariances, torch.full((1,), 0.0039), torch.ones(1, 3), camera).alpha.max() == 0
+
+
+def test_background_fills_what_is_left():
+    background = torch.tensor([0.2, 0.5, 1.0], dtype=torch.float64)
+    black, coloured = render_torch(*_scene(), _camera()), render_torch(*_scene(), _camera(), background)
+    torch.testing.assert_close(coloured.color, black.color + (1 - black.alpha) * background)
+    torch.testing.assert_close(coloured.depth, black.depth)
+
+
+def test_order_of_the_input_does_not_matter():
+    scene = _scene()
+    permutation = torch.randperm(len(scene[0]))
+    expected, result = render_torch(*scene, _camera()), render_torch(*(s[permutation] for s in scene), _camera())
+    torch.testing.assert_close(result.color, expected.color, atol=1e-12, rtol=0)
+    torch.testing.assert_close(result.depth, expected.depth, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("max_pairs", [1, 7, 100, 1 << 20])
+def test_memory_limit_does_not_change_the_picture(max_pairs):
+    expected, result = render_torch(*_scene(), _camera()), TorchRenderer(max_pairs=max_pairs)(*_scene(), _camera())
+    for name in ("color", "alpha", "depth"):
+        torch.testing.assert_close(getattr(result, name), getattr(expected, name), atol=1e-12, rtol=0)
+
+
+def test_deterministic_bit_for_bit():
+    scene = _scene(400, torch.float32)
+    first, second = render_torch(*scene, _camera()), render_torch(*scene, _camera())
+    assert torch.equal(first.color, second.color)
+    assert torch.equal(first.alpha, second.alpha)
+    with torch.inference_mode():
+        assert torch.equal(first.color, render_torch(*scene, _camera()).color)
+
+
+@pytest.mark.parametrize("case", ["none", "behind", "aside"])
+def test_nothing_visible(device, dtype, case):
+    scene = _scene(dtype=dtype, device=device)
+    if case == "none":
+        scene = tuple(item[:0] for item in scene)
+    else:
+        offset = torch.tensor([0.0, -9.0, 0.0] if case == "behind" else [900.0, 0.0, 0.0], dtype=dtype, device=device)
+        scene = (scene[0] + offset, *scene[1:])
+    background = torch.tensor([0.2, 0.5, 1.0], dtype=dtype, device=device)
+    result = render_torch(*scene, _camera(), background)
+    assert result.color.shape == (HEIGHT, WIDTH, 3)
+    assert result.color.eq(background).all()
+    assert result.alpha.shape == result.depth.shape == (HEIGHT, WIDTH, 1)
+    assert result.alpha.eq(0).all()
+    assert result.depth.eq(0).all()
+
+
+def test_bad_gaussians_do_not_poison_the_picture():
+    scene = _scene()
+    expected = render_torch(*scene, _camera())
+    for field in range(4):
+        for value in (math.nan, math.inf):
+            extra = [item[:1].clone() for item in scene]
+            extra[field].fill_(value)
+            result = render_torch(*(torch.cat(pair) for pair in zip(scene, extra, strict=True)), _camera())
+            torch.testing.assert_close(result.color, expected.color, atol=1e-12, rtol=0)
+    huge = (scene[0][:1], torch.eye(3).double()[None] * 1e305, scene[2][:1], scene[3][:1])
+    assert render_torch(*huge, _camera()).color.isfinite().all()
+
+
+def test_projection_is_sorted_and_keeps_what_is_seen():
+    projected = project_gaussians(*_scene()[:3], _camera())
+    assert (projected.depths.diff() >= 0).all()
+    kept = set(projected.index.tolist())
+    assert kept.isdisjoint({6, 10, 11})
+    assert {0, 7, 13} <= kept
+
+
+def test_gradcheck():
+    means, covariances, opacities, colors = (item[[20, 21, 22, 23]].clone() for item in _scene())
+    means *= 0.4  # inside the image
+    factors = torch.linalg.cholesky(covariances + 0.02 * torch.eye(3).double())
+    background = torch.rand(3, dtype=torch.float64)
+    inputs = (means, factors, 0.2 + 0.6 * opacities, colors, background)
+    for item in inputs:
+        item.requires_grad_()
+
+    def render(means, factors, opacities, colors, background):
+        result = render_torch(means, factors @ factors.mT, opacities, colors, _camera(), background, max_pairs=300)
+        return result.color[::4, ::4], result.alpha[::4, ::4], result.depth[::4, ::4]
+
+    assert all(float(output.detach().std()) > 0.01 for output in render(*inputs))
+    assert torch.autograd.gradcheck(render, inputs, eps=1e-7, atol=1e-5)
+
+
+def test_gradients_are_finite_where_gaussians_are_dropped():
+    scene = [item.clone().requires_grad_() for item in _scene(dtype=torch.float32)]
+    with torch.no_grad():
+        scene[0][0] = math.nan
+        scene[2][1] = 0.0
+    render_torch(*scene, _camera()).color.square().sum().backward()
+    for item in scene:
+        assert item.grad.isfinite().all()
+        assert item.grad.abs().sum() > 0
+    assert scene[0].grad[0].eq(0).all()
+
+
+def test_make_renderer_without_cuda():
+    assert isinstance(make_renderer("cpu"), TorchRenderer)
+    assert isinstance(make_renderer(torch.device("cpu")), TorchRenderer)
+    if not torch.cuda.is_available():
+        assert isinstance(make_renderer("cuda"), TorchRenderer)
+
+
+@pytest.mark.parametrize(
+    ("field", "name"), [(0, "means"), (1, "covariances"), (2, "opacities"), (3, "colors"), (4, "background")]
+)
+def test_bad_shapes_are_named(field, name):
+    scene = [*_scene(), torch.zeros(3)]
+    scene[field] = torch.zeros(7, 7)
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        render_torch(*scene[:4], _camera(), scene[4])
+    scene[field] = [1.0]
+    with pytest.raises(TypeError, match=f"`{name}`"):
+        render_torch(*scene[:4], _camera(), scene[4])
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="`eps2d`"):
+        TorchRenderer(eps2d=-0.1)
+    with pytest.raises(ValueError, match="`max_pairs`"):
+        TorchRenderer(max_pairs=0)

@@ -1,0 +1,8 @@
+"""Simulate a scene in the wind: ``python tools/sim.py --config configs/sim/flag.yaml``."""
+
+import sys
+
+from gaussian_swaying.simulation.config import main
+
+if __name__ == "__main__":
+    sys.exit(main())
