@@ -1,0 +1,186 @@
+"""The wind law against its closed forms and symmetries."""
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce, aero_force, drag_rate
+
+RHO = 1.225
+
+
+def _force(wind, normal, velocity=(0.0, 0.0, 0.0), area=1.0, **options):
+    arguments = {"drag": 0.0, "friction": 0.0, "lift": 0.0} | options
+    return aero_force(
+        torch.tensor(wind, dtype=torch.float64),
+        torch.tensor([velocity], dtype=torch.float64),
+        torch.nn.functional.normalize(torch.tensor([normal], dtype=torch.float64), dim=-1),
+        torch.tensor([area], dtype=torch.float64),
+        **arguments,
+    )[0]
+
+
+def _random(count=200):
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+    return torch.randn(3, dtype=torch.float64), torch.randn(count, 3, dtype=torch.float64), normal, torch.rand(count).double()
+
+
+def _vector(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_each_term_against_the_equation():
+    """Wind of 2 m/s along x on a patch at 45 degrees: q = rho / 2 * 4."""
+    q, root = 0.5 * RHO * 4, 0.5**0.5
+    normal = (root, 0.0, root)
+    torch.testing.assert_close(_force((2.0, 0, 0), normal, drag=0.5), q * 0.5 * _vector(root, 0, root))
+    # d - (d.n) n = (1/2, 0, -1/2)
+    torch.testing.assert_close(_force((2.0, 0, 0), normal, friction=0.4), q * 0.4 * _vector(0.5, 0, -0.5))
+    # d x n = (0, -root, 0)
+    torch.testing.assert_close(_force((2.0, 0, 0), normal, lift=0.1), q * 0.1 * _vector(0, -root, 0))
+    torch.testing.assert_close(
+        _force((2.0, 0, 0), normal, drag=0.5, law="projected"), q * 0.5 * root * _vector(root, 0, root)
+    )
+    torch.testing.assert_close(
+        _force((2.0, 0, 0), normal, friction=0.4, unit_tangent=True), q * 0.4 * _vector(root, 0, -root)
+    )
+    # (d x n) x d = n - (n.d) d
+    torch.testing.assert_close(
+        _force((2.0, 0, 0), normal, lift=0.1, lift_direction="lift"), q * 0.1 * _vector(0, 0, root)
+    )
+
+
+@pytest.mark.parametrize("law", ["paper", "projected"])
+def test_sign_of_the_normal_does_not_matter(law):
+    """A splat's normal has no outside: drag must never push upwind."""
+    wind, velocity, normal, area = _random()
+    options = {"drag": 0.5, "friction": 0.4, "lift": 0.01, "law": law}
+    one = aero_force(wind, velocity, normal, area, **options)
+    torch.testing.assert_close(one, aero_force(wind, velocity, -normal, area, **options))
+    drag = aero_force(wind, velocity, normal, area, drag=0.5, friction=0.0, lift=0.0, law=law)
+    assert bool(((drag * (wind - velocity)).sum(-1) >= 0).all())
+
+
+@pytest.mark.parametrize("law", ["paper", "projected"])
+def test_quadratic_linear_and_relative(law, device, dtype):
+    wind, velocity, normal, area = (t.to(device, dtype) for t in _random())
+    aero = AeroForce(law=law)
+    base = aero(wind, velocity, normal, area)
+    tol = {"rtol": 1e2 * torch.finfo(dtype).eps, "atol": 1e2 * torch.finfo(dtype).eps}
+    torch.testing.assert_close(aero(3 * wind, 3 * velocity, normal, area), 9 * base, **tol)
+    torch.testing.assert_close(aero(wind, velocity, normal, 2 * area), 2 * base, **tol)
+    drift = torch.tensor([1.0, -2.0, 0.5], device=device, dtype=dtype)
+    torch.testing.assert_close(aero(wind + drift, velocity + drift, normal, area), base, rtol=1e-4, atol=1e-5)
+    assert base.dtype == dtype
+
+
+@pytest.mark.parametrize("law", ["paper", "projected"])
+def test_still_air_exerts_nothing_and_has_a_gradient(law):
+    """The gradient of |v| at zero must not be NaN."""
+    velocity = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
+    normal = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=-1)
+    force = AeroForce(law=law)(torch.zeros(3, dtype=torch.float64), velocity, normal, torch.ones(4).double())
+    assert float(force.detach().abs().max()) == 0.0
+    force.sum().backward()
+    assert bool(torch.isfinite(velocity.grad).all())
+
+
+def test_edge_on_patch():
+    """`paper` gives the full normal force at grazing flow, `projected` none."""
+    assert float(_force((0.0, 2.0, 0), (0, 0, 1.0), drag=1.0).norm()) == pytest.approx(0.5 * RHO * 4)
+    assert float(_force((0.0, 2.0, 0), (0, 0, 1.0), drag=1.0, law="projected").norm()) == 0.0
+
+
+def test_only_patches_with_an_area_feel_the_wind():
+    wind, velocity, normal, area = _random()
+    area[::2] = 0
+    force = AeroForce()(wind, velocity, normal, area)
+    assert float(force[::2].abs().max()) == 0.0
+    assert bool((force[1::2].norm(dim=-1) > 0).all())
+
+
+@pytest.mark.parametrize("law", ["paper", "projected"])
+def test_rotation_turns_the_force(law):
+    wind, velocity, normal, area = _random()
+    Q = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    Q = Q * torch.linalg.det(Q)
+    aero = AeroForce(law=law)
+    torch.testing.assert_close(
+        aero(Q @ wind, velocity @ Q.T, normal @ Q.T, area), aero(wind, velocity, normal, area) @ Q.T
+    )
+
+
+@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("lift_direction", ["side", "lift"])
+@pytest.mark.parametrize("unit_tangent", [False, True])
+def test_gradcheck(law, lift_direction, unit_tangent):
+    wind, velocity, normal, area = _random(4)
+    coefficients = torch.tensor([0.5, 0.4, 0.1], dtype=torch.float64)
+
+    def run(wind, velocity, normal, area, coefficients):
+        drag, friction, lift = coefficients
+        return aero_force(
+            wind,
+            velocity,
+            normal,
+            area,
+            drag=drag,
+            friction=friction,
+            lift=lift,
+            law=law,
+            lift_direction=lift_direction,
+            unit_tangent=unit_tangent,
+        )
+
+    inputs = [t.requires_grad_() for t in (wind, velocity, normal, area, coefficients)]
+    assert torch.autograd.gradcheck(run, inputs, fast_mode=True)
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_batches(batch):
+    velocity, normal = torch.randn(*batch, 5, 3), torch.nn.functional.normalize(torch.randn(*batch, 5, 3), dim=-1)
+    wind = torch.randn(*batch, 1, 3)
+    area = torch.rand(*batch, 5)
+    force = AeroForce()(wind, velocity, normal, area)
+    assert force.shape == (*batch, 5, 3)
+    first = (0,) * len(batch)
+    torch.testing.assert_close(force[first], AeroForce()(wind[first], velocity[first], normal[first], area[first]))
+
+
+def test_drag_rate_is_the_slope_of_the_force():
+    """Across the flow, m dv/dt = rho/2 A C (U - v)², so the rate is rho A C U / m."""
+    rate = drag_rate(torch.tensor([3.0]), torch.tensor([0.2]), torch.tensor([0.5]), 0.7, RHO)
+    velocity = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+    force = aero_force(
+        _vector(3, 0, 0), velocity, _vector(1, 0, 0)[None], torch.tensor([0.2]).double(), drag=0.7, friction=0, lift=0
+    )
+    (slope,) = torch.autograd.grad(force[0, 0], velocity)
+    assert float(rate) == pytest.approx(-float(slope[0, 0]) / 0.5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"law": "plate"}, "`law` to be one of paper, projected"),
+        ({"lift_direction": "up"}, "`lift_direction` to be one of side, lift"),
+        ({"C_D": -0.1}, "`C_D` to not be negative"),
+        ({"air_density": -1.0}, "`air_density` to not be negative"),
+        ({"C_L": float("nan")}, "`C_L` to be finite"),
+    ],
+)
+def test_bad_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        AeroForce(**arguments)
+
+
+def test_shapes_are_checked():
+    good = (torch.zeros(3), torch.zeros(5, 3), torch.ones(5, 3), torch.ones(5))
+    for position, name, bad in (
+        (0, "wind", torch.zeros(2)),
+        (1, "velocity", torch.zeros(5, 2)),
+        (2, "normal", torch.zeros(4, 3)),
+        (3, "area", torch.ones(6)),
+    ):
+        arguments = list(good)
+        arguments[position] = bad
+        with pytest.raises(ValueError, match=f"Expected `{name}` of shape"):
+            AeroForce()(*arguments)
