@@ -78,10 +78,8 @@ def aero_force(
     else:
         shear = friction * speed * tangent
     across = torch.linalg.cross(relative, oriented, dim=-1)
-    if lift_direction == "side":
-        lifting = lift * speed * across
-    else:
-        lifting = lift * torch.linalg.cross(across, relative, dim=-1)
+    sideways = lift_direction == "side"
+    lifting = lift * (speed * across if sideways else torch.linalg.cross(across, relative, dim=-1))
     return (0.5 * air_density) * area[..., None] * (pressure + shear + lifting)
 
 

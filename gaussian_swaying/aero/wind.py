@@ -10,6 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -177,7 +178,7 @@ class WindField(nn.Module):
         check_choice("interpolation", interpolation, ("step", "linear"))
         keys = schedule or [FlowKey(0.0, list(flow))]
         times = [float(key.time) for key in keys]
-        if any(a >= b for a, b in zip(times, times[1:], strict=False)):
+        if any(a >= b for a, b in pairwise(times)):
             raise ValueError(f"Expected the times of `schedule` to increase, but got {times}.")
         name = "schedule.flow" if schedule else "flow"
         flows = [check_vector(name, key.flow) for key in keys]

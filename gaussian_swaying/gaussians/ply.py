@@ -6,6 +6,7 @@ import dataclasses
 import os
 import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
 
-_DEGREE_OF_COEFFICIENTS = {1: 0, 4: 1, 9: 2, 16: 3}
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -62,8 +63,7 @@ class GaussianCloud:
             check_shape(name, tensor, *size)
             if tensor.ndim != len(size):
                 raise ValueError(f"Expected `{name}` to have {len(size)} dimensions, but got {tuple(tensor.shape)}.")
-        if self.sh.shape[1] not in _DEGREE_OF_COEFFICIENTS:
-            raise ValueError(f"Expected `sh` to have 1, 4, 9 or 16 coefficients, but got {self.sh.shape[1]}.")
+        sh_degree(self.sh.shape[1])
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -71,20 +71,21 @@ class GaussianCloud:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return _DEGREE_OF_COEFFICIENTS[self.sh.shape[1]]
+        return sh_degree(self.sh.shape[1])
 
     def to(self, *args: Any, **kwargs: Any) -> GaussianCloud:
         """Copy with every tensor moved or cast by :meth:`torch.Tensor.to`."""
-        return GaussianCloud(*(None if t is None else t.to(*args, **kwargs) for t in self._tensors()))
+        return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
     def select(self, mask: Tensor) -> GaussianCloud:
         """The Gaussians that a boolean mask (N,) or an index tensor (M,) picks."""
         if mask.dtype == torch.bool:
             check_shape("mask", mask, len(self))
-        return GaussianCloud(*(None if t is None else t[mask] for t in self._tensors()))
+        return self._map(lambda tensor: tensor[mask])
 
-    def _tensors(self) -> list[Any]:
-        return [getattr(self, field.name) for field in dataclasses.fields(self)]
+    def _map(self, function: Callable[[Tensor], Tensor]) -> GaussianCloud:
+        tensors = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return GaussianCloud(**{name: None if t is None else function(t) for name, t in tensors.items()})
 
 
 def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -115,9 +116,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         raise ValueError(f"{path} is a compressed .ply; export it as an uncompressed 3DGS .ply.")
     for name in _REQUIRED:
         if name not in names:
-            raise ValueError(
-                f"{path} has no property `{name}`, so it is not a 3D Gaussian Splatting file; export it from a 3DGS tool."
-            )
+            raise ValueError(f"{path} has no property `{name}`, so it is not a 3DGS file; export it from a 3DGS tool.")
     rest = _rest_names(path, names)
     has_normals = all(name in names for name in _NORMALS)
     known = {*_REQUIRED, *rest, *(_NORMALS if has_normals else ())}
@@ -134,14 +133,9 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
                 raise ValueError(f"{path}: property `{field}` is a list; export it as one float per Gaussian.")
             with np.errstate(over="ignore"):
                 table[:, index] = data[field]
-        bad = ~np.isfinite(table)
-        if bad.any():
-            column = int(bad.any(axis=0).argmax())
-            first, total = int(bad[:, column].argmax()), int(bad[:, column].sum())
-            raise ValueError(
-                f"{path}: property `{fields[column]}` is NaN or infinite for {total} of {len(data)} Gaussians, first at "
-                f"index {first}; remove them or train again."
-            )
+        for index, field in enumerate(fields):
+            bad = ~np.isfinite(table[:, index])
+            _reject(path, bad, f"property `{field}` is NaN or infinite", "remove them or train again")
         return table
 
     opacities = _read_opacities(path, data)
@@ -244,8 +238,8 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
     found = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
     if len(found) not in (0, 9, 24, 45):
         raise ValueError(
-            f"{path} has {len(found)} properties `f_rest_*`, but spherical harmonics of degree 0, 1, 2 or 3 have 0, 9, 24 "
-            "or 45; export it with one of these degrees."
+            f"{path} has {len(found)} properties `f_rest_*`, but spherical harmonics of degree 0, 1, 2 or 3 have "
+            "0, 9, 24 or 45; export it with one of these degrees."
         )
     rest = tuple(f"f_rest_{index}" for index in range(len(found)))
     for name in rest:
@@ -275,5 +269,6 @@ def _reject(path: Path, bad: np.ndarray, what: str, remedy: str) -> None:
     """Raise ValueError if any Gaussian of the mask (N,) is bad."""
     if bad.any():
         raise ValueError(
-            f"{path}: {what} for {int(bad.sum())} of {len(bad)} Gaussians, first at index {int(bad.argmax())}; {remedy}."
+            f"{path}: {what} for {int(bad.sum())} of {len(bad)} Gaussians, first at index {int(bad.argmax())}; "
+            f"{remedy}."
         )

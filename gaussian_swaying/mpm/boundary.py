@@ -135,9 +135,7 @@ class PinnedRegion(Boundary):
         end: Time from which it no longer acts [s]; None for never.
     """
 
-    def __init__(
-        self, region: Region, held_share: float = 0.3, start: float = 0.0, end: float | None = None
-    ) -> None:
+    def __init__(self, region: Region, held_share: float = 0.3, start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
         if not 0 <= held_share < 1:
             raise ValueError(f"Expected `held_share` to lie in [0, 1), but got {held_share}.")
@@ -278,9 +276,7 @@ class VelocityBox(Boundary):
 
     needs_position = True
 
-    def __init__(
-        self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None
-    ) -> None:
+    def __init__(self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
         self.region = region
         self.velocity = check_vector("velocity", velocity)

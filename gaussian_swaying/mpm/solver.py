@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -95,6 +96,9 @@ class MPMSolver(nn.Module):
         """Whether stencils stay at the rest positions."""
         return self.formulation == "total"
 
+    def _conditions(self) -> list[Boundary]:
+        return [b for b in self.boundaries if isinstance(b, Boundary)]
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MPMSolver:
         super()._apply(fn, recurse)
         if self._points is not None:
@@ -105,7 +109,7 @@ class MPMSolver(nn.Module):
         """Take the material and compute what never changes: Lamé parameters and, in ``total``, stencil and mass."""
         mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
         self._points, self._static = points, {"mu": mu, "lam": lam}
-        masks = [b.particle_mask(points.position.detach()) for b in self.boundaries]
+        masks = [b.particle_mask(points.position.detach()) for b in self._conditions()]
         for k, mask in enumerate(masks):
             if mask is not None:
                 self._static[f"pinned_mass_{k}"] = torch.where(mask, points.mass, 0.0)
@@ -208,8 +212,8 @@ class MPMSolver(nn.Module):
             limit = self.stable_substep(state)
             if self.substep > limit * (1 + 1e-6):
                 raise ValueError(
-                    f"The fixed `substep` of {self.substep:g} s is longer than the stable one of {limit:.4g} s (at dx = "
-                    f"{self.dx:g} m and this material): lower it, or set it to null for the adaptive substep."
+                    f"The fixed `substep` of {self.substep:g} s is longer than the stable one of {limit:.4g} s (at dx "
+                    f"= {self.dx:g} m and this material): lower it, or set it to null for the adaptive substep."
                 )
             return substeps_per_frame(frame_dt, self.substep, exact=True)
         return substeps_per_frame(frame_dt, self.cfl / max(float(self.cfl_number(state, 1.0)), 1e-30), exact=False)
@@ -251,7 +255,10 @@ class MPMSolver(nn.Module):
         return state
 
     def _step_total(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
-        assert self._stencil is not None and state.node_velocity is not None and state.node_displacement is not None
+        assert self._stencil is not None
+        assert state.node_velocity is not None
+        displacement = state.node_displacement
+        assert displacement is not None
         points, static = self.points, self._static
         stress = fixed_corotated_pk1(state.F_elastic, static["mu"], static["lam"]) * points.volume[..., None, None]
         value = torch.zeros_like(state.position) if force is None else force
@@ -265,7 +272,7 @@ class MPMSolver(nn.Module):
             position = static["node_rest"] + scatter(self._stencil, shift[..., None, :]) * inverse_mass
         velocity = self._constrain(velocity, position, lambda k: static.get(f"held_{k}"), state.time)
         state = state.replace(time=state.time + dt)
-        return self._read_particles(state, state.node_displacement + dt * velocity, velocity)  # type: ignore[operator]
+        return self._read_particles(state, displacement + dt * velocity, velocity)
 
     def _read_particles(self, state: MPMState, displacement: Tensor, velocity: Tensor) -> MPMState:
         """Particle fields of the ``total`` formulation, interpolated from the nodes."""

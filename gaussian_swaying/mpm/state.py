@@ -189,7 +189,7 @@ class MPMState:
     @classmethod
     def from_state_dict(cls, values: dict[str, Any], device: torch.device | str = "cpu") -> MPMState:
         """Rebuild a state saved by :meth:`state_dict`."""
-        moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in values.items()}
+        moved: dict[str, Any] = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in values.items()}
         grid = moved["grid"]
         moved["grid"] = GridSpec(float(grid["dx"]), tuple(grid["offset"]), tuple(grid["resolution"]))
         if moved["F_total"] is None:

@@ -21,7 +21,12 @@ def _force(wind, normal, velocity=(0.0, 0.0, 0.0), area=1.0, **options):
 
 def _random(count=200):
     normal = torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
-    return torch.randn(3, dtype=torch.float64), torch.randn(count, 3, dtype=torch.float64), normal, torch.rand(count).double()
+    return (
+        torch.randn(3, dtype=torch.float64),
+        torch.randn(count, 3, dtype=torch.float64),
+        normal,
+        torch.rand(count).double(),
+    )
 
 
 def _vector(*values):

@@ -55,7 +55,7 @@ def test_same_seed_same_wind_on_any_device(device):
 
 @pytest.mark.parametrize("gust", [GaussianGust(0.3), UniformGust(0.3)], ids=["gaussian", "uniform"])
 def test_gusts_do_not_depend_on_the_substep(gust):
-    """Drawn per substep, the impulse of white noise fades with the root of the step; drawn at fixed times it does not."""
+    """Drawn per substep, the impulse of white noise fades with the root of the step; at fixed times it does not."""
     wind = WindField([1.0, 0.0, 0.0], modulations=[gust])
     impulses = []
     for steps in (40, 400, 4000):

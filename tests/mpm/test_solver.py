@@ -144,9 +144,7 @@ def test_formulations_agree_on_a_vibrating_block():
     """A free block in its first stretching mode, over most of a period, within the discretisation error of either."""
     axis = (torch.arange(12, dtype=torch.float64) + 0.5) / 30
     position = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    points = MaterialPoints.create(
-        position, volume=1 / 27000, density=100.0, youngs_modulus=2e4, poisson_ratio=0.3
-    )
+    points = MaterialPoints.create(position, volume=1 / 27000, density=100.0, youngs_modulus=2e4, poisson_ratio=0.3)
     velocity = torch.zeros_like(position)
     velocity[:, 0] = -torch.cos(torch.pi * position[:, 0] / 0.4)
     ends = []

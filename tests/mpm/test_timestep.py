@@ -12,9 +12,7 @@ from gaussian_swaying.mpm.transfer import bspline_stencil
 
 
 def _points(position, e=1e4, nu=0.3, density=100.0):
-    return MaterialPoints.create(
-        position, volume=1e-6, density=density, youngs_modulus=e, poisson_ratio=nu
-    )
+    return MaterialPoints.create(position, volume=1e-6, density=density, youngs_modulus=e, poisson_ratio=nu)
 
 
 @pytest.mark.parametrize(
@@ -111,5 +109,6 @@ def test_fixed_substep_above_the_stable_one_is_refused():
     points = _points(torch.rand(20, 3, dtype=torch.float64))
     solver = MPMSolver(dx=0.1, substep=0.04)
     state = solver.init_state(points)
-    with pytest.raises(ValueError, match=rf"fixed `substep` of 0\.04 s .* stable one of {solver.stable_substep():.4g} s"):
+    stable = f"{solver.stable_substep():.4g}"
+    with pytest.raises(ValueError, match=rf"fixed `substep` of 0\.04 s .* stable one of {stable} s"):
         solver.substeps(state, 0.04)

@@ -136,9 +136,7 @@ def test_bounding_grid_holds_every_stencil():
 
 def test_p2g_gradcheck(device):
     inputs = [t.requires_grad_() for t in _particles(device, torch.float64, count=3)]
-    assert torch.autograd.gradcheck(
-        lambda x, m, v, c: p2g(m, v, c, bspline_stencil(x, GRID)), inputs, fast_mode=True
-    )
+    assert torch.autograd.gradcheck(lambda x, m, v, c: p2g(m, v, c, bspline_stencil(x, GRID)), inputs, fast_mode=True)
 
 
 @pytest.mark.parametrize(("name", "shape"), [("velocity", (64, 2)), ("velocity", (63, 3)), ("affine", (64, 9))])

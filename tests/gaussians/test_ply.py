@@ -1,0 +1,315 @@
+"""The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
+from gaussian_swaying.gaussians.surface import smallest_axis_normal
+
+REST = {0: 0, 1: 9, 2: 24, 3: 45}
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def _cloud(count=7, degree=3, normals=False):
+    return GaussianCloud(
+        means=torch.randn(count, 3),
+        quats=torch.randn(count, 4),
+        scales=torch.randn(count, 3) - 4,
+        opacities=torch.randn(count),
+        sh=torch.randn(count, (degree + 1) ** 2, 3),
+        normals=torch.nn.functional.normalize(torch.randn(count, 3), dim=-1) if normals else None,
+    )
+
+
+def _columns(degree=0, count=5, normals=True):
+    """The columns of a valid file, each filled with its own values."""
+    names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals else []) + ["f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(REST[degree])]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    draw = np.random.default_rng(0)
+    return {name: draw.standard_normal(count).astype("f4") for name in names}
+
+
+def _write(path, columns, byte_order="<", text=False, name="vertex"):
+    count = len(next(iter(columns.values())))
+    rows = np.empty(count, dtype=[(key, value.dtype.str.replace("<", "")) for key, value in columns.items()])
+    for key, value in columns.items():
+        rows[key] = value
+    PlyData([PlyElement.describe(rows, name)], text=text, byte_order=byte_order).write(str(path))
+    return path
+
+
+def _assert_equal(actual, expected, fields=FIELDS):
+    for field in fields:
+        torch.testing.assert_close(getattr(actual, field), getattr(expected, field), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("normals", [False, True])
+def test_round_trip_is_exact(tmp_path, degree, normals):
+    cloud = _cloud(degree=degree, normals=normals)
+    write_ply(tmp_path / "a.ply", cloud)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        back = read_ply(tmp_path / "a.ply")
+    _assert_equal(back, cloud)
+    assert back.sh_degree == degree
+    assert all(getattr(back, field).dtype == torch.float32 for field in FIELDS)
+    expected = cloud.normals if normals else smallest_axis_normal(cloud.quats, cloud.scales)
+    torch.testing.assert_close(back.normals, expected, rtol=0, atol=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_written_order_and_channels(tmp_path):
+    """The order of Kerbl et al.'s save_ply, with f_rest by channel: all of red, then green, then blue."""
+    cloud = _cloud(degree=1)
+    write_ply(tmp_path / "a.ply", cloud)
+    ply = PlyData.read(str(tmp_path / "a.ply"))
+    vertex = ply["vertex"]
+    names = [prop.name for prop in vertex.properties]
+    assert names == list(_columns(degree=1))
+    assert {prop.val_dtype for prop in vertex.properties} == {"f4"}
+    assert ply.byte_order == "<"
+    np.testing.assert_array_equal(vertex["f_rest_0"], cloud.sh[:, 1, 0])
+    np.testing.assert_array_equal(vertex["f_rest_2"], cloud.sh[:, 3, 0])
+    np.testing.assert_array_equal(vertex["f_rest_3"], cloud.sh[:, 1, 1])
+    np.testing.assert_array_equal(vertex["f_rest_8"], cloud.sh[:, 3, 2])
+    np.testing.assert_array_equal(vertex["rot_0"], cloud.quats[:, 0])
+
+
+def test_write_casts_and_detaches(tmp_path):
+    cloud = _cloud().to(torch.float64)
+    cloud.means.requires_grad_()
+    write_ply(str(tmp_path / "a.ply"), cloud)
+    _assert_equal(read_ply(str(tmp_path / "a.ply")), cloud.to(torch.float32))
+
+
+def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
+    write_ply(tmp_path / "a.ply", _cloud(3))
+    old = (tmp_path / "a.ply").read_bytes()
+
+    def fail(self, stream):
+        with open(stream, "wb") as file:
+            file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(PlyData, "write", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_ply(tmp_path / "a.ply", _cloud(4))
+    assert (tmp_path / "a.ply").read_bytes() == old
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+@pytest.mark.parametrize("byte_order", ["<", ">"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_any_property_order_and_byte_order(tmp_path, degree, byte_order):
+    columns = _columns(degree)
+    names = np.random.default_rng(1).permutation(list(columns))
+    expected = read_ply(_write(tmp_path / "a.ply", columns))
+    shuffled = read_ply(_write(tmp_path / "b.ply", {name: columns[name] for name in names}, byte_order))
+    _assert_equal(shuffled, expected, (*FIELDS, "normals"))
+    np.testing.assert_array_equal(expected.means[:, 1], columns["y"])
+    if degree == 2:
+        np.testing.assert_array_equal(expected.sh[:, 8, 1], columns["f_rest_15"])
+
+
+def test_double_properties_become_float32(tmp_path):
+    columns = {name: value.astype("f8") for name, value in _columns().items()}
+    _assert_equal(read_ply(_write(tmp_path / "a.ply", columns)), read_ply(_write(tmp_path / "b.ply", _columns())))
+
+
+def test_zero_or_absent_normals_count_as_none(tmp_path):
+    assert read_ply(_write(tmp_path / "a.ply", _columns(normals=False))).normals is None
+    zero = _columns() | {name: np.zeros(5, "f4") for name in ("nx", "ny", "nz")}
+    assert read_ply(_write(tmp_path / "b.ply", zero)).normals is None
+    assert read_ply(_write(tmp_path / "c.ply", _columns())).normals.shape == (5, 3)
+
+
+def test_extra_properties_are_named_once(tmp_path):
+    columns = _columns() | {"red": np.arange(5, dtype="u1"), "label": np.arange(5, dtype="i4")}
+    with pytest.warns(UserWarning, match=r"extra\.ply: ignored the properties red, label") as record:
+        cloud = read_ply(_write(tmp_path / "extra.ply", columns))
+    assert len(record) == 1
+    _assert_equal(cloud, read_ply(_write(tmp_path / "plain.ply", _columns())))
+
+
+def test_infinite_opacity_is_read_as_opaque(tmp_path):
+    """Converters store an opacity of 1 as an infinite logit; it must not reach a loss or an optimiser."""
+    columns = _columns()
+    columns["opacity"][1:3] = np.inf, -np.inf
+    with pytest.warns(UserWarning, match=r"bad\.ply: property `opacity` is infinite for 2 of 5 Gaussians.*index 1"):
+        cloud = read_ply(_write(tmp_path / "bad.ply", columns))
+    assert cloud.opacities[1:3].tolist() == [16.0, -16.0]
+
+
+def _assert_rejected(path, *parts):
+    with pytest.raises(ValueError, match=re.escape(str(path))) as error:
+        read_ply(path)
+    message = str(error.value)
+    assert message.endswith(".")
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.ply does not exist; check the path"):
+        read_ply(tmp_path / "none.ply")
+
+
+def test_directory(tmp_path):
+    _assert_rejected(tmp_path, "is a directory; give the .ply file inside it")
+
+
+@pytest.mark.parametrize("content", [b"", b"solid x\n", b"plywood"])
+def test_not_a_ply(tmp_path, content):
+    (tmp_path / "bad.ply").write_bytes(content)
+    _assert_rejected(tmp_path / "bad.ply", "is not a .ply file", "export the scene as .ply")
+
+
+def test_broken_header(tmp_path):
+    (tmp_path / "bad.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex many\nend_header\n")
+    _assert_rejected(tmp_path / "bad.ply", "broken .ply header", "export the file again")
+
+
+def test_ascii(tmp_path):
+    _assert_rejected(_write(tmp_path / "bad.ply", _columns(), text=True), "ASCII", "export as binary")
+
+
+def test_truncated(tmp_path):
+    path = _write(tmp_path / "bad.ply", _columns())
+    path.write_bytes(path.read_bytes()[:-30])
+    _assert_rejected(path, "is truncated", "copy or export the file again")
+
+
+def test_no_vertex_element(tmp_path):
+    path = _write(tmp_path / "bad.ply", _columns(), name="face")
+    _assert_rejected(path, "no element `vertex` (elements: face)", "export it from a 3DGS tool")
+
+
+@pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_2", "rot_3"])
+def test_missing_property(tmp_path, name):
+    columns = _columns()
+    del columns[name]
+    _assert_rejected(_write(tmp_path / "bad.ply", columns), f"no property `{name}`", "export it from a 3DGS tool")
+
+
+def test_compressed(tmp_path):
+    path = _write(tmp_path / "bad.ply", {"packed_position": np.zeros(3, "u4")})
+    _assert_rejected(path, "compressed .ply", "export it as an uncompressed 3DGS .ply")
+
+
+def test_list_property(tmp_path):
+    columns = _columns()
+    rows = np.empty(5, dtype=[(name, "O" if name == "y" else "f4") for name in columns])
+    for name, value in columns.items():
+        rows[name] = value if name != "y" else [np.zeros(2, "f4")] * 5
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "bad.ply"))
+    _assert_rejected(tmp_path / "bad.ply", "property `y` is a list", "one float per Gaussian")
+
+
+@pytest.mark.parametrize("count", [1, 8, 10, 72])
+def test_wrong_number_of_coefficients(tmp_path, count):
+    columns = _columns() | {f"f_rest_{i}": np.zeros(5, "f4") for i in range(count)}
+    _assert_rejected(_write(tmp_path / "bad.ply", columns), f"{count} properties `f_rest_*`", "0, 9, 24 or 45")
+
+
+def test_gap_in_the_coefficients(tmp_path):
+    columns = _columns(1)
+    columns["f_rest_9"] = columns.pop("f_rest_4")
+    _assert_rejected(_write(tmp_path / "bad.ply", columns), "no property `f_rest_4`", "export it again")
+
+
+def test_zero_gaussians(tmp_path):
+    _assert_rejected(_write(tmp_path / "bad.ply", _columns(count=0)), "zero Gaussians", "export the scene again")
+
+
+@pytest.mark.parametrize("name", ["z", "nx", "f_dc_2", "f_rest_7", "scale_1", "rot_2"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_non_finite_value(tmp_path, name, value):
+    columns = _columns(1)
+    columns[name][[2, 4]] = value
+    path = _write(tmp_path / "bad.ply", columns)
+    _assert_rejected(
+        path, f"property `{name}` is NaN or infinite for 2 of 5 Gaussians, first at index 2", "remove them"
+    )
+
+
+def test_nan_opacity(tmp_path):
+    columns = _columns()
+    columns["opacity"][3] = np.nan
+    path = _write(tmp_path / "bad.ply", columns)
+    _assert_rejected(path, "property `opacity` is NaN for 1 of 5 Gaussians, first at index 3", "remove them")
+
+
+def test_double_beyond_float32(tmp_path):
+    columns = {name: value.astype("f8") for name, value in _columns().items()}
+    columns["y"][1] = 1e300
+    _assert_rejected(_write(tmp_path / "bad.ply", columns), "property `y` is NaN or infinite for 1 of 5")
+
+
+@pytest.mark.parametrize("value", [-200.0, 100.0])
+def test_absurd_scale(tmp_path, value):
+    columns = _columns()
+    columns["scale_1"][1] = value
+    path = _write(tmp_path / "bad.ply", columns)
+    _assert_rejected(path, "`scale_1`", "size of zero or infinity for 1 of 5 Gaussians, first at index 1", "logarithm")
+
+
+def test_zero_quaternion(tmp_path):
+    columns = _columns()
+    for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
+        columns[name][2] = 0
+    path = _write(tmp_path / "bad.ply", columns)
+    _assert_rejected(path, "`rot_0` to `rot_3` is zero for 1 of 5 Gaussians, first at index 2", "store 1 0 0 0")
+
+
+def test_write_needs_gaussians_and_a_folder(tmp_path):
+    with pytest.raises(ValueError, match=r"a\.ply was not written because the cloud holds zero Gaussians"):
+        write_ply(tmp_path / "a.ply", _cloud(0))
+    with pytest.raises(FileNotFoundError, match=r"a\.ply cannot be written because .*none is not a folder; create it"):
+        write_ply(tmp_path / "none" / "a.ply", _cloud())
+
+
+def test_cloud_selects_and_moves(device, dtype):
+    cloud = _cloud(normals=True).to(device, dtype)
+    mask = torch.tensor([True, False, True, False, False, False, True], device=device)
+    picked = cloud.select(mask)
+    assert len(cloud) == 7
+    assert len(picked) == 3
+    for field in (*FIELDS, "normals"):
+        tensor = getattr(picked, field)
+        assert (tensor.dtype, tensor.device.type) == (dtype, device.type)
+        torch.testing.assert_close(tensor, getattr(cloud, field)[[0, 2, 6]])
+    assert _cloud().select(torch.tensor([1])).normals is None
+    with pytest.raises(ValueError, match="Expected `mask` of shape"):
+        cloud.select(mask[:3])
+
+
+@pytest.mark.parametrize(
+    ("field", "shape"),
+    [
+        ("means", (7, 2)),
+        ("quats", (7, 3)),
+        ("scales", (6, 3)),
+        ("opacities", (7, 1)),
+        ("sh", (7, 3)),
+        ("normals", (3,)),
+    ],
+)
+def test_cloud_rejects_wrong_shape(field, shape):
+    cloud = _cloud()
+    tensors = {name: getattr(cloud, name) for name in FIELDS} | {field: torch.zeros(shape)}
+    with pytest.raises(ValueError, match=rf"Expected `({field}|quats)` (of shape|to have)"):
+        GaussianCloud(**tensors)
+
+
+def test_cloud_rejects_other_degrees():
+    cloud = _cloud()
+    with pytest.raises(ValueError, match="Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
+        GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.zeros(7, 5, 3))

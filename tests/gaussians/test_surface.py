@@ -1,0 +1,477 @@
+"""Patches against mapped planes, inverses and the true areas of planes, shells and spheres."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
+from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
+from gaussian_swaying.gaussians.surface import (
+    GaussianSurfaceModel,
+    _nearest,
+    covariance,
+    covariance_to_quat_scale,
+    coverage_area,
+    deform_area,
+    deform_covariance,
+    deform_normal,
+    patch_area,
+    quat_to_rotation,
+    rotation_to_quat,
+    smallest_axis_normal,
+)
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def _unit(*shape, device="cpu", dtype=torch.float64):
+    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
+
+
+def _gradients(count, device="cpu", dtype=torch.float64):
+    """Deformation gradients of both orientations, none of them near singular."""
+    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
+    f = f[torch.linalg.det(f).abs() > 0.2]
+    assert len(f) > 4
+    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+    return f.to(device, dtype)
+
+
+# --- rotations and covariances -----------------------------------------------------------------------------------
+
+
+def test_quaternion_rotates_as_hamilton_product(device, dtype):
+    quats, v = torch.randn(20, 4, device=device, dtype=dtype), torch.randn(20, 3, device=device, dtype=dtype)
+    unit = quats / quats.norm(dim=-1, keepdim=True)
+    w, u = unit[:, :1], unit[:, 1:]
+    expected = v + 2 * torch.linalg.cross(u, torch.linalg.cross(u, v) + w * v)
+    torch.testing.assert_close((quat_to_rotation(quats) @ v[..., None]).squeeze(-1), expected)
+
+
+def test_rotation_to_quat_inverts(device, dtype):
+    """Half turns about each axis included, where the formula from the trace divides by zero."""
+    quats = torch.cat([torch.eye(4, dtype=torch.float64), _unit(200, 4)]).to(device, dtype)
+    quats = torch.where(quats[:, :1] < 0, -quats, quats)
+    back = rotation_to_quat(quat_to_rotation(quats))
+    assert (back[:, 0] >= 0).all()
+    torch.testing.assert_close(quat_to_rotation(back), quat_to_rotation(quats))
+    torch.testing.assert_close(back[4:], quats[4:], rtol=0, atol=1e-5 if dtype == torch.float32 else 1e-13)
+
+
+def test_covariance_has_the_axes_and_scales(device, dtype):
+    quats, log_scales = torch.randn(9, 4, device=device, dtype=dtype), torch.randn(9, 3, device=device, dtype=dtype)
+    a, rotation = covariance(quats, log_scales), quat_to_rotation(quats)
+    torch.testing.assert_close(a, a.mT)
+    torch.testing.assert_close(a @ rotation, rotation * (2 * log_scales).exp()[:, None])
+
+
+def test_covariance_to_quat_scale_round_trip(device, dtype):
+    quats, log_scales = (
+        torch.randn(50, 4, device=device, dtype=dtype),
+        torch.randn(50, 3, device=device, dtype=dtype) - 3,
+    )
+    a = deform_covariance(_gradients(1000, device, dtype)[:50], covariance(quats, log_scales))
+    q, s = covariance_to_quat_scale(a)
+    assert (q.dtype, s.dtype) == (dtype, dtype)
+    torch.testing.assert_close(torch.linalg.det(quat_to_rotation(q)), torch.ones(50, device=device, dtype=dtype))
+    torch.testing.assert_close(covariance(q, s), a, rtol=1e-4, atol=1e-6)
+    assert (s.diff(dim=-1) >= 0).all()
+
+
+def test_covariance_to_quat_scale_of_singular_and_equal_axes():
+    singular = torch.diag_embed(torch.tensor([[0.0, 1.0, 4.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]))
+    q, s = covariance_to_quat_scale(singular)
+    assert torch.isfinite(q).all()
+    assert torch.isfinite(s).all()
+    assert (s.exp() > 0).all()
+    torch.testing.assert_close(covariance(q, s), singular)
+    again, _ = covariance_to_quat_scale(singular * (1 + 1e-6))
+    torch.testing.assert_close(again, q)
+
+
+def test_covariance_to_quat_scale_signs_follow_the_matrix():
+    """A small change of the matrix may not flip an axis: frames of an animation would flicker."""
+    a = covariance(_unit(100, 4), torch.tensor([0.0, -1.0, -2.0], dtype=torch.float64).expand(100, 3))
+    q0, _ = covariance_to_quat_scale(a)
+    q1, _ = covariance_to_quat_scale(a + 1e-9 * torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(q1, q0, rtol=0, atol=1e-6)
+
+
+# --- deformation -------------------------------------------------------------------------------------------------
+
+
+def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
+    f, scales = _gradients(20, device, dtype)[:5], torch.randn(5, 3, device=device, dtype=dtype)
+    quats = torch.randn(5, 4, device=device, dtype=dtype)
+    axes = quat_to_rotation(quats) * scales.exp()[:, None]
+    mapped = f @ axes
+    torch.testing.assert_close(deform_covariance(f, covariance(quats, scales)), mapped @ mapped.mT)
+
+
+def test_deformed_normal_and_area_match_a_mapped_plane():
+    """Finite differences of x(u, v) on a curved map: the normal and the area of the image of the plane."""
+
+    def curved(x):
+        a, b, c = x.unbind(-1)
+        return torch.stack([a + 0.3 * torch.sin(2 * b) + 0.2 * c, b + 0.4 * a * a, c + 0.5 * torch.cos(a + b)], dim=-1)
+
+    points, step = torch.rand(30, 3, dtype=torch.float64), 1e-5
+    tangents = torch.linalg.qr(torch.randn(30, 3, 3, dtype=torch.float64))[0]
+    first, second = tangents[..., 0], tangents[..., 1]
+    normal = torch.linalg.cross(first, second)
+    shift = step * torch.eye(3, dtype=torch.float64)
+    f = torch.stack([(curved(points + e) - curved(points - e)) / (2 * step) for e in shift], dim=-1)
+    assert (torch.linalg.det(f) > 0).all()
+    mapped = [(curved(points + step * t) - curved(points - step * t)) / (2 * step) for t in (first, second)]
+    cross = torch.linalg.cross(*mapped)
+    torch.testing.assert_close(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), rtol=0, atol=1e-8)
+    area = torch.rand(30, dtype=torch.float64)
+    torch.testing.assert_close(deform_area(f, normal, area), cross.norm(dim=-1) * area, rtol=1e-7, atol=0)
+
+
+def test_deformed_normal_matches_the_inverse(device, dtype):
+    """Reflections included: the sign is that of F^-T N."""
+    f = _gradients(40, device, dtype)
+    normal = _unit(len(f), 3, device=device, dtype=dtype)
+    expected = (torch.linalg.inv(f).mT @ normal[..., None]).squeeze(-1)
+    assert (torch.linalg.det(f) < 0).any()
+    torch.testing.assert_close(
+        deform_normal(f, normal), expected / expected.norm(dim=-1, keepdim=True), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_deformed_normal_of_singular_gradients(device, dtype):
+    up = UP.to(device, dtype)
+    flat = torch.diag(torch.tensor([2.0, 3.0, 0.0], device=device, dtype=dtype))  # the plane keeps its normal
+    line = torch.diag(torch.tensor([2.0, 0.0, 1.0], device=device, dtype=dtype))  # the plane becomes a line
+    tiny = 1e-12 * torch.eye(3, device=device, dtype=dtype)  # squares of cofactors underflow in float32
+    f = torch.stack([flat, line, torch.zeros_like(flat), tiny]).requires_grad_()
+    normal = deform_normal(f, up.expand(4, 3))
+    torch.testing.assert_close(normal.detach(), up.expand(4, 3))
+    normal.sum().backward()
+    assert torch.isfinite(f.grad).all()
+    assert deform_area(f.detach(), up.expand(4, 3), torch.ones(4, device=device, dtype=dtype))[:3].tolist() == [6, 0, 0]
+
+
+def test_gradcheck(device):
+    f = _gradients(20, device)[:4].requires_grad_()
+    normal = _unit(4, 3, device=device).requires_grad_()
+    a = covariance(_unit(4, 4, device=device), torch.randn(4, 3, device=device, dtype=torch.float64)).requires_grad_()
+    log_scales = torch.randn(4, 3, device=device, dtype=torch.float64, requires_grad=True)
+    area = torch.rand(4, device=device, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(deform_covariance, (f, a))
+    assert torch.autograd.gradcheck(deform_normal, (f, normal))
+    assert torch.autograd.gradcheck(deform_area, (f, normal, area))
+    assert torch.autograd.gradcheck(patch_area, (log_scales,))
+
+
+def test_smallest_axis(device, dtype):
+    quats = _unit(3, 4, device=device, dtype=dtype)
+    log_scales = torch.tensor([[-9.0, 0, 1], [0, -9, 1], [1, 0, -9]], device=device, dtype=dtype)
+    rotation = quat_to_rotation(quats)
+    expected = torch.stack([rotation[0, :, 0], rotation[1, :, 1], rotation[2, :, 2]])
+    torch.testing.assert_close(smallest_axis_normal(quats, log_scales), expected)
+
+
+def test_patch_area_takes_the_two_larger_scales(device, dtype):
+    scales = torch.tensor(
+        [[2.0, 3.0, 0.1], [0.1, 2.0, 3.0], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]], device=device, dtype=dtype
+    )
+    expected = math.pi * torch.tensor([6.0, 6.0, 6.0, 1.0], device=device, dtype=dtype)
+    torch.testing.assert_close(patch_area(scales.log()), expected)
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda z: quat_to_rotation(z(2, 3)), "quats"),
+        (lambda z: rotation_to_quat(z(2, 3)), "rotation"),
+        (lambda z: covariance(z(2, 4), z(2, 4)), "log_scales"),
+        (lambda z: covariance_to_quat_scale(z(2, 3)), "covariances"),
+        (lambda z: deform_covariance(z(2, 9), z(2, 3, 3)), "deformation_gradient"),
+        (lambda z: deform_covariance(z(2, 3, 3), z(2, 6)), "covariances"),
+        (lambda z: deform_normal(z(2, 3, 3), z(2, 2)), "normals"),
+        (lambda z: deform_area(z(2, 3), z(2, 3), z(2)), "deformation_gradient"),
+        (lambda z: patch_area(z(2, 2)), "log_scales"),
+        (lambda z: coverage_area(z(2, 2), z(2, 3), z(2, 3)), "means"),
+        (lambda z: coverage_area(z(2, 3), z(3, 3), z(2, 3)), "normals"),
+        (lambda z: coverage_area(z(2, 3), z(2, 3), z(2, 3), z(3)), "opacity"),
+    ],
+)
+def test_wrong_shapes_are_named(call, name):
+    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
+        call(torch.zeros)
+
+
+# --- areas that add up -------------------------------------------------------------------------------------------
+
+
+def _plane(kind, side):
+    """side^2 points of the unit square."""
+    line = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+    points = torch.cartesian_prod(line, line)
+    if kind == "jittered":
+        points = points + (torch.rand(side**2, 2, dtype=torch.float64) - 0.5) * 0.8 / side
+    if kind == "random":
+        points = torch.rand(side**2, 2, dtype=torch.float64)
+    return torch.nn.functional.pad(points, (0, 1))
+
+
+def _discs(count, area, overlap):
+    """Flat splats of standard deviation overlap x spacing."""
+    scale = math.log(overlap * math.sqrt(area / count))
+    return torch.tensor([scale, scale, scale - 3], dtype=torch.float64).expand(count, 3)
+
+
+def _sum_on_plane(points, overlap=0.5, **kwargs):
+    return float(coverage_area(points, UP.expand(len(points), 3), _discs(len(points), 1, overlap), **kwargs).sum())
+
+
+@pytest.mark.parametrize("overlap", [0.3, 0.5, 1.0])
+@pytest.mark.parametrize("kind", ["regular", "jittered", "random"])
+@pytest.mark.parametrize("side", [32, 100])
+def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
+    """The paper's pi s1 s2 gives 0.28 to 3.1 here."""
+    assert _sum_on_plane(_plane(kind, side), overlap) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", ["regular", "random"])
+def test_sum_at_a_hundred_thousand(kind):
+    assert _sum_on_plane(_plane(kind, 316)) == pytest.approx(1, abs=0.01)
+
+
+def test_each_patch_of_a_regular_plane_has_its_cell():
+    """Not only the sum: borders and corners included, within the angular resolution of the rays."""
+    areas = coverage_area(_plane("regular", 20), UP.expand(400, 3), _discs(400, 1, 0.3)) * 400
+    inner = areas.unflatten(0, (20, 20))[3:-3, 3:-3]
+    torch.testing.assert_close(inner, torch.ones_like(inner), rtol=0, atol=0.03)
+    assert float(areas.min()) > 0.7
+    assert float(areas.max()) < 1.4
+
+
+@pytest.mark.parametrize("overlap", [0.3, 1.0])
+@pytest.mark.parametrize("count", [1000, 10000])
+@pytest.mark.parametrize("kind", ["spiral", "random"])
+def test_sum_is_the_area_of_a_sphere(kind, count, overlap):
+    if kind == "spiral":
+        index = torch.arange(count, dtype=torch.float64)
+        z, angle = 1 - 2 * (index + 0.5) / count, index * math.pi * (3 - math.sqrt(5))
+        radius = (1 - z * z).sqrt()
+        points = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
+    else:
+        points = _unit(count, 3)
+    total = float(coverage_area(points, points, _discs(count, 4 * math.pi, overlap)).sum())
+    assert total == pytest.approx(4 * math.pi, rel=0.03)
+
+
+def test_sum_scales_and_moves_with_the_scene():
+    points, scale = _plane("random", 40), 250.0
+    rotation = quat_to_rotation(_unit(4))
+    moved = scale * points @ rotation.T + 1e3
+    normals = (rotation @ UP).expand(len(points), 3)
+    total = float(coverage_area(moved, normals, _discs(len(points), scale**2, 0.5)).sum())
+    assert total / scale**2 == pytest.approx(_sum_on_plane(points), rel=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["regular", "random"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_shell_counts_each_sheet_from_one_spacing_apart(kind, sign):
+    first, second, spacing = _plane(kind, 60), _plane(kind, 60), 1 / 60
+    normals = torch.cat([UP.expand(3600, 3), sign * UP.expand(3600, 3)])
+
+    def total(gap):
+        points = torch.cat([first, second + gap * spacing * UP])
+        return float(coverage_area(points, normals, _discs(3600, 1, 0.5).repeat(2, 1)).sum())
+
+    assert total(1.0) == pytest.approx(2, rel=0.03)
+    assert total(3.0) == pytest.approx(2, rel=0.03)
+    assert total(0.2) == pytest.approx(1, rel=0.03)
+
+
+def test_clones_thickness_and_sizes_do_not_change_the_sum():
+    """What captures have: copies, centres off the surface, sizes and opacities that vary, noisy normals."""
+    points, count = _plane("random", 60), 3600
+    normals, discs, spacing = UP.expand(count, 3), _discs(count, 1, 0.5), 1 / 60
+    reference = _sum_on_plane(points)
+    copies = coverage_area(points.repeat(3, 1), normals.repeat(3, 1), discs.repeat(3, 1))
+    assert float(copies.sum()) == pytest.approx(reference, rel=1e-9)
+    torch.testing.assert_close(copies[:count], copies[count : 2 * count])
+    near = torch.cat([points, points + 1e-3 * spacing * torch.randn_like(points)])
+    assert float(coverage_area(near, normals.repeat(2, 1), discs.repeat(2, 1)).sum()) == pytest.approx(1, abs=0.03)
+    assert _sum_on_plane(points + 0.1 * spacing * torch.randn(count, 1) * UP) == pytest.approx(1, abs=0.03)
+    sizes, opacity = discs + 0.7 * torch.randn(count, 1), torch.rand(count)
+    assert float(coverage_area(points, normals, sizes, opacity).sum()) == pytest.approx(1, abs=0.03)
+    tilted = torch.nn.functional.normalize(normals + 0.1 * torch.randn(count, 3), dim=-1)
+    assert float(coverage_area(points, tilted, discs).sum()) == pytest.approx(1, abs=0.03)
+
+
+def test_faint_patch_among_opaque_ones_carries_little():
+    points = _plane("regular", 20)
+    opacity = torch.ones(400, dtype=torch.float64)
+    opacity[210] = 0.01
+    areas = coverage_area(points, UP.expand(400, 3), _discs(400, 1, 0.5), opacity)
+    assert float(areas[210]) < 0.05 / 400
+    assert float(areas.sum()) == pytest.approx(_sum_on_plane(points), rel=1e-9)
+
+
+def test_twins_share_by_weight():
+    """Two Gaussians at one centre: what one carries alone, they carry together."""
+    points = _plane("regular", 20)
+    points = torch.cat([points, points[210:211]])
+    opacity = torch.ones(401, dtype=torch.float64)
+    opacity[210], opacity[400] = 0.75, 0.25
+    areas = coverage_area(points, UP.expand(401, 3), _discs(400, 1, 0.5)[:1].expand(401, 3), opacity)
+    alone = coverage_area(points[:400], UP.expand(400, 3), _discs(400, 1, 0.5))
+    torch.testing.assert_close(areas[210] + areas[400], alone[210])
+    torch.testing.assert_close(areas[210], 3 * areas[400])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
+def test_few_or_lonely_gaussians_keep_their_own_area(count, device, dtype):
+    means = 1e3 * torch.rand(count, 3, device=device, dtype=dtype)
+    scales = torch.tensor([0.0, 0.5, -3.0], device=device, dtype=dtype).expand(count, 3)
+    areas = coverage_area(means, torch.nn.functional.normalize(torch.ones_like(means), dim=-1), scales)
+    assert (areas.dtype, areas.device.type) == (dtype, device.type)
+    torch.testing.assert_close(areas, patch_area(scales))
+
+
+def test_wild_input_stays_finite_and_positive():
+    """Floaters, needles, clusters tighter than the neighbour count, lines and coincident points."""
+    cluster = 1e-7 * torch.randn(500, 3)
+    line = torch.stack([torch.linspace(0, 1, 300), torch.zeros(300), torch.zeros(300)], dim=-1)
+    means = torch.cat([torch.rand(2000, 3), cluster, line, torch.full((60, 3), 0.5), torch.tensor([[1e6, 0, 0]])])
+    scales = -4 + 2 * torch.randn(len(means), 3)
+    areas = coverage_area(means, _unit(len(means), 3, dtype=torch.float32), scales, torch.rand(len(means)))
+    assert torch.isfinite(areas).all()
+    assert (areas > 0).all()
+    assert coverage_area(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)
+
+
+def test_same_input_same_areas_and_order_does_not_matter():
+    points, normals = _plane("random", 50), UP.expand(2500, 3)
+    discs = _discs(2500, 1, 0.5)
+    areas = coverage_area(points, normals, discs)
+    assert torch.equal(areas, coverage_area(points, normals, discs))
+    order = torch.randperm(2500)
+    torch.testing.assert_close(coverage_area(points[order], normals, discs), areas[order])
+    torch.testing.assert_close(coverage_area(points, -normals, discs).sum(), areas.sum(), rtol=2e-3, atol=0)
+
+
+def test_coverage_rejects_bad_values():
+    points = _plane("regular", 4)
+    with pytest.raises(ValueError, match="Expected `neighbours` to be at least 6, but got 3"):
+        _sum_on_plane(points, neighbours=3)
+    points[3, 1] = torch.nan
+    with pytest.raises(ValueError, match="Expected `means` to be finite"):
+        _sum_on_plane(points)
+
+
+def test_nearest_matches_brute_force():
+    """Density that varies by orders of magnitude, and a point far away."""
+    points = torch.randn(3000, 3, dtype=torch.float64) * torch.logspace(-4, 1, 3000, dtype=torch.float64)[:, None]
+    points[0] = 1e5
+    distance, index = _nearest(points, 12)
+    everything = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
+    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :12])
+    torch.testing.assert_close(everything.gather(-1, index), distance)
+
+
+# --- the model ---------------------------------------------------------------------------------------------------
+
+
+def _cloud(count=6, degree=2, normals=False, device="cpu", dtype=torch.float32):
+    cloud = GaussianCloud(
+        means=torch.randn(count, 3),
+        quats=torch.randn(count, 4),
+        scales=torch.randn(count, 3) - 3,
+        opacities=torch.randn(count),
+        sh=torch.randn(count, (degree + 1) ** 2, 3),
+        normals=_unit(count, 3, dtype=torch.float32) if normals else None,
+    )
+    return cloud.to(device, dtype)
+
+
+def test_model_holds_storage_form_parameters(device, dtype):
+    model = GaussianSurfaceModel.from_cloud(_cloud(device=device, dtype=dtype))
+    shapes = {name: tuple(parameter.shape) for name, parameter in model.named_parameters()}
+    assert shapes == {"means": (6, 3), "quats": (6, 4), "scales": (6, 3), "opacities": (6,), "sh0": (6, 1, 3)} | {
+        "shN": (6, 8, 3)
+    }
+    assert all(parameter.requires_grad for parameter in model.parameters())
+    fixed = GaussianSurfaceModel.from_cloud(_cloud(device=device, dtype=dtype), requires_grad=False)
+    assert not any(parameter.requires_grad for parameter in fixed.parameters())
+    assert len(model) == 6
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("normals", [False, True])
+def test_model_round_trip_through_a_file(tmp_path, degree, normals):
+    cloud = _cloud(degree=degree, normals=normals)
+    GaussianSurfaceModel.from_cloud(cloud).save_ply(tmp_path / "a.ply")
+    model = GaussianSurfaceModel.from_ply(tmp_path / "a.ply", requires_grad=False)
+    back = model.to_cloud()
+    for field in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(back, field), getattr(cloud, field))
+        assert not getattr(back, field).requires_grad
+    assert torch.equal(back.normals, read_ply(tmp_path / "a.ply").normals)
+    assert not any(parameter.requires_grad for parameter in model.parameters())
+
+
+def test_model_leaves_its_cloud_alone():
+    cloud = _cloud(normals=True)
+    before = cloud.means.clone()
+    model = GaussianSurfaceModel.from_cloud(cloud)
+    with torch.no_grad():
+        model.means.add_(1)
+    assert torch.equal(cloud.means, before)
+
+
+def test_model_normals_take_the_side_of_the_file():
+    cloud = _cloud(200, normals=True)
+    normals = GaussianSurfaceModel.from_cloud(cloud).normals()
+    axis = smallest_axis_normal(cloud.quats, cloud.scales)
+    assert ((normals * cloud.normals).sum(-1) >= 0).all()
+    torch.testing.assert_close((normals * axis).sum(-1).abs(), torch.ones(200))
+    assert not torch.equal(normals, axis)
+    assert torch.equal(
+        GaussianSurfaceModel.from_cloud(_cloud()).normals().norm(dim=-1).round(decimals=5), torch.ones(6)
+    )
+
+
+def test_model_methods_agree_with_the_functions(device, dtype):
+    cloud = _cloud(40, device=device, dtype=dtype)
+    model = GaussianSurfaceModel.from_cloud(cloud)
+    directions = torch.randn(40, 3, device=device, dtype=dtype)
+    torch.testing.assert_close(model.covariance(), covariance(cloud.quats, cloud.scales))
+    torch.testing.assert_close(model.opacity(), 1 / (1 + (-cloud.opacities).exp()))
+    torch.testing.assert_close(model.colors(directions), sh_to_color(cloud.sh, directions))
+    torch.testing.assert_close(model.areas("paper"), patch_area(cloud.scales))
+    expected = coverage_area(cloud.means, model.normals(), cloud.scales, model.opacity())
+    torch.testing.assert_close(model.areas("coverage"), expected)
+    assert not torch.allclose(expected, patch_area(cloud.scales))
+    with pytest.raises(ValueError, match="Expected `mode` to be one of paper, coverage, but got 'disc'"):
+        model.areas("disc")
+
+
+def test_model_deforms_a_batch(device, dtype):
+    model = GaussianSurfaceModel.from_cloud(_cloud(device=device, dtype=dtype))
+    f = _gradients(100, device, dtype)[:12].unflatten(0, (2, 6))
+    position = torch.randn(2, 6, 3, device=device, dtype=dtype)
+    deformed = model.deformed(position, f)
+    assert deformed.means is position
+    torch.testing.assert_close(deformed.covariances, f @ model.covariance() @ f.mT)
+    torch.testing.assert_close(deformed.normals, deform_normal(f, model.normals().expand(2, 6, 3)))
+    deformed.covariances.sum().backward()
+    assert model.quats.grad.abs().sum() > 0
+    with pytest.raises(ValueError, match=r"Expected `deformation_gradient` of shape \(6, 3, 3\)"):
+        model.deformed(position, f[:, :5])
+
+
+def test_model_state_dict_round_trip():
+    cloud = _cloud(normals=True)
+    state = GaussianSurfaceModel.from_cloud(cloud).state_dict()
+    other = GaussianSurfaceModel.from_cloud(_cloud(normals=True))
+    other.load_state_dict(state)
+    assert torch.equal(other.sh, cloud.sh)
+    assert torch.equal(other.to_cloud().normals, cloud.normals)

@@ -1,0 +1,243 @@
+"""Measure, record as JSON, and make the documentation's tables from what was recorded.
+
+``python tools/bench.py sim``        the main job end to end and one substep; writes docs/results/sim_<device>.json
+``python tools/bench.py pages``      docs/benchmarks.md from all recorded JSON
+``python tools/bench.py pictures``   the README's pictures from a finished run
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
+from gaussian_swaying.simulation.pipeline import describe_device, versions
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "docs" / "results"
+
+
+def timed(function: Callable[[], Any], device: torch.device, repeats: int) -> dict[str, float]:
+    """Milliseconds of a call after warm-up: median and quartiles; on a GPU between events."""
+    for _ in range(3):
+        function()
+    samples = []
+    for _ in range(repeats):
+        if device.type == "cuda":
+            start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            start.record()
+            function()
+            end.record()
+            torch.cuda.synchronize()
+            samples.append(start.elapsed_time(end))
+        else:
+            begin = time.perf_counter()
+            function()
+            samples.append(1e3 * (time.perf_counter() - begin))
+    low, median, high = statistics.quantiles(samples, n=4)
+    return {"median_ms": median, "quartile_low_ms": low, "quartile_high_ms": high, "repeats": repeats}
+
+
+def sheet(particles: int, device: torch.device) -> MaterialPoints:
+    """A square sheet of particles at half the spacing of a 100³ cube's worth of grid (dx = 0.01 m, domain 1 m)."""
+    side = round(particles**0.5)
+    axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) / side * 0.9 + 0.05
+    x, y = (g.reshape(-1) for g in torch.meshgrid(axis, axis, indexing="ij"))
+    position = torch.stack([x, y, 0.5 + 0.003 * torch.sin(9 * x)], dim=-1)
+    area = (0.9 / side) ** 2
+    return MaterialPoints.create(position, volume=area * 0.01, density=50.0, youngs_modulus=5e3, poisson_ratio=0.3)
+
+
+def bench_substep(device: torch.device, particles: int, formulation: str) -> dict[str, Any]:
+    """One elastic substep, without wind; the grid of ``updated`` is the whole 100³ cube."""
+    points = sheet(particles, device)
+    solver = MPMSolver(dx=0.01, formulation=formulation)
+    state = solver.init_state(points, margin=48 if formulation == "updated" else 4)
+    with torch.inference_mode():
+        result = timed(lambda: solver.step(state, 1e-4), device, 30)
+    nodes = state.grid.node_count
+    return {"particles": points.count, "formulation": formulation, "nodes": nodes} | result
+
+
+def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, Any]:
+    """Run tools/sim.py as a user does, in its own process, and keep its summary."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(ROOT / "tools" / "sim.py"), *arguments, "--device", device.type]
+        begin = time.perf_counter()
+        subprocess.run([*command, "--output", f"{folder}/out"], check=True, cwd=ROOT)
+        wall = time.perf_counter() - begin
+        summary = json.loads((Path(folder) / "out" / "summary.json").read_text())
+    summary.pop("per_frame")
+    return {"name": name, "arguments": arguments, "process_wall_s": wall} | summary
+
+
+def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
+    """PSNR between the splat as it is and the picture of frame 0 of the run, at the size of the config's camera."""
+    parser = build_parser()
+    settings = parser.parse_args(["--config", config, "--scene.ply", ply, "--device", device.type])
+    pipeline, _ = build_pipeline(parser, settings)
+    with torch.inference_mode():
+        state = pipeline.start()
+        moved = pipeline.render(state, 0).color
+        pipeline.shader = None
+        rest = pipeline.scene.rest()
+        camera = pipeline.camera_at(0)
+        plain = pipeline.draw(rest, pipeline.colours(rest, camera), camera).color
+    error = float((moved - plain).square().mean())
+    return float("inf") if error == 0 else -10 * float(torch.log10(torch.tensor(error)))
+
+
+def sim(options: argparse.Namespace) -> None:
+    """Measure the main job."""
+    device = torch.device(
+        options.device if options.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    )
+    result: dict[str, Any] = {"device": describe_device(device), "versions": versions(), "seed": 0}
+    result["substep"] = [
+        bench_substep(device, particles, formulation)
+        for particles in ([20_000, 100_000] if device.type == "cpu" else [20_000, 100_000, 1_000_000])
+        for formulation in ("total", "updated")
+    ]
+    flag = ["--config", str(ROOT / "configs" / "sim" / "flag.yaml")]
+    result["runs"] = [run_sim("flag, 75 frames at 480x270", flag, device)]
+    if options.ply:
+        hanging = ["--config", str(ROOT / "configs" / "sim" / "hanging_object.yaml"), "--scene.ply", options.ply]
+        size = (
+            ["--camera.init_args.width", "1920", "--camera.init_args.height", "1080"] if device.type == "cuda" else []
+        )
+        frames = ["--frames", str(options.frames)] if options.frames else []
+        name = f"{Path(options.ply).stem}, {'1920x1080' if size else '960x540'}"
+        result["runs"].append(run_sim(name, [*hanging, *size, *frames], device))
+        result["round_trip_psnr_db"] = round_trip_psnr(hanging[1], options.ply, device)
+    folder = Path(options.results)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"sim_{device.type}.json"
+    path.write_text(json.dumps(result, indent=2).replace(str(ROOT) + "/", "") + "\n")
+    print(f"wrote {path}")
+
+
+GOALS = {
+    "flag_cpu": "flag end to end on 2 CPU cores: within 90 s and 2 GB",
+    "substep_cpu": "one elastic substep of 20,000 particles on 2 CPU cores: within 60 ms",
+    "object_cuda": "captured object, 250 frames at 1920x1080 on one H200, files apart: within 180 s and 2 GiB",
+}
+
+
+def pages(options: argparse.Namespace) -> None:
+    """Write docs/benchmarks.md from the recorded JSON."""
+    lines = [
+        "# Benchmarks",
+        "",
+        "Made by `python tools/bench.py pages` from the JSON in `docs/results/`. Medians; the machines are shared.",
+        "",
+    ]
+    for path in sorted(Path(options.results).glob("sim_*.json")):
+        result = json.loads(path.read_text())
+        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
+        lines += [f"## {result['device']}", "", f"{stack}; seed {result['seed']}.", ""]
+        lines += ["| elastic substep, sheet | grid nodes | median [ms] | quartiles [ms] |", "|---|---|---|---|"]
+        for row in result["substep"]:
+            quartiles = f"{row['quartile_low_ms']:.2f} to {row['quartile_high_ms']:.2f}"
+            lines.append(
+                f"| `{row['formulation']}`, {row['particles']:,} particles | {row['nodes']:,} | "
+                f"{row['median_ms']:.2f} | {quartiles} |"
+            )
+        lines += [
+            "",
+            "| run | particles | frames | substeps | simulation [s] | shading [s] | rendering [s] | writing [s] | "
+            "process [s] | host memory [GiB] | device memory [GiB] |",
+            "|---|---|---|---|---|---|---|---|---|---|---|",
+        ]
+        for run in result["runs"]:
+            wall, memory = run["wall_s"], run["peak_memory_bytes"]
+            on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
+            lines.append(
+                f"| {run['name']} | {run['particles']:,} | {run['frames']} | {run['substeps']:,} | "
+                f"{wall['simulation']:.1f} | {wall['shading']:.1f} | {wall['rendering']:.1f} | {wall['writing']:.1f} | "
+                f"{run['process_wall_s']:.1f} | {memory['host'] / 2**30:.2f} | {on_device} |"
+            )
+        lines.append("")
+        for run in result["runs"]:
+            lines.append(
+                f"- {run['name']}: {run['lost_particles']} particles lost, singular values of F in "
+                f"[{run['stretch_min']:.2f}, {run['stretch_max']:.2f}], largest CFL number {run['largest_cfl']:.2f}, "
+                f"largest mean displacement {run['displacement_mean_max_m']:.3f} m."
+            )
+        if "round_trip_psnr_db" in result:
+            lines.append(
+                f"- PSNR of frame 0 against the splat as it was captured: {result['round_trip_psnr_db']:.1f} dB."
+            )
+        lines += ["", "| goal | measured | reached |", "|---|---|---|", *_goals(result), ""]
+    target = ROOT / "docs" / "benchmarks.md"
+    target.write_text("\n".join(lines))
+    print(f"wrote {target}")
+
+
+def _goals(result: dict[str, Any]) -> list[str]:
+    rows = []
+    runs, first = result["runs"], result["substep"][0]
+    memory = runs[0]["peak_memory_bytes"]
+    if memory["device"] is None:
+        wall, used = runs[0]["process_wall_s"], memory["host"] / 1e9
+        rows.append(_goal("flag_cpu", f"{wall:.1f} s, {used:.2f} GB", wall <= 90 and used <= 2))
+        rows.append(_goal("substep_cpu", f"{first['median_ms']:.1f} ms (`total`)", first["median_ms"] <= 60))
+    elif len(runs) > 1:
+        wall = runs[1]["wall_s"]
+        total, used = wall["simulation"] + wall["shading"] + wall["rendering"], runs[1]["peak_memory_bytes"]["device"]
+        whole = runs[1]["frames"] >= 250
+        rows.append(
+            _goal("object_cuda", f"{total:.1f} s, {used / 2**30:.2f} GiB", whole and total <= 180 and used <= 2**31)
+        )
+    return rows
+
+
+def _goal(name: str, measured: str, reached: bool) -> str:
+    return f"| {GOALS[name]} | {measured} | {'yes' if reached else 'no'} |"
+
+
+def pictures(options: argparse.Namespace) -> None:
+    """A strip of frames of a finished run, for the README."""
+    import imageio.v3 as iio
+    import numpy as np
+
+    frames = [iio.imread(Path(options.run) / "frames" / f"{int(i):05d}.png") for i in options.frames_shown.split(",")]
+    target = ROOT / "docs" / "pictures" / f"{options.name}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(target, np.concatenate(frames, axis=1))
+    print(f"wrote {target}")
+
+
+def main() -> None:
+    """Parse and run one command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    for function in (sim, pages, pictures):
+        command = commands.add_parser(function.__name__, help=function.__doc__)
+        command.set_defaults(run_command=function)
+        command.add_argument("--results", default=str(RESULTS), help="folder of the recorded JSON")
+        if function is sim:
+            command.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+            command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
+            command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")
+        if function is pictures:
+            command.add_argument("--run", required=True, help="output folder of a run")
+            command.add_argument("--name", required=True, help="name of the picture")
+            command.add_argument("--frames_shown", default="0,20,40,60", help="frame numbers")
+    options = parser.parse_args()
+    options.run_command(options)
+
+
+if __name__ == "__main__":
+    main()
