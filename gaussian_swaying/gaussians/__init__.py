@@ -1,1 +1,1 @@
-
+"""The scene as Gaussians: files, harmonics, regions, surface patches."""

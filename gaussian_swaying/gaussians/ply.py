@@ -84,8 +84,9 @@ class GaussianCloud:
         return self._map(lambda tensor: tensor[mask])
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> GaussianCloud:
-        tensors = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return GaussianCloud(**{name: None if t is None else function(t) for name, t in tensors.items()})
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        changed: dict[str, Any] = {name: None if t is None else function(t) for name, t in fields.items()}
+        return GaussianCloud(**changed)
 
 
 def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:

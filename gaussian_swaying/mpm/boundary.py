@@ -45,8 +45,17 @@ class RegionInFrame(Region):
         """Whether each point (..., 3) [m, z up] lies inside; bool, shape (...)."""
         return self.region.contains(self.frame.point_to_scene(points))
 
+    def bounds(self, points: Tensor) -> str:
+        """Where points [m, z up] lie, in the units in which the region was given."""
+        return _bounds(self.frame.point_to_scene(points.reshape(-1, 3)))
+
     def __repr__(self) -> str:
         return repr(self.region)
+
+
+def _bounds(points: Tensor) -> str:
+    low, high = ([round(v, 4) for v in corner.tolist()] for corner in (points.amin(0), points.amax(0)))
+    return f"{low} and {high}"
 
 
 def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float) -> Tensor:
@@ -152,11 +161,15 @@ class PinnedRegion(Boundary):
         """Particles inside the region at rest; ValueError if there are none."""
         mask = self.region.contains(rest_position)
         if not bool(mask.any()):
-            low, high = rest_position.reshape(-1, 3).amin(0).tolist(), rest_position.reshape(-1, 3).amax(0).tolist()
+            inner = self.region
+            where = (
+                inner.bounds(rest_position)
+                if isinstance(inner, RegionInFrame)
+                else _bounds(rest_position.reshape(-1, 3))
+            )
             raise ValueError(
-                f"The pin {self.region!r} holds no particle: the simulated particles lie between "
-                f"{[round(v, 4) for v in low]} and {[round(v, 4) for v in high]} (metres, z up); "
-                "move or enlarge `region` of the PinnedRegion."
+                f"The pin {inner!r} holds no particle: the simulated particles lie between {where}; move or enlarge "
+                "`region` of the PinnedRegion."
             )
         return mask
 

@@ -1,1 +1,1 @@
-
+"""Cameras, shading and renderers."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from argparse import ArgumentError
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -34,6 +36,7 @@ def build_parser() -> ArgumentParser:
 
     parser = ArgumentParser(
         prog="sim.py",
+        exit_on_error=False,
         description="Let the wind move a 3D Gaussian scene: splat in, video out. Lengths that say where something is "
         "are in scene units and axes; velocities, gravity and light are in metres, z up.",
     )
@@ -44,10 +47,15 @@ def build_parser() -> ArgumentParser:
     )
     parser.add_argument("--frames", type=int, default=250, help="Number of frames, the first at rest.")
     parser.add_argument("--frame_dt", type=float, default=0.04, help="Time between frames [s].")
-    parser.add_argument("--dtype", type=Literal["float32", "float64"], default="float32", help="Precision of the solver.")
+    parser.add_argument(
+        "--dtype", type=Literal["float32", "float64"], default="float32", help="Precision of the solver."
+    )
     parser.add_argument("--background", type=list[float], default=[0.0, 0.0, 0.0], help="Background colour in [0, 1].")
     parser.add_argument(
-        "--resume", action=ActionYesNo(no_prefix=None), default=False, help="Continue the run found in the output folder."
+        "--resume",
+        action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
+        default=False,
+        help="Continue the run found in the output folder.",
     )
     parser.add_class_arguments(Scene, "scene")
     parser.add_class_arguments(Material, "material")
@@ -65,7 +73,7 @@ def resolve_device(name: str) -> torch.device:
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise ValueError(
-            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, and torch finds none: use --device auto or cpu."
+            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, and there is none: use --device auto or cpu."
         )
     return torch.device("cuda" if name != "cpu" and available else "cpu")
 
@@ -86,7 +94,7 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
     device = resolve_device(settings.device)
     if settings.frames < 1:
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
-    parts = parser.instantiate_classes(settings)
+    parts = parser.instantiate(settings)
     solver = parts.solver
     scene = SimulatedScene(parts.scene, parts.material, solver.dx, getattr(torch, settings.dtype))
     pipeline = SimulationPipeline(
@@ -119,6 +127,18 @@ def output_folder(settings: Namespace) -> Path:
     return Path("outputs") / (Path(files[-1]).stem if files else "run")
 
 
+def _one_sentence(message: str, arguments: Sequence[str]) -> str:
+    """The part of the parser's message that concerns people, with the config file if that cannot be parsed."""
+    noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+    lines = [line.strip() for line in message.splitlines()]
+    kept = [line.removeprefix("- ").rstrip(".") for line in lines if line and not line.startswith(noise)]
+    if message.startswith("Problems parsing config"):
+        files = [b for a, b in pairwise(arguments) if a == "--config"]
+        files += [a.removeprefix("--config=") for a in arguments if a.startswith("--config=")]
+        kept[0] = f"{', '.join(files)} is not valid YAML{kept[0].removeprefix('Problems parsing config')}"
+    return " ".join(kept)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, build, run.
 
@@ -129,8 +149,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C. With the
         environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
-    settings = parser.parse_args(arguments)
+    try:
+        settings = parser.parse_args(arguments)
+    except ArgumentError as error:
+        print(f"error: {_one_sentence(str(error), arguments)}; --help lists the options.", file=sys.stderr)
+        return 2
     try:
         pipeline, recorder = build_pipeline(parser, settings)
         folder = output_folder(settings)

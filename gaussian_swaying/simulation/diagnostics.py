@@ -11,7 +11,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 
 
-class SimulationDiverged(RuntimeError):
+class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way StopIteration ends a loop)
     """The simulation left the range where its numbers mean anything.
 
     Attributes:
@@ -96,9 +96,9 @@ def diagnose(solver: MPMSolver, state: MPMState, substeps: int, dt: float) -> Fr
             moved.amax().double(),
         ]
     ).tolist()
-    return FrameDiagnostics(
-        values[0], substeps, values[1], *values[2:5], int(values[5]), *values[6:]
-    )
+    names = ("time", "cfl", "kinetic", "elastic", "potential", "lost", "J_min", "J_max", "stretch_min", "stretch_max")
+    found = dict(zip((*names, "displacement_mean", "displacement_max"), values, strict=True))
+    return FrameDiagnostics(substeps=substeps, lost=int(found.pop("lost")), **found)
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

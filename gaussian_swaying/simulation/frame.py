@@ -8,33 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape, check_vector
-
-
-def rotation_to_z(up: Sequence[float]) -> Tensor:
-    """The smallest rotation that takes a direction to +z (Rodrigues' formula).
-
-    Args:
-        up: Direction, of any length but zero.
-
-    Returns:
-        Rotation, shape (3, 3), float64. A direction of -z is turned about x.
-
-    Raises:
-        ValueError: If ``up`` is zero or does not have three numbers.
-    """
-    u = torch.tensor(check_vector("up", up), dtype=torch.float64)
-    if float(u.norm()) == 0:
-        raise ValueError("Expected `up` not to be zero, for example [0, 0, 1] or [0, -1, 0].")
-    u = u / u.norm()
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    cosine = float(u @ z)
-    if cosine < -1 + 1e-12:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    axis = torch.linalg.cross(u, z)
-    x, y, w = axis.tolist()
-    skew = torch.tensor([[0.0, -w, y], [w, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)
+from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.rendering.camera import rotation_from_z
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +52,7 @@ class SimFrame:
         check_shape("points", points, "N", 3)
         if longest_side is not None and metres_per_unit is not None:
             raise ValueError("Give either `longest_side` or `metres_per_unit`, not both.")
-        rotation = rotation_to_z(up)
+        rotation = rotation_from_z(up).T
         turned = points.detach().cpu().double() @ rotation.T
         low, high = turned.amin(0), turned.amax(0)
         scale = 1.0
@@ -88,7 +63,9 @@ class SimFrame:
             check_positive("longest_side", longest_side)
             extent = float((high - low).amax())
             if extent <= 0:
-                raise ValueError("The object has no extent, so `longest_side` cannot set its size: use metres_per_unit.")
+                raise ValueError(
+                    "The object has no extent that `longest_side` could scale: give `metres_per_unit` instead."
+                )
             scale = float(longest_side) / extent
         return cls((0.5 * (low + high)) @ rotation, rotation, scale)
 
@@ -132,9 +109,9 @@ class SimFrame:
         return rotation.T @ covariance @ rotation / self.metres_per_unit**2
 
     def gradient_to_scene(self, F: Tensor) -> Tensor:
-        """Deformation gradients (..., 3, 3) from the z-up frame to scene axes: Rᵀ F R."""
-        rotation = self.rotation.to(F)
-        return rotation.T @ F @ rotation
+        """Deformation gradients (..., 3, 3) from the z-up frame to scene axes: Rᵀ F R, exactly I where F is."""
+        rotation, eye = self.rotation.to(F), torch.eye(3, dtype=F.dtype, device=F.device)
+        return eye + rotation.T @ (F - eye) @ rotation
 
     def describe(self) -> str:
         """One line for people who place boxes and cameras."""

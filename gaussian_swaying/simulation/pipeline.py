@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import resource
 import sys
@@ -9,9 +10,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -33,6 +33,8 @@ from gaussian_swaying.simulation.scene import SceneGaussians, SimulatedScene
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that ends above it is done again with shorter substeps
+MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
+MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
 
 
 class SimulationPipeline(nn.Module):
@@ -68,19 +70,26 @@ class SimulationPipeline(nn.Module):
         check_positive("frame_dt", frame_dt)
         self.scene, self.solver, self.wind, self.aero, self.shader = scene, solver, wind, aero, shader
         self.camera, self.frame_dt = camera, float(frame_dt)
-        solver.boundaries = nn.ModuleList([b.in_frame(scene.frame) for b in solver.boundaries])
+        solver.boundaries = nn.ModuleList([b.in_frame(scene.frame) for b in solver.boundaries])  # type: ignore[operator]
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
         self.background: Tensor
         self.to(device)
         self.device = torch.device(device)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
         self._windless = not bool(self.wind.flows.any()) and len(self.wind.modulations) == 0
+        self._most_substeps = sys.maxsize
 
     # ---- simulation
 
     def start(self) -> MPMState:
-        """The state at rest, time zero."""
-        return self.solver.init_state(self.scene.points)
+        """The state at rest, time zero.
+
+        Raises:
+            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long.
+        """
+        state = self.solver.init_state(self.scene.points)
+        self._most_substeps = MAX_GROWTH * self._substeps(state)
+        return state
 
     def force(self, state: MPMState, wind: Tensor) -> Tensor:
         """Wind force on every particle [N], shape (..., P, 3), at an air velocity [m/s] of shape (3,)."""
@@ -103,22 +112,36 @@ class SimulationPipeline(nn.Module):
         Raises:
             SimulationDiverged: If the frame does not end well.
         """
-        try:
-            steps = max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
-            for retry in range(MAX_RETRIES + 1):
-                dt = self.frame_dt / steps
+        steps = self._substeps(state)
+        for retry in range(MAX_RETRIES + 1):
+            if steps > self._most_substeps:
+                self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
+            try:
                 end = self._roll(self.solver.fit_grid(state, self.frame_dt), steps)
-                if self.solver.substep is not None or retry == MAX_RETRIES:
-                    break
-                cfl = float(self.solver.cfl_number(end, dt))
-                if cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl):
-                    break
-                growth = cfl / self.solver.cfl if np.isfinite(cfl) else 4.0
-                steps = int(steps * min(growth * 1.1, 4.0)) + 1
-        except FloatingPointError as error:
-            raise SimulationDiverged(float(state.time), None, str(error), "lower `solver.cfl`") from error
+            except FloatingPointError as error:
+                raise SimulationDiverged(float(state.time), None, str(error), "lower `solver.cfl`") from error
+            dt = self.frame_dt / steps
+            cfl = float(self.solver.cfl_number(end, dt))
+            if self.solver.substep is not None or cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl) or retry == MAX_RETRIES:
+                break
+            growth = cfl / self.solver.cfl if math.isfinite(cfl) else 4.0
+            steps = int(steps * min(growth * 1.1, 4.0)) + 1
         check_state(self.solver, end)
+        if not cfl <= MAX_CFL:
+            self._give_up(
+                end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
+            )
         return end, diagnose(self.solver, end, steps, dt)
+
+    def _give_up(self, state: MPMState, cause: str) -> NoReturn:
+        """Raise SimulationDiverged, blaming the particle with the largest deformation."""
+        particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
+        field = "solver.cfl" if self.solver.substep is None else "solver.substep"
+        remedy = f"lower `{field}`, or weaken the wind or the boundary that drives it"
+        raise SimulationDiverged(float(state.time), particle, cause, remedy)
+
+    def _substeps(self, state: MPMState) -> int:
+        return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
 
     def _roll(self, state: MPMState, steps: int) -> MPMState:
         dt = self.frame_dt / steps
@@ -246,12 +269,16 @@ class SimulationPipeline(nn.Module):
         """
         check_positive("frames", frames)
         self.camera_at(0)
-        state = self.start()
-        self.solver.substeps(state, self.frame_dt)  # a substep that is too long is refused before anything is written
+        state = self.start()  # what is refused is refused before anything is written
         checkpoint = recorder.open(output, config, resume)
         first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
         if checkpoint is not None:
             state = MPMState.from_state_dict(checkpoint["state"], self.device)
+            if state.position.shape != self.scene.points.position.shape:
+                raise ValueError(
+                    f"The checkpoint in {output} holds {len(state.position)} particles, but the scene has "
+                    f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
+                )
             first, log = checkpoint["frame"] + 1, checkpoint["log"]
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
@@ -285,9 +312,12 @@ class SimulationPipeline(nn.Module):
         except KeyboardInterrupt:
             status, reason = "interrupted", "stopped by the user; continue with --resume"
             raise
+        except Exception as error:
+            status, reason = "failed", str(error)
+            raise
         finally:
             bar.close()
-            summary = {"status": status if done >= frames or status != "complete" else "failed", "reason": reason}
+            summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log, frames, walls, peak) | (settings or {})
             # the video of a run that was stopped early is made too: nothing that was recorded is lost
             with walls("writing"):

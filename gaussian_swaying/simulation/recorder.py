@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
 import shutil
@@ -19,6 +20,8 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 
 MARKER = "run.json"
+# what a run writes, and so must not find in a folder that no run made
+_OURS = ("frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "config.yaml", "video.mp4")
 
 
 @contextmanager
@@ -52,7 +55,7 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
         fps: Frames per second.
 
     Raises:
-        RuntimeError: If ffmpeg fails, with its last message.
+        OSError: If ffmpeg fails, with its last message.
     """
     import imageio.v3 as iio
     import imageio_ffmpeg
@@ -64,7 +67,8 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
         command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
         command += ["-movflags", "+faststart", str(temporary)]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
-        assert process.stdin is not None and process.stderr is not None
+        assert process.stdin is not None
+        assert process.stderr is not None
         with suppress(BrokenPipeError):  # ffmpeg's own message, read below, says why it stopped
             for frame in frames:
                 process.stdin.write(iio.imread(frame)[..., :3].tobytes())
@@ -72,7 +76,7 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
             process.stdin.close()
         message = process.stderr.read().decode(errors="replace").strip()
         if process.wait() != 0:
-            raise RuntimeError(f"ffmpeg could not write {path.name}: {message.splitlines()[-1] if message else '?'}")
+            raise OSError(f"ffmpeg could not write {path.name}: {message.splitlines()[-1] if message else '?'}")
 
 
 class Recorder:
@@ -103,7 +107,7 @@ class Recorder:
             check_positive(f"recorder.{name}", value, allow_zero=True)
         check_positive("recorder.fps", fps)
         if video and not images:
-            raise ValueError("The video is made from the images: set `recorder.images` to true or `recorder.video` off.")
+            raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
         self.images, self.video, self.trajectory = images, video, trajectory
         self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), float(fps)
         self._folder: Path | None = None
@@ -118,7 +122,8 @@ class Recorder:
     def open(self, folder: str | os.PathLike[str], config: str = "", resume: bool = False) -> dict[str, Any] | None:
         """Prepare the output folder.
 
-        An earlier run found there is moved aside, never overwritten; anything else in the folder is left alone.
+        An earlier run found there is moved aside, never overwritten. Any other files in the folder are left alone; if
+        one of them bears a name of the layout, the folder is refused.
 
         Args:
             folder: Where to write.
@@ -142,10 +147,16 @@ class Recorder:
                 aside = _free_name(path)
                 path.rename(aside)
                 print(f"An earlier run in {path} was moved to {aside}.")
+            foreign = [name for name in _OURS if (path / name).exists()]
+            if foreign:
+                raise ValueError(
+                    f"The output folder {path} holds {', '.join(foreign)} of something else, which would be "
+                    "overwritten: choose another with --output."
+                )
             path.mkdir(parents=True, exist_ok=True)
             self._folder = path
-            self._make_folders()
             write_json(path / MARKER, {"made_by": "gaussian_swaying", "format": 1})
+            self._make_folders()
             if config:
                 with atomic(path / "config.yaml") as temporary:
                     temporary.write_text(config)
@@ -166,17 +177,20 @@ class Recorder:
         if not file.exists():
             raise ValueError(f"There is nothing to resume in {path}: it holds no checkpoint.pt; leave out --resume.")
         try:
-            checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+            checkpoint = dict(torch.load(file, map_location="cpu", weights_only=True))
+            missing = [name for name in ("frame", "state", "log", "config", "wall_s") if name not in checkpoint]
+            if missing:
+                raise ValueError(f"it lacks {', '.join(missing)}")
         except Exception as error:
-            raise ValueError(f"{file} cannot be read as a checkpoint ({error}): start again without --resume.") from error
-        if config and checkpoint.get("config", config) != config:
-            old, new = checkpoint["config"].splitlines(), config.splitlines()
-            changed = [line.strip() for line in new if line not in old] or [line.strip() for line in old if line not in new]
+            why = (str(error).splitlines() or ["empty"])[0]
+            raise ValueError(f"{file} cannot be read as a checkpoint ({why}): start again without --resume.") from error
+        if config and checkpoint["config"] != config:
             raise ValueError(
-                f"The configuration differs from that of the run in {path} (first at {changed[0] if changed else '?'!r}): "
-                "resume with the same one, or start again without --resume."
+                f"The configuration differs from that of the run in {path} "
+                f"({_first_change(checkpoint['config'], config)}): resume with the same one, or start again without "
+                "--resume."
             )
-        return dict(checkpoint)
+        return checkpoint
 
     def write_image(self, index: int, image: Tensor) -> None:
         """Write one frame as PNG from colours in [0, 1], shape (H, W, 3)."""
@@ -188,10 +202,9 @@ class Recorder:
     def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
         """Keep position [m] (P, 3) and F (P, 3, 3) of one frame; packed into one file by :meth:`close`."""
         with atomic(self.folder / "trajectory" / f"{index:05d}.npz") as temporary:
-            np.savez(
-                temporary,
-                **{f"position_{index:05d}": position.float().cpu().numpy(), f"F_{index:05d}": F.half().cpu().numpy()},
-            )
+            arrays: dict[str, Any] = {f"position_{index:05d}": position.float().cpu().numpy()}
+            arrays[f"F_{index:05d}"] = F.half().cpu().numpy()
+            np.savez(temporary, **arrays)
 
     def write_ply(self, index: int, write: Callable[[Path], None]) -> None:
         """Write one frame's Gaussians; ``write(path)`` is itself whole or nothing."""
@@ -217,20 +230,20 @@ class Recorder:
         Returns:
             The files and folders of the run, for telling the user.
         """
-        made: list[Path] = []
-        if self.images and frames:
-            files = self.frame_files(frames)
-            if self.video and files:
-                encode_video(files, self.folder / "video.mp4", self.fps)
-                made.append(self.folder / "video.mp4")
-            made.append(self.folder / "frames")
+        self.write_summary(summary)
+        made = [self.folder / "summary.json"]
         if self.ply_every and frames:
             made.append(self.folder / "ply")
         if self.trajectory and frames:
             self._pack_trajectory(frames)
             made.append(self.folder / "trajectory.npz")
-        self.write_summary(summary)
-        return [*made, self.folder / "summary.json"]
+        if self.images and frames:
+            made.append(self.folder / "frames")
+            files = self.frame_files(frames)
+            if self.video and files:  # last: it needs another program
+                encode_video(files, self.folder / "video.mp4", self.fps)
+                made.append(self.folder / "video.mp4")
+        return made
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write ``summary.json``."""
@@ -244,7 +257,7 @@ class Recorder:
             sources = [target] if target.exists() else []
             done: set[str] = set()
             # frames of a resumed run replace those of the run before it
-            for source in [*sorted(shards.glob("*.npz"), reverse=True), *sources]:
+            for source in [*sorted(shards.glob("[0-9]*.npz"), reverse=True), *sources]:
                 with zipfile.ZipFile(source) as archive:
                     for name in archive.namelist():
                         if name.rsplit("_", 1)[1][:5] in wanted and name not in done:
@@ -268,6 +281,20 @@ def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, T
         if f"position_{name}" not in arrays:
             raise ValueError(f"{path} holds no frame {frame}: it has {len(arrays.files) // 2} frames.")
         return torch.from_numpy(arrays[f"position_{name}"]), torch.from_numpy(arrays[f"F_{name}"]).float()
+
+
+def _first_change(old: str, new: str) -> str:
+    lines = difflib.ndiff(old.splitlines(), new.splitlines())
+    removed: list[str] = []
+    added: list[str] = []
+    for mark, line in ((line[:2], line[2:].strip()) for line in lines):
+        if mark == "  " and (removed or added):
+            break
+        if mark == "- ":
+            removed.append(line)
+        elif mark == "+ ":
+            added.append(line)
+    return f"first at {', '.join(removed) or 'nothing'!r}, now {', '.join(added) or 'nothing'!r}"
 
 
 def _free_name(path: Path) -> Path:

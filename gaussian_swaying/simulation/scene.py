@@ -46,7 +46,8 @@ class Material:
         nu: Poisson's ratio, below 0.5.
         density: Density [kg/m³].
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
-        volume: ``patch`` (area x thickness) or ``cell`` (PhysGaussian's rule for solids: cell volume / particles in it).
+        volume: ``patch`` (area x thickness) or ``cell`` (PhysGaussian's rule for solids: cell volume / particles in
+            it).
         regions: Parts made of something else; later entries win.
     """
 
@@ -59,7 +60,8 @@ class Material:
 
     def __post_init__(self) -> None:
         check_choice("material.volume", self.volume, ("patch", "cell"))
-        for entry in (self, *self.regions):
+        entries: list[Material | MaterialRegion] = [self, *self.regions]
+        for entry in entries:
             for name in ("E", "density", "thickness"):
                 if getattr(entry, name) is not None:
                     check_positive(f"material.{name}", getattr(entry, name))
@@ -175,7 +177,8 @@ class SimulatedScene(nn.Module):
         self.rest_normals: Tensor
         self.patch_normal: Tensor
         self.patch_area: Tensor
-        fields = {name: torch.full((len(simulated),), getattr(material, name)) for name in _MATERIAL_FIELDS}
+        count = len(simulated)
+        fields = {name: torch.full((count,), getattr(material, name), dtype=dtype) for name in _MATERIAL_FIELDS}
         for entry in material.regions:
             inside = entry.region.contains(cloud.means[simulated])
             if not bool(inside.any()):
@@ -184,15 +187,15 @@ class SimulatedScene(nn.Module):
                 if getattr(entry, name) is not None:
                     fields[name][inside] = getattr(entry, name)
         if material.volume == "patch":
-            volume = self.patch_area * fields["thickness"].to(dtype)
+            volume = self.patch_area * fields["thickness"]
         else:
             volume = cell_volume(position, dx).to(dtype)
         self.points = MaterialPoints.create(
             position.to(dtype),
             volume=volume,
-            density=fields["density"].to(dtype),
-            youngs_modulus=fields["E"].to(dtype),
-            poisson_ratio=fields["nu"].to(dtype),
+            density=fields["density"],
+            youngs_modulus=fields["E"],
+            poisson_ratio=fields["nu"],
         )
 
     def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
@@ -239,10 +242,11 @@ class SimulatedScene(nn.Module):
         means = rest.means.clone()
         means[index] = rest.means[index] + move
         if len(self.carried):
-            anchor = self.simulated[self.anchor]
-            arm = rest.means[self.carried] - rest.means[anchor]
-            means[self.carried] = means[anchor] + (F[self.anchor] @ arm[..., None])[..., 0]
-            index, gradient = torch.cat([index, self.carried]), torch.cat([F, F[self.anchor]])
+            near = F[self.anchor]
+            arm = rest.means[self.carried] - rest.means[index[self.anchor]]
+            turned = (near @ arm[..., None])[..., 0] - arm  # a difference, so that nothing moves at rest
+            means[self.carried] = rest.means[self.carried] + (move[self.anchor] + turned)
+            index, gradient = torch.cat([index, self.carried]), torch.cat([F, near])
         covariances, normals, rotations = rest.covariances.clone(), rest.normals.clone(), rest.rotations.clone()
         covariances[index] = deform_covariance(gradient, rest.covariances[index])
         normals[index] = deform_normal(gradient, rest.normals[index])
@@ -265,7 +269,9 @@ def nearest(queries: Tensor, points: Tensor, chunk: int = 2**26) -> Tensor:
         Shape (M,), int64.
     """
     rows = max(1, chunk // max(len(points), 1))
-    parts = [torch.cdist(part, points).argmin(1) for part in queries.split(rows)] if len(queries) else []
+    # not by matrix products: far from the origin they lose the differences that decide
+    exact = "donot_use_mm_for_euclid_dist"
+    parts = [torch.cdist(q, points, compute_mode=exact).argmin(1) for q in queries.split(rows)] if len(queries) else []
     return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.long, device=points.device)
 
 

@@ -87,9 +87,9 @@ def test_batches_and_devices(region, device, dtype):
         (lambda: Cylinder([0, 0, 0], [0, 0, 1], -1, 1), ValueError, "`radius` to be positive"),
         (lambda: Cylinder([0, 0, 0], [0, 0, 1], 1, 0), ValueError, "`height` to be positive"),
         (lambda: Union([]), ValueError, "`regions` to hold at least one region"),
-        (lambda: Union([3]), TypeError, "`regions` to be a region with a method `contains`, but got 3"),
+        (lambda: Union([3]), TypeError, "`regions` to be a Region, but got 3"),
         (lambda: Union(Everything()), TypeError, "`regions` to be a list of regions, but got Everything"),
-        (lambda: Not(Everything), TypeError, "`region` to be a region"),
+        (lambda: Not(Everything), TypeError, "`region` to be a Region"),
     ],
 )
 def test_bad_arguments_are_named(build, error, message):

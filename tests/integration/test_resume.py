@@ -1,0 +1,220 @@
+"""Runs that are stopped, killed or broken, and the runs that continue them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+from gaussian_swaying.simulation.config import main
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
+
+ROOT = Path(__file__).parents[2]
+PIN = (
+    '[{"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", '
+    '"init_args": {"min": [null, null, null], "max": [0.11, null, null]}}}}]'
+)
+FRAMES = 6
+
+
+def _arguments(folder, *more):
+    common = ["--config", str(ROOT / "configs/sim/flag.yaml"), "--output", str(folder), "--frames", str(FRAMES)]
+    common += ["--device", "cpu", "--scene.generator.init_args.spacing", "0.1", "--solver.dx", "0.2"]
+    common += ["--solver.boundaries", PIN, "--camera.init_args.width", "32", "--camera.init_args.height", "18"]
+    return [*common, *more]
+
+
+def _trajectory(folder):
+    return [load_trajectory(folder / "trajectory.npz", frame) for frame in range(FRAMES)]
+
+
+def _stop_after(monkeypatch, frames, error=KeyboardInterrupt):
+    """Break the run while it records the given frame."""
+    record = SimulationPipeline._record
+
+    def stop(self, recorder, state, frame, walls):
+        if frame == frames:
+            raise error("stopped")
+        record(self, recorder, state, frame, walls)
+
+    monkeypatch.setattr(SimulationPipeline, "_record", stop)
+
+
+def _same_as_uninterrupted(folder, other):
+    for (position, F), (expected, expected_F) in zip(_trajectory(folder), _trajectory(other), strict=True):
+        assert torch.equal(position, expected)
+        assert torch.equal(F, expected_F)
+    for frame in range(FRAMES):
+        name = f"frames/{frame:05d}.png"
+        assert (folder / name).read_bytes() == (other / name).read_bytes()
+    assert len(iio.imread(folder / "video.mp4")) == FRAMES
+    mine, others = (json.loads((path / "summary.json").read_text()) for path in (folder, other))
+    assert mine["status"] == "complete"
+    for name in ("per_frame", "energy_start_J", "energy_end_J", "largest_cfl", "substeps", "frames", "simulated_s"):
+        assert mine[name] == others[name], name
+    states = [torch.load(path / "checkpoint.pt", weights_only=True)["state"] for path in (folder, other)]
+    for name, value in states[0].items():
+        assert torch.equal(value, states[1][name]) if isinstance(value, torch.Tensor) else value == states[1][name]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run from start to end."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    assert main(_arguments(folder)) == 0
+    return folder
+
+
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_stopped_run_continues_bit_for_bit(formulation, every, whole, tmp_path, monkeypatch, capsys):
+    """Also from a checkpoint that is older than the last frame."""
+    more = ["--solver.formulation", formulation, "--recorder.checkpoint_every", str(every)]
+    folder, other = tmp_path / "run", whole
+    if (formulation, every) != ("total", 1):
+        other = tmp_path / "whole"
+        assert main(_arguments(other, *more)) == 0
+    with monkeypatch.context() as patch:
+        _stop_after(patch, 3)
+        assert main(_arguments(folder, *more)) == 130
+    assert "--resume" in capsys.readouterr().err
+    assert json.loads((folder / "summary.json").read_text())["status"] == "interrupted"
+    assert main(_arguments(folder, "--resume", *more)) == 0
+    _same_as_uninterrupted(folder, other)
+
+
+def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
+    """SIGKILL in the middle: no handler runs, nothing is packed; a half-written file lies about."""
+    folder = tmp_path / "run"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    # the same program, slowed down so that the kill surely comes in the middle
+    code = (
+        "import sys, time\n"
+        "from gaussian_swaying.simulation import config, pipeline\n"
+        "advance = pipeline.SimulationPipeline.advance\n"
+        "def slow(self, state):\n"
+        "    time.sleep(60 if float(state.time) > 0.1 else 0)\n"
+        "    return advance(self, state)\n"
+        "pipeline.SimulationPipeline.advance = slow\n"
+        "sys.exit(config.main(sys.argv[1:]))\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *_arguments(folder)], env=environment, stdout=subprocess.DEVNULL
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and process.poll() is None:
+            checkpoint = folder / "checkpoint.pt"
+            if checkpoint.exists() and torch.load(checkpoint, weights_only=True)["frame"] == 3:
+                break
+            time.sleep(0.05)
+        assert process.poll() is None
+    finally:
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    assert not (folder / "summary.json").exists()
+    (folder / "trajectory" / ".00004.1234.npz").write_bytes(b"half")
+    assert main(_arguments(folder, "--resume")) == 0
+    _same_as_uninterrupted(folder, whole)
+
+
+def test_a_finished_run_can_be_lengthened(whole, tmp_path):
+    folder = tmp_path / "run"
+    assert main([*_arguments(folder), "--frames", "3"]) == 0
+    assert main(_arguments(folder, "--resume")) == 0
+    _same_as_uninterrupted(folder, whole)
+
+
+@pytest.fixture
+def stopped(tmp_path, monkeypatch):
+    """A run that was stopped after two frames."""
+    with monkeypatch.context() as patch:
+        _stop_after(patch, 2)
+        assert main(_arguments(tmp_path / "run")) == 130
+    return tmp_path / "run"
+
+
+def _contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _refused(arguments, folder, capsys, *words):
+    """Exit code 2, one sentence with the words, and nothing changed."""
+    before = _contents(folder)
+    capsys.readouterr()
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error
+    assert _contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (["--material.E", "5000"], ["'E: 3000.0'", "'E: 5000.0'"]),
+        (["--wind.seed", "3"], ["seed: 3"]),
+        (["--shader", "null"], ["shader"]),
+        (["--material.regions", '[{"region": {"class_path": "Everything"}, "E": 1.0}]'], ["regions"]),
+    ],
+)
+def test_another_configuration_is_refused_by_name(change, words, stopped, capsys):
+    _refused(_arguments(stopped, "--resume", *change), stopped, capsys, "configuration differs", "--resume", *words)
+
+
+def test_nothing_to_resume(tmp_path, capsys):
+    _refused(_arguments(tmp_path / "none", "--resume"), tmp_path, capsys, "nothing to resume", "checkpoint.pt")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "text", "list", "keys"])
+def test_a_damaged_checkpoint_is_refused(damage, stopped, capsys):
+    file = stopped / "checkpoint.pt"
+    content = file.read_bytes()
+    if damage in ("list", "keys"):
+        torch.save([1, 2] if damage == "list" else {"frame": 1}, file)
+    else:
+        file.write_bytes({"truncated": content[: len(content) // 2], "empty": b"", "text": b"hello"}[damage])
+    words = ("checkpoint.pt cannot be read", "without --resume")
+    _refused(_arguments(stopped, "--resume"), stopped, capsys, *words)
+
+
+def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
+    """The configuration is the same, the number of particles is not."""
+    file = stopped / "checkpoint.pt"
+    checkpoint = torch.load(file, weights_only=True)
+    for name in ("position", "velocity", "affine", "F_elastic", "lost"):
+        checkpoint["state"][name] = checkpoint["state"][name][:50]
+    torch.save(checkpoint, file)
+    _refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
+
+
+def test_a_refused_run_does_not_move_the_earlier_one(stopped, capsys):
+    _refused(_arguments(stopped, "--wind.flow", "[1, 2]"), stopped, capsys, "flow")
+    assert [path.name for path in stopped.parent.iterdir()] == [stopped.name]
+
+
+def test_checkpoints_are_written_after_what_they_promise(tmp_path, monkeypatch):
+    """A checkpoint of frame k exists only once the picture and the trajectory of frame k do."""
+    seen = []
+    write = Recorder.write_checkpoint
+
+    def check(self, checkpoint):
+        name = f"{checkpoint['frame']:05d}"
+        assert (self.folder / "frames" / f"{name}.png").exists()
+        assert (self.folder / "trajectory" / f"{name}.npz").exists()
+        seen.append(checkpoint["frame"])
+        write(self, checkpoint)
+
+    monkeypatch.setattr(Recorder, "write_checkpoint", check)
+    assert main(_arguments(tmp_path / "run")) == 0
+    assert seen == list(range(FRAMES))

@@ -1,0 +1,112 @@
+"""Small scenes that are built from tensors."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
+from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+
+
+class CloudScene(ProceduralScene):
+    """A given splat as a scene."""
+
+    def __init__(self, cloud):
+        self.cloud = cloud
+
+    def generate(self):
+        return self.cloud
+
+
+def _make_cloud(count=40, degree=1, opacity=0.9, seed=0, offset=0.0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    return GaussianCloud(
+        means=random(count, 3) + offset,
+        quats=random(count, 4) - 0.5,
+        scales=(0.02 + 0.1 * random(count, 3)).log(),
+        opacities=torch.full((count,), math.log(opacity / (1 - opacity))),
+        sh=0.5 * (random(count, (degree + 1) ** 2, 3) - 0.5),
+    )
+
+
+@pytest.fixture
+def make_cloud():
+    """A random splat in the unit cube."""
+    return _make_cloud
+
+
+@pytest.fixture
+def make_scene():
+    """A SimulatedScene of a splat (a random one by default)."""
+
+    def make(cloud=None, material=None, dx=0.25, dtype=torch.float32, **settings):
+        cloud = _make_cloud() if cloud is None else cloud
+        return SimulatedScene(Scene(generator=CloudScene(cloud), **settings), material or Material(), dx, dtype)
+
+    return make
+
+
+@pytest.fixture
+def make_pipeline():
+    """A flag of 96 Gaussians on its pole, 32 x 18 pixels."""
+
+    def make(
+        cloud=None,
+        wind=None,
+        shader=None,
+        camera=None,
+        aero=None,
+        scene=None,
+        material=None,
+        pinned=True,
+        frame_dt=0.04,
+        dtype=torch.float32,
+        background=(0.0, 0.0, 0.0),
+        **solver,
+    ):
+        source = FlagScene(spacing=0.1) if cloud is None else CloudScene(cloud)
+        solver = {"dx": 0.2, **solver}
+        if pinned:
+            solver["boundaries"] = [PinnedRegion(Box([None, None, None], [0.11, None, None]))]
+        model = SimulatedScene(
+            Scene(generator=source, **(scene or {})), material or Material(E=3e3, density=30.0), solver["dx"], dtype
+        )
+        return SimulationPipeline(
+            model,
+            MPMSolver(**solver),
+            wind or WindField([6.0, 1.5, 0.0]),
+            aero or AeroForce(),
+            shader,
+            camera or OrbitCamera(width=32, height=18, azimuth=-70.0, radius=1.9),
+            background=background,
+            frame_dt=frame_dt,
+        )
+
+    return make
+
+
+@pytest.fixture
+def flag_ply(tmp_path):
+    """The small flag as a file, y up instead of z, in units of 0.3 m, far from the origin."""
+    cloud = FlagScene(spacing=0.05).generate()
+    turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # z to y
+    half = math.sqrt(0.5)
+    w, x, y, z = cloud.quats.unbind(-1)
+    quats = half * torch.stack([w + x, x - w, y + z, z - y], -1)  # by -90 degrees about x
+    means = cloud.means @ turn.T / 0.3 + torch.tensor([5.0, -3.0, 2.0])
+    path = tmp_path / "flag.ply"
+    write_ply(path, GaussianCloud(means, quats, cloud.scales - math.log(0.3), cloud.opacities, cloud.sh))
+    return path

@@ -1,0 +1,120 @@
+"""Scene units to metres and back, against closed forms."""
+
+import pytest
+import torch
+
+from gaussian_swaying.rendering.camera import rotation_from_z
+from gaussian_swaying.simulation.frame import SimFrame
+
+UPS = [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0, 1, 0], [1, 0, 0], [0.3, -0.7, 0.2], [1e-9, 0, -1]]
+
+
+def _points(dtype=torch.float64):
+    return torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=dtype) * 4 - 1
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_rotation_is_proper_and_takes_up_to_z(up):
+    rotation = rotation_from_z(up).T
+    direction = torch.tensor(up, dtype=torch.float64)
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
+    expected = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(rotation @ direction / direction.norm(), expected, rtol=0, atol=1e-8)
+
+
+def test_up_is_minus_y_has_a_closed_form():
+    """(x, y, z) with y down becomes (x, z, -y): a quarter turn about x, exactly."""
+    frame = SimFrame(torch.zeros(3, dtype=torch.float64), rotation_from_z([0, -1, 0]).T, 2.0)
+    point = torch.tensor([1.0, 2.0, 3.0])
+    assert frame.point_to_sim(point).tolist() == [2.0, 6.0, -4.0]
+    assert frame.direction_to_sim(point).tolist() == [1.0, 3.0, -2.0]
+    assert frame.displacement_to_scene(torch.tensor([2.0, 6.0, -4.0])).tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_longest_side_sets_the_box(up):
+    """The box along the simulation's axes has the longest side asked for and its centre at the origin."""
+    frame = SimFrame.fit(_points(), up, longest_side=1.5)
+    placed = frame.point_to_sim(_points())
+    low, high = placed.amin(0), placed.amax(0)
+    assert float((high - low).amax()) == pytest.approx(1.5, rel=1e-12)
+    torch.testing.assert_close(low + high, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [{"longest_side": 1.0}, {"metres_per_unit": 0.01}, {}])
+@pytest.mark.parametrize("up", UPS)
+def test_there_and_back(up, size):
+    frame = SimFrame.fit(_points(), up, **size)
+    torch.testing.assert_close(frame.point_to_scene(frame.point_to_sim(_points())), _points(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(frame.direction_to_scene(frame.direction_to_sim(_points())), _points())
+    move = frame.point_to_sim(_points() + 0.5) - frame.point_to_sim(_points())
+    torch.testing.assert_close(frame.displacement_to_scene(move), torch.full_like(move, 0.5))
+
+
+def test_metres_per_unit_is_taken_as_it_is():
+    frame = SimFrame.fit(_points(), metres_per_unit=0.25)
+    assert frame.metres_per_unit == 0.25
+    distance = torch.linalg.vector_norm(frame.point_to_sim(_points())[0] - frame.point_to_sim(_points())[1])
+    assert float(distance) == pytest.approx(0.25 * float((_points()[0] - _points()[1]).norm()))
+    assert SimFrame.fit(_points()).metres_per_unit == 1.0
+    assert float(frame.area_to_sim(torch.tensor(16.0))) == 1.0
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_covariances_follow_the_points(up):
+    """Covariance of transformed samples = transformed covariance of samples."""
+    frame = SimFrame.fit(_points(), up, longest_side=1.0)
+    covariance = torch.cov(_points().T)
+    torch.testing.assert_close(frame.covariance_to_sim(covariance), torch.cov(frame.point_to_sim(_points()).T))
+    torch.testing.assert_close(frame.covariance_to_scene(frame.covariance_to_sim(covariance)), covariance)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_deforming_in_the_scene_is_deforming_in_metres(up):
+    """F_scene A F_sceneᵀ is F_sim A_sim F_simᵀ brought back."""
+    frame = SimFrame.fit(_points(), up, longest_side=0.7)
+    factor = torch.rand(5, 3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    covariance, F = factor @ factor.mT, factor + torch.eye(3, dtype=torch.float64)
+    in_scene = frame.gradient_to_scene(F)
+    in_metres = F @ frame.covariance_to_sim(covariance) @ F.mT
+    torch.testing.assert_close(in_scene @ covariance @ in_scene.mT, frame.covariance_to_scene(in_metres))
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_an_undeformed_gradient_stays_exactly_that(up):
+    eye = torch.eye(3).expand(4, 3, 3)
+    assert torch.equal(SimFrame.fit(_points(), up).gradient_to_scene(eye), eye)
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0.3, -0.7, 0.2]])
+def test_a_scene_far_away_keeps_its_detail(up):
+    """float32 at 1e4 resolves 1e-3; what the file holds must come through to float32 round-off of the object's size."""
+    stored = (_points() + 1e4).float()
+    frame = SimFrame.fit(stored, up, longest_side=1.0)
+    near = frame.point_to_sim(stored)
+    exact = (stored.double() - stored.double()[0]) @ rotation_from_z(up) * frame.metres_per_unit
+    torch.testing.assert_close((near - near[0]).double(), exact, rtol=0, atol=3e-7)
+    assert torch.equal(frame.point_to_scene(near.double()).float(), stored)
+
+
+def test_bad_arguments():
+    points = _points()
+    with pytest.raises(ValueError, match=r"either `longest_side` or `metres_per_unit`"):
+        SimFrame.fit(points, longest_side=1.0, metres_per_unit=1.0)
+    with pytest.raises(ValueError, match=r"`up` to be a direction"):
+        SimFrame.fit(points, [0, 0, 0])
+    with pytest.raises(ValueError, match=r"`up` to have 3 numbers"):
+        SimFrame.fit(points, [0, 1])
+    with pytest.raises(ValueError, match=r"no extent .*`metres_per_unit`"):
+        SimFrame.fit(points[:1], longest_side=1.0)
+    for name in ("longest_side", "metres_per_unit"):
+        with pytest.raises(ValueError, match=name):
+            SimFrame.fit(points, **{name: 0.0})
+    with pytest.raises(ValueError, match="points"):
+        SimFrame.fit(points[:, :2])
+
+
+def test_one_point_is_enough_without_a_size():
+    frame = SimFrame.fit(torch.tensor([[1.0, 2.0, 3.0]]))
+    assert frame.point_to_sim(torch.tensor([1.0, 2.0, 4.0])).tolist() == [0.0, 0.0, 1.0]

@@ -1,0 +1,279 @@
+"""Frames from components: substeps, wind, cameras, colours and pictures."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import GaussianGust, SineSway, WindField
+from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.camera import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.rendering.torch_renderer import render_torch
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+
+
+def _advance(pipeline, frames):
+    state, log = pipeline.start(), []
+    for _ in range(frames):
+        state, health = pipeline.advance(state)
+        log.append(health)
+    return state, log
+
+
+# ---- time
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_the_substep_does_not_depend_on_the_frame(formulation, make_pipeline):
+    """0.16 s in frames of 40, 80 or 160 ms with gusts that change every 40 ms: the same substeps, the same motion."""
+    ends = []
+    for frame_dt, frames in ((0.04, 4), (0.08, 2), (0.16, 1)):
+        wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(period=0.3), GaussianGust(1.0)])
+        settings = {"frame_dt": frame_dt, "formulation": formulation, "substep": 0.004, "dtype": torch.float64}
+        state, log = _advance(make_pipeline(wind=wind, **settings), frames)
+        assert sum(health.substeps for health in log) == 40
+        assert float(state.time) == pytest.approx(0.16)
+        ends.append(state.position)
+    moved = float((ends[0] - make_pipeline(dtype=torch.float64).start().position).abs().max())
+    assert moved > 0.05
+    for end in ends[1:]:
+        torch.testing.assert_close(end, ends[0], rtol=0, atol=1e-9)
+
+
+def test_the_adaptive_substep_follows_the_courant_number(make_pipeline):
+    """c = sqrt((lambda + 2 mu) / rho) at rest: ceil(frame_dt c / (cfl dx)) substeps, whatever the frame."""
+    speed = math.sqrt(3e3 * 0.7 / (1.3 * 0.4) / 30.0)
+    for frame_dt in (0.04, 0.1):
+        for cfl in (0.4, 0.1):
+            pipeline = make_pipeline(wind=WindField(), frame_dt=frame_dt, cfl=cfl, gravity=(0.0, 0.0, 0.0))
+            _, (health,) = _advance(pipeline, 1)
+            assert health.substeps == math.ceil(frame_dt * speed / (cfl * 0.2))
+            assert health.cfl == pytest.approx(frame_dt / health.substeps * speed / 0.2, rel=1e-5)
+
+
+def test_strong_drag_on_light_patches_shortens_the_substep(make_pipeline):
+    """Explicit drag is stable for dt < 2 m / (rho A C v)."""
+    light = Material(E=10.0, density=1.0, thickness=1e-3)
+    wind = WindField([30.0, 0.0, 0.0])
+    pipeline = make_pipeline(wind=wind, material=light, aero=AeroForce(C_D=1.0, C_F=0.0, C_L=0.0))
+    _, (health,) = _advance(pipeline, 1)
+    areal = 1.0 * 1e-3
+    assert health.substeps > 0.04 * 1.225 * 1.0 * 30.0 / areal / 2
+    assert math.isfinite(health.kinetic)
+
+
+def test_without_wind_the_aerodynamics_are_not_asked(make_pipeline, monkeypatch):
+    calls = []
+    forward = AeroForce.forward
+    monkeypatch.setattr(AeroForce, "forward", lambda self, *a: calls.append(1) or forward(self, *a))
+    _, (health,) = _advance(make_pipeline(wind=WindField()), 1)
+    assert calls == []
+    assert health.kinetic > 0
+    _, (health,) = _advance(make_pipeline(), 1)
+    assert len(calls) == health.substeps
+    calls.clear()
+    _advance(make_pipeline(wind=WindField(modulations=[GaussianGust(0.3)])), 1)
+    assert calls
+
+
+def test_the_wind_blows_the_flag_its_way(make_pipeline):
+    """Along y, the normal of the flag, with either sign."""
+    for sign in (1.0, -1.0):
+        pipeline = make_pipeline(wind=WindField([0.0, 4.0 * sign, 0.0]), gravity=(0.0, 0.0, 0.0))
+        state, _ = _advance(pipeline, 2)
+        assert sign * float((state.position - pipeline.scene.points.position)[:, 1].mean()) > 0.01
+
+
+def test_a_frame_whose_substep_was_too_long_is_done_again(make_pipeline, monkeypatch):
+    """The first try ends with a Courant number of 2, so more substeps are taken, from the same start."""
+    pipeline = make_pipeline(wind=WindField())
+    state = pipeline.start()
+    _, expected = _advance(make_pipeline(wind=WindField()), 1)
+    tries = []
+    roll, number = pipeline._roll, pipeline.solver.cfl_number
+
+    def record(start, steps):
+        tries.append((start, steps))
+        return roll(start, steps)
+
+    monkeypatch.setattr(pipeline, "_roll", record)
+    monkeypatch.setattr(
+        pipeline.solver, "cfl_number", lambda s, dt: torch.tensor(2.0) if len(tries) == 1 else number(s, dt)
+    )
+    end, health = pipeline.advance(state)
+    steps = [n for _, n in tries]
+    assert steps[0] < steps[1] <= 4 * steps[0] + 1
+    assert len(tries) == 2
+    assert health.substeps == steps[1] > expected[0].substeps
+    assert torch.equal(tries[0][0].position, tries[1][0].position)
+    assert float(end.time) == pytest.approx(0.04)
+
+
+def test_a_fixed_substep_is_kept(make_pipeline):
+    _, log = _advance(make_pipeline(substep=0.004), 3)
+    assert [health.substeps for health in log] == [10, 10, 10]
+
+
+def test_a_fixed_substep_above_the_stable_one_is_refused_with_the_stable_one(make_pipeline):
+    pipeline = make_pipeline(substep=0.5)
+    with pytest.raises(ValueError, match=r"`substep` of 0.5 s is longer than the stable one of \d") as info:
+        pipeline.start()
+    assert f"{pipeline.solver.stable_substep():.4g} s" in str(info.value)
+
+
+# ---- divergence
+
+
+def test_a_courant_number_beyond_any_stability_is_a_divergence(make_pipeline):
+    pipeline = make_pipeline(cfl=50.0)
+    with pytest.raises(
+        SimulationDiverged, match=r"t = 0.04 s, particle \d+: the Courant number .*`solver.cfl`"
+    ) as info:
+        _advance(pipeline, 1)
+    assert info.value.particle is not None
+
+
+def test_a_frame_of_endless_substeps_is_a_divergence(make_pipeline):
+    """An enormous stretch would take years of substeps; the most stretched particle is named."""
+    pipeline = make_pipeline(wind=WindField())
+    state = pipeline.start()
+    F = state.F_elastic.clone()
+    F[12] *= 1e4
+    with pytest.raises(SimulationDiverged, match=r"particle 12: a frame would take [\d,]+ substeps"):
+        pipeline.advance(state.replace(F_elastic=F))
+
+
+def test_a_particle_that_becomes_nan_is_a_divergence(make_pipeline, monkeypatch):
+    pipeline = make_pipeline(wind=WindField())
+    state, roll = pipeline.start(), pipeline._roll
+
+    def poison(start, steps):
+        end = roll(start, steps)
+        velocity = end.velocity.clone()
+        velocity[7] = math.nan
+        return end.replace(velocity=velocity)
+
+    monkeypatch.setattr(pipeline, "_roll", poison)
+    with pytest.raises(SimulationDiverged, match=r"particle 7: .*NaN"):
+        pipeline.advance(state)
+
+
+# ---- camera
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+def test_the_camera_orbits_the_object_in_scene_units(up, make_cloud, make_pipeline):
+    cloud = make_cloud(offset=5.0)
+    pipeline = make_pipeline(cloud, pinned=False, scene={"up": up, "longest_side": 0.1}, camera=OrbitCamera(radius=3.0))
+    low, high = cloud.means.amin(0), cloud.means.amax(0)
+    eye = pipeline.camera_at(0).position
+    assert float((eye - 0.5 * (low + high)).norm()) == pytest.approx(3 * float((high - low).amax()), rel=1e-4)
+
+
+def test_a_camera_inside_the_object_is_an_error(make_cloud, make_pipeline):
+    inside = make_pipeline(make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 0.5], target=[2.0, 0.5, 0.5]))
+    with pytest.raises(ValueError, match=r"camera at \[0.5, 0.5, 0.5\] lies inside the object"):
+        inside.camera_at(0)
+    outside = make_pipeline(
+        make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 3.0], target=[0.5, 0.4, 0.5])
+    )
+    outside.camera_at(0)
+
+
+# ---- colours
+
+
+def _turn():
+    """A rotation of the simulation frame by 70 degrees about an oblique axis."""
+    axis = torch.nn.functional.normalize(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64), dim=0)
+    x, y, z = axis.tolist()
+    skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.matrix_exp(math.radians(70.0) * skew)
+
+
+def test_colours_turn_with_the_object(make_cloud, make_pipeline):
+    """Object and eye turned alike about the object's centre: the same colours. The eye left behind: other ones."""
+    pipeline = make_pipeline(make_cloud(), pinned=False, scene={"up": [0.0, -1.0, 0.0], "longest_side": 0.5})
+    frame, state, R = pipeline.scene.frame, pipeline.start(), _turn()
+    turned = state.replace(position=(state.position.double() @ R.T).float(), F_total=R.float().expand_as(state.F_total))
+    eye = torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64)
+    turned_eye = frame.point_to_scene(frame.point_to_sim(eye) @ R.T)
+    target = frame.origin.tolist()
+
+    def colours(state, eye):
+        pipeline.camera = LookAtCamera(eye=eye.tolist(), target=target, width=32, height=18)
+        return pipeline.shade(state, pipeline.camera_at(0))[1]
+
+    rest = colours(state, eye)
+    torch.testing.assert_close(colours(turned, turned_eye), rest, rtol=0, atol=1e-5)
+    assert float((colours(turned, eye) - rest).abs().max()) > 0.05
+    assert float((colours(state, turned_eye) - rest).abs().max()) > 0.05
+
+
+def test_only_moving_gaussians_are_shaded(make_cloud, make_pipeline):
+    from gaussian_swaying.gaussians.selection import Box
+
+    cloud = make_cloud(degree=0)
+    opacities = cloud.opacities.clone()
+    opacities[::4] = -4.0  # faint: carried inside the region
+    cloud = dataclasses.replace(cloud, opacities=opacities)
+    region = Box([None, None, None], [0.5, None, None])
+    settings = {"scene": {"region": region}, "pinned": False}
+    plain = make_pipeline(cloud, **settings)
+    dark = make_pipeline(cloud, shader=DiffuseShader([0.0, 0.0, 1.0]), **settings)
+    before = plain.shade(plain.start(), plain.camera_at(0))[1]
+    gaussians, after = dark.shade(dark.start(), dark.camera_at(0))
+    inside = cloud.means[:, 0] <= 0.5
+    assert torch.equal(after[~inside], before[~inside])
+    expected = before * gaussians.normals[:, 2:].clamp_min(0)  # max(0, n . L), light from above
+    torch.testing.assert_close(after[inside], expected[inside], rtol=0, atol=1e-6)
+
+
+def test_the_light_is_given_in_the_z_up_frame(make_pipeline):
+    """y up in the scene: a sheet whose normal is y is fully lit by light from above."""
+    flag = FlagScene(spacing=0.1, ripple=0.0, pattern="white").generate()
+    shader = DiffuseShader([0.0, 0.0, 1.0], two_sided=True)
+    for up, factor in (([0.0, 1.0, 0.0], 1.0), ([0.0, 0.0, 1.0], 0.0)):
+        pipeline = make_pipeline(flag, shader=shader, pinned=False, scene={"up": up})
+        camera = LookAtCamera(eye=[0.6, -3.0, 1.0], target=[0.6, 0.0, 0.4])
+        pipeline.camera = camera
+        colours = pipeline.shade(pipeline.start(), pipeline.camera_at(0))[1]
+        torch.testing.assert_close(colours, torch.full_like(colours, 0.9 * factor), rtol=0, atol=1e-5)
+
+
+# ---- pictures
+
+
+def test_the_first_picture_is_that_of_the_splat(flag_ply, make_pipeline):
+    """A file with y up and another unit, scaled to 1 m and back, against the file drawn as it is."""
+    scene = SimulatedScene(Scene(ply=flag_ply, up=[0.0, 1.0, 0.0], longest_side=1.0), Material(), 0.1)
+    camera = LookAtCamera(eye=[7.0, -2.0, -5.0], target=[7.0, -1.7, 2.0], up=[0.0, 1.0, 0.0], width=64, height=36)
+    background = (0.2, 0.3, 0.4)
+    pipeline = SimulationPipeline(
+        scene, MPMSolver(dx=0.1), WindField([5.0, 0.0, 0.0]), AeroForce(), None, camera, background
+    )
+    picture = pipeline.render(pipeline.start(), 0)
+    model = GaussianSurfaceModel.from_cloud(read_ply(flag_ply), requires_grad=False)
+    view = camera(0, 0.0, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]), 1.0)
+    colours = model.colors(torch.nn.functional.normalize(model.means - view.position, dim=-1))
+    direct = render_torch(model.means, model.covariance(), model.opacity(), colours, view, torch.tensor(background))
+    assert float(direct.alpha.mean()) > 0.1  # the flag is in the picture
+    error = float((picture.color - direct.color).square().mean())
+    assert -10 * math.log10(max(error, 1e-12)) >= 35
+    state, _ = _advance(pipeline, 3)
+    moved = pipeline.render(state, 0)
+    assert float((moved.color - direct.color).square().mean()) > 100 * max(error, 1e-12)
+
+
+@pytest.mark.parametrize("frame_dt", [0.0, -1.0, math.nan])
+def test_bad_frame_length(frame_dt, make_pipeline):
+    with pytest.raises(ValueError, match="frame_dt"):
+        make_pipeline(frame_dt=frame_dt)

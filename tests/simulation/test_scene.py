@@ -1,0 +1,247 @@
+"""Which Gaussians move, what they weigh, and how they follow the material."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians.ply import GaussianCloud
+from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, cell_volume, nearest
+
+LEFT = Box([None, None, None], [0.5, None, None])
+UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]
+
+
+def _rest_state(scene):
+    return MPMSolver(dx=0.25).init_state(scene.points)
+
+
+def _rotation(dtype=torch.float64):
+    q, r = torch.linalg.qr(torch.rand(3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64))
+    q = q * torch.sign(torch.diagonal(r))
+    return (q * torch.sign(torch.linalg.det(q))).to(dtype)
+
+
+def _faint_cloud(make_cloud):
+    """Forty Gaussians; the odd ones are faint."""
+    cloud = make_cloud()
+    opacities = cloud.opacities.clone()
+    opacities[1::2] = math.log(0.05 / 0.95)
+    return dataclasses.replace(cloud, opacities=opacities)
+
+
+def test_the_region_chooses_and_the_rest_stays(make_cloud, make_scene):
+    cloud = make_cloud()
+    scene = make_scene(cloud, region=LEFT)
+    inside = cloud.means[:, 0] <= 0.5
+    assert 0 < int(inside.sum()) < len(cloud)
+    assert torch.equal(scene.simulated, inside.nonzero()[:, 0])
+    assert scene.points.count == int(inside.sum())
+    assert len(scene.model.means) == len(cloud)
+    state = _rest_state(scene)
+    moved = scene.deformed(state.replace(position=state.position + 0.3, F_total=state.F_total * 1.5))
+    for name in ("means", "covariances", "normals", "rotations"):
+        assert torch.equal(getattr(moved, name)[~inside], getattr(scene.rest(), name)[~inside]), name
+    torch.testing.assert_close(moved.means[inside], cloud.means[inside] + 0.3)
+
+
+@pytest.mark.parametrize("faint", ["carry", "static", "drop"])
+def test_faint_gaussians(faint, make_cloud, make_scene):
+    """They are no particles in any case; they follow, stay, or are gone."""
+    cloud = _faint_cloud(make_cloud)
+    scene = make_scene(cloud, faint=faint)
+    assert scene.points.count == 20
+    assert len(scene.model.means) == (20 if faint == "drop" else 40)
+    state = _rest_state(scene)
+    means = scene.deformed(state.replace(position=state.position + 1.0)).means
+    expected = cloud.means + 1.0
+    if faint == "static":
+        expected[1::2] = cloud.means[1::2]
+    torch.testing.assert_close(means, expected[::2] if faint == "drop" else expected)
+
+
+def test_faint_gaussians_outside_the_region_stay(make_cloud, make_scene):
+    cloud = _faint_cloud(make_cloud)
+    outside = cloud.means[:, 0] > 0.5
+    for faint, count in (("carry", 40), ("drop", 40 - int((~outside)[1::2].sum()))):
+        scene = make_scene(cloud, faint=faint, region=LEFT)
+        assert len(scene.model.means) == count
+        assert not bool((scene.model.means[scene.carried, 0] > 0.5).any())
+
+
+def test_carried_gaussians_follow_their_nearest_particle(make_cloud, make_scene):
+    """x' = x_a' + F_a (x - x_a), with a covariance and normal of F_a; every particle has its own F."""
+    cloud = _faint_cloud(make_cloud)
+    scene = make_scene(cloud)
+    state = _rest_state(scene)
+    F = torch.eye(3) + 0.3 * torch.rand(20, 3, 3, generator=torch.Generator().manual_seed(3))
+    shift = torch.rand(20, 3, generator=torch.Generator().manual_seed(4))
+    deformed = scene.deformed(state.replace(position=state.position + shift, F_total=F))
+    for k, index in enumerate(scene.carried.tolist()):
+        particle = int((cloud.means[::2] - cloud.means[index]).norm(dim=-1).argmin())
+        assert int(scene.anchor[k]) == particle
+        arm = cloud.means[index] - cloud.means[2 * particle]
+        torch.testing.assert_close(deformed.means[index], deformed.means[2 * particle] + F[particle] @ arm)
+        covariance = F[particle] @ scene.rest_covariances[index] @ F[particle].T
+        torch.testing.assert_close(deformed.covariances[index], covariance)
+
+
+def test_the_nearest_is_found_far_from_the_origin():
+    """Distances by matrix products would be off by metres at float32 coordinates of 1e4."""
+    points = (torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) + 1e4).float()
+    queries = points[::3] + torch.tensor([0.001, 0.0, 0.0])
+    exact = torch.linalg.vector_norm(queries[:, None].double() - points[None].double(), dim=-1).argmin(1)
+    assert torch.equal(nearest(queries, points), exact)
+    assert torch.equal(nearest(queries, points, chunk=200), exact)
+    assert nearest(queries[:0], points).shape == (0,)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_nothing_moves_at_rest(up, make_cloud, make_scene):
+    """Bit for bit, whatever the axes and the unit, carried Gaussians included."""
+    cloud = _faint_cloud(make_cloud)
+    cloud.means[1::2] *= 7.3  # arms that do not round to nothing
+    scene = make_scene(cloud, up=up, longest_side=0.37)
+    for formulation in ("total", "updated"):
+        deformed = scene.deformed(MPMSolver(dx=0.25, formulation=formulation).init_state(scene.points))
+        assert torch.equal(deformed.means, scene.model.means)
+        assert torch.equal(deformed.covariances, scene.rest_covariances)
+        torch.testing.assert_close(deformed.normals, scene.rest_normals, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_a_rigid_motion_moves_everything_rigidly(up, make_cloud, make_scene):
+    """Rotation and translation given in metres; the Gaussians turn by its picture in scene axes."""
+    scene = make_scene(_faint_cloud(make_cloud), up=up, longest_side=0.5, dtype=torch.float64)
+    state, frame = _rest_state(scene), scene.frame
+    R, shift = _rotation(), torch.tensor([0.2, -0.1, 0.4], dtype=torch.float64)
+    F = R.expand(20, 3, 3)
+    deformed = scene.deformed(state.replace(position=state.position @ R.T + shift, F_total=F, F_elastic=F))
+    turn = (frame.rotation.T @ R @ frame.rotation).float()
+    rest = scene.rest()
+    expected = frame.point_to_scene(frame.point_to_sim(rest.means.double()) @ R.T + shift).float()
+    torch.testing.assert_close(deformed.means, expected, rtol=0, atol=2e-6)
+    torch.testing.assert_close(deformed.covariances, turn @ rest.covariances @ turn.T, rtol=0, atol=1e-7)
+    torch.testing.assert_close(deformed.normals, rest.normals @ turn.T, rtol=0, atol=1e-6)
+    torch.testing.assert_close(deformed.rotations, turn.expand(40, 3, 3), rtol=0, atol=1e-6)
+
+
+def test_normals_of_a_shear_are_not_those_of_its_rotation(make_scene):
+    """F⁻ᵀN: a sheet in the x-z plane sheared by y += x has the normal (-1, 1, 0) / sqrt 2."""
+    scene = make_scene(FlagScene(spacing=0.2, ripple=0.0).generate())
+    state = _rest_state(scene)
+    F = torch.tensor([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).expand_as(state.F_total)
+    normals = scene.deformed(state.replace(F_total=F)).normals
+    expected = torch.tensor([-1.0, 1.0, 0.0]) / math.sqrt(2)
+    torch.testing.assert_close((normals @ expected).abs(), torch.ones(len(normals)))
+
+
+def test_pictures_follow_the_total_deformation(make_scene):
+    scene = make_scene()
+    state = _rest_state(scene)
+    F = 2 * torch.eye(3).expand_as(state.F_total)
+    torch.testing.assert_close(scene.deformed(state.replace(F_total=F)).covariances, 4 * scene.rest_covariances)
+    assert torch.equal(scene.deformed(state.replace(F_elastic=F)).covariances, scene.rest_covariances)
+
+
+@pytest.mark.parametrize("metres_per_unit", [1.0, 0.5])
+def test_a_patch_weighs_density_times_area_times_thickness(make_scene, metres_per_unit):
+    material = Material(density=30.0, thickness=0.02)
+    flag = FlagScene(spacing=0.1, ripple=0.0).generate()
+    scene = make_scene(flag, material, metres_per_unit=metres_per_unit)
+    torch.testing.assert_close(scene.points.volume, scene.patch_area * 0.02)
+    torch.testing.assert_close(scene.points.mass, scene.points.volume * 30.0)
+    weight = 1.2 * 0.8 * metres_per_unit**2 * 0.02 * 30.0
+    assert float(scene.points.mass.sum()) == pytest.approx(weight, rel=0.02)
+
+
+def test_faint_gaussians_take_no_area(make_cloud, make_scene):
+    """The surface belongs to those that carry it, so its weight does not depend on what is filtered out."""
+    flag = FlagScene(spacing=0.1, ripple=0.0).generate()
+    haze = dataclasses.replace(flag, means=flag.means + 0.01, opacities=torch.full((96,), -5.0))
+    names = ("means", "quats", "scales", "opacities", "sh")
+    both = GaussianCloud(*(torch.cat([getattr(flag, name), getattr(haze, name)]) for name in names))
+    torch.testing.assert_close(make_scene(both).patch_area, make_scene(flag).patch_area)
+
+
+def test_areas_as_in_the_paper(make_cloud, make_scene):
+    cloud = make_cloud()
+    s = cloud.scales.exp().sort(dim=-1).values
+    scene = make_scene(cloud, area="paper", metres_per_unit=2.0)
+    torch.testing.assert_close(scene.patch_area, 4 * math.pi * s[:, 1] * s[:, 2])
+
+
+def test_cell_rule(make_scene):
+    """Three particles share one cell, one has another to itself."""
+    position = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.4], [0.4, 0.4, 0.4], [-0.1, 0.1, 0.1]])
+    torch.testing.assert_close(cell_volume(position, 0.5), torch.tensor([1, 1, 1, 3]) * 0.125 / 3)
+    scene = make_scene(material=Material(volume="cell", density=10.0), dx=0.25)
+    torch.testing.assert_close(scene.points.volume, cell_volume(scene.points.position, 0.25))
+    torch.testing.assert_close(scene.points.mass, 10 * scene.points.volume)
+
+
+def test_material_regions(make_cloud, make_scene):
+    """Later entries win, what is null stays."""
+    material = Material(
+        E=1e4,
+        nu=0.2,
+        density=100.0,
+        thickness=0.01,
+        regions=[
+            MaterialRegion(LEFT, E=2e4, nu=0.4, density=50.0, thickness=0.03),
+            MaterialRegion(Box([None, None, None], [0.25, None, None]), E=3e4),
+        ],
+    )
+    cloud = make_cloud()
+    scene = make_scene(cloud, material, dtype=torch.float64)
+    x, points = cloud.means[:, 0], scene.points
+    left, far_left = x <= 0.5, x <= 0.25
+    assert bool(far_left.any()) and bool((left & ~far_left).any())  # noqa: PT018
+
+    def field(outside, inside, further):
+        values = torch.full((len(cloud),), outside, dtype=torch.float64)
+        values[left] = inside
+        values[far_left] = further
+        return values
+
+    assert torch.equal(points.youngs_modulus, field(1e4, 2e4, 3e4))
+    assert torch.equal(points.poisson_ratio, field(0.2, 0.4, 0.4))
+    torch.testing.assert_close(points.mass / points.volume, field(100.0, 50.0, 50.0))
+    torch.testing.assert_close(points.volume / scene.patch_area, field(0.01, 0.03, 0.03))
+
+
+def test_a_material_region_that_holds_nothing_is_an_error(make_scene):
+    region = MaterialRegion(Box([5, 5, 5], [6, 6, 6]), E=1.0)
+    with pytest.raises(ValueError, match=r"`material.regions` holds no simulated"):
+        make_scene(material=Material(regions=[region]))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("E", 0.0), ("E", -1.0), ("density", 0.0), ("thickness", -0.01), ("nu", 0.5), ("nu", -1.0)]
+)
+def test_bad_materials(name, value):
+    with pytest.raises(ValueError, match=f"material.{name}"):
+        Material(**{name: value})
+    with pytest.raises(ValueError, match=f"material.{name}"):
+        Material(regions=[MaterialRegion(LEFT, **{name: value})])
+
+
+def test_bad_scenes():
+    flag = FlagScene(spacing=0.1)
+    with pytest.raises(ValueError, match=r"`scene.ply`"):
+        Scene()
+    with pytest.raises(ValueError, match=r"material\.volume"):
+        Material(volume="all")
+    for name, value in (("faint", "hide"), ("area", "disc"), ("opacity_threshold", 1.0), ("up", [0.0, 1.0])):
+        with pytest.raises(ValueError, match=f"scene.{name}"):
+            Scene(generator=flag, **{name: value})
+
+
+def test_points_move_with_the_module(make_scene):
+    scene = make_scene()
+    scene.to(torch.float64)
+    assert scene.points.position.dtype == scene.patch_area.dtype == torch.float64

@@ -1,0 +1,354 @@
+"""The command line: what it accepts, and the one sentence it answers bad input with."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.simulation.config import build_parser, build_pipeline, config_text, main, output_folder
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+
+ROOT = Path(__file__).parents[2]
+FLAG = ROOT / "configs/sim/flag.yaml"
+CONFIGS = sorted((ROOT / "configs/sim").glob("*.yaml"))
+
+
+def _pin(low, high):
+    region = {"class_path": "Box", "init_args": {"min": low, "max": high}}
+    return json.dumps([{"class_path": "PinnedRegion", "init_args": {"region": region}}])
+
+
+POLE = _pin([None, None, None], [0.11, None, None])
+SMALL = ["--config", str(FLAG), "--frames", "2", "--device", "cpu", "--scene.generator.init_args.spacing", "0.1"]
+SMALL += ["--solver.dx", "0.2", "--solver.boundaries", POLE]
+SMALL += ["--camera.init_args.width", "32", "--camera.init_args.height", "18"]
+
+
+def _code(arguments):
+    """The exit code, returned or raised."""
+    try:
+        return main(arguments)
+    except SystemExit as stop:
+        return stop.code
+
+
+def _refuse(arguments, output, capsys, *words):
+    """Exit code 2, one sentence on stderr that holds the words, and nothing left behind."""
+    capsys.readouterr()
+    before = sorted(output.parent.rglob("*"))
+    assert _code([*arguments, "--output", str(output)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    for word in words:
+        assert word in error, error
+    assert sorted(output.parent.rglob("*")) == before
+
+
+# ---- what works
+
+
+def test_a_run(tmp_path, capsys):
+    assert main([*SMALL, "--output", str(tmp_path / "run")]) == 0
+    out = capsys.readouterr().out
+    assert "96 of 96 Gaussians simulated on cpu" in out
+    assert "1 scene unit = 1 m" in out
+    for name in ("video.mp4", "trajectory.npz", "summary.json", "frames"):
+        assert f"wrote {tmp_path / 'run' / name}\n" in out
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["config"] == [str(FLAG)]
+    assert summary["frames"] == 2
+
+
+def test_the_tool_as_a_program(tmp_path):
+    """Exit code and streams of the process itself, from another folder."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / "tools/sim.py"), *SMALL, "--material.nu", "0.5"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: Expected `material.nu`")
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_stored_configuration_makes_the_same_run(tmp_path):
+    """config.yaml of a run is a complete configuration: run again, it gives the same positions."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert main([*SMALL, "--output", str(one)]) == 0
+    assert main(["--config", str(one / "config.yaml"), "--frames", "2", "--device", "cpu", "--output", str(two)]) == 0
+    with np.load(one / "trajectory.npz") as a, np.load(two / "trajectory.npz") as b:
+        assert a.files == b.files
+        assert all(np.array_equal(a[name], b[name]) for name in a.files)
+
+
+def test_a_splat_from_a_file(tmp_path, capsys):
+    path = tmp_path / "flag.ply"
+    write_ply(path, FlagScene(spacing=0.1).generate())
+    assert main([*SMALL, "--scene.ply", str(path), "--output", str(tmp_path / "run")]) == 0
+    assert "96 of 96" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
+def test_every_shipped_configuration_builds(config, tmp_path):
+    """Parsed, and its components made; the splat is exchanged where the user has to give one."""
+    parser = build_parser()
+    settings = parser.parse_args(["--config", str(config), "--device", "cpu"])
+    if settings.scene.ply is None and settings.scene.generator is None:
+        write_ply(tmp_path / "splat.ply", FlagScene(spacing=0.1).generate())
+        settings.scene.ply = str(tmp_path / "splat.ply")
+    elif settings.scene.generator is not None and "spacing" in settings.scene.generator.init_args:
+        settings.scene.generator.init_args.spacing = 0.1
+    pipeline, recorder = build_pipeline(parser, settings)
+    assert pipeline.scene.points.count > 0
+    assert len(pipeline.solver.boundaries) > 0
+    assert pipeline.wind(0.0).norm() > 0
+    assert recorder.video
+
+
+def test_there_are_configurations():
+    assert len(CONFIGS) >= 2
+
+
+def test_print_config_parses_back(tmp_path, capsys):
+    assert _code([*SMALL, "--material.E", "1234.5", "--print_config"]) == 0
+    printed = capsys.readouterr().out
+    assert yaml.safe_load(printed)["material"]["E"] == 1234.5
+    (tmp_path / "again.yaml").write_text(printed)
+    parser = build_parser()
+    first = parser.parse_args([*SMALL, "--material.E", "1234.5"])
+    second = parser.parse_args(["--config", str(tmp_path / "again.yaml")])
+    assert config_text(parser, first) == config_text(parser, second)
+    assert second.frames == 2
+
+
+def test_help_shows_the_units(capsys):
+    assert _code(["--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "Young's modulus [Pa]",
+        "Grid spacing [m]",
+        "Density [kg/m³]",
+        "Thickness of the surface [m]",
+        "Time between frames [s]",
+        "Acceleration [m/s²]",
+        "Steady air velocity [m/s]",
+        "Rate at which velocities decay [1/s]",
+    ):
+        assert words in text, words
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "path"),
+    [
+        ("--frames", "7", "frames"),
+        ("--background", "[0.1, 0.2, 0.3]", "background"),
+        ("--scene.up", "[0.0, -1.0, 0.0]", "scene.up"),
+        ("--scene.generator.init_args.width", "2.0", "scene.generator.init_args.width"),
+        ("--scene.generator.width", "2.0", "scene.generator.init_args.width"),
+        ("--material.E", "5.0", "material.E"),
+        ("--solver.formulation", "updated", "solver.formulation"),
+        ("--solver.substep", "0.001", "solver.substep"),
+        ("--wind.flow", "[1.0, 2.0, 3.0]", "wind.flow"),
+        ("--wind.seed", "5", "wind.seed"),
+        ("--aero.C_D", "1.2", "aero.C_D"),
+        ("--shader.init_args.ambient", "0.75", "shader.init_args.ambient"),
+        ("--shader", "null", "shader"),
+        ("--camera.init_args.radius", "4.5", "camera.init_args.radius"),
+        ("--recorder.ply_every", "3", "recorder.ply_every"),
+    ],
+)
+def test_any_field_can_be_overridden(option, value, path):
+    settings = build_parser().parse_args(["--config", str(FLAG), option, value])
+    assert settings[path] == yaml.safe_load(value)
+
+
+def test_the_default_folder_is_named_after_the_configuration():
+    parser = build_parser()
+    assert output_folder(parser.parse_args(["--config", str(FLAG)])) == Path("outputs/flag")
+    assert output_folder(parser.parse_args(["--output", "there"])) == Path("there")
+
+
+def test_debug_keeps_the_traceback(tmp_path, monkeypatch):
+    monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
+    with pytest.raises(ValueError, match="material"):
+        main([*SMALL, "--material.E", "0", "--output", str(tmp_path / "run")])
+
+
+# ---- bad splats
+
+
+def _splat(path, change=None, *, drop=None, text=False):
+    """A small splat file with something wrong with it."""
+    from plyfile import PlyData, PlyElement
+
+    write_ply(path, FlagScene(spacing=0.2).generate())
+    data = PlyData.read(str(path))["vertex"].data.copy()
+    if change is not None:
+        data = change(data)
+    if drop is not None:
+        kept = [name for name in data.dtype.names if name != drop]
+        smaller = np.empty(len(data), dtype=[(name, data.dtype[name]) for name in kept])
+        for name in kept:
+            smaller[name] = data[name]
+        data = smaller
+    PlyData([PlyElement.describe(data, "vertex")], text=text, byte_order="<").write(str(path))
+    return path
+
+
+def _set(name, value):
+    def change(data):
+        data[name][3] = value
+        return data
+
+    return change
+
+
+def _truncate(path):
+    _splat(path)
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda path: path.write_text("hello"), ["is not a .ply file", "export"]),
+        (lambda path: path.write_bytes(b""), ["is not a .ply file"]),
+        (lambda path: _splat(path, text=True), ["ASCII", "export as binary"]),
+        (_truncate, ["is truncated", "again"]),
+        (lambda path: _splat(path, drop="rot_2"), ["`rot_2`", "export"]),
+        (lambda path: _splat(path, lambda data: data[:0]), ["zero Gaussians", "export"]),
+        (lambda path: _splat(path, _set("x", np.nan)), ["`x` is NaN", "index 3", "remove"]),
+        (lambda path: _splat(path, _set("opacity", np.nan)), ["`opacity` is NaN", "index 3"]),
+        (lambda path: _splat(path, _set("scale_1", -np.inf)), ["`scale_1`", "index 3"]),
+        (lambda path: _splat(path, _set("scale_1", -200.0)), ["scale_1", "size of zero", "index 3"]),
+        (lambda path: None, ["does not exist", "check the path"]),
+        (lambda path: path.mkdir(), ["is a directory"]),
+    ],
+    ids=[
+        "text", "empty", "ascii", "truncated", "property", "none", "nan", "opacity", "inf", "scale", "missing", "folder"
+    ],
+)  # fmt: skip
+def test_a_bad_splat(make, words, tmp_path, capsys):
+    path = tmp_path / "splat.ply"
+    make(path)
+    _refuse([*SMALL, "--scene.ply", str(path)], tmp_path / "run", capsys, "splat.ply", *words)
+
+
+# ---- bad settings
+
+EMPTY_BOX = '{"class_path": "Box", "init_args": {"min": [5, 5, 5], "max": [6, 6, 6]}}'
+INSIDE = '{"class_path": "LookAtCamera", "init_args": {"eye": [0.6, 0.0, 0.4], "target": [0.6, 1.0, 0.4]}}'
+GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--scene.region", EMPTY_BOX], ["No Gaussian is selected", "Box(min=[5.0", "move the region"]),
+        (["--scene.opacity_threshold", "0.999"], ["opacity threshold", "lower the threshold"]),
+        (["--solver.boundaries", _pin([5, 5, 5], [6, 6, 6])], ["holds no particle", "`region`"]),
+        (["--bogus", "1"], ["--bogus", "--help"]),
+        (["--scene.bogus", "1"], ["--scene.bogus", "--help"]),
+        (["--scene.generator.init_args.spacng", "0.1"], ["spacng", "scene.generator", "--help"]),
+        (["--wind.modulations", GUST], ["amplitud", "wind.modulations"]),
+        (["--shader.class_path", "NoSuchShader"], ["NoSuchShader"]),
+        (["--frames", "many"], ["frames", "many"]),
+        (["--frames", "0"], ["`frames`", "at least 1"]),
+        (["--frame_dt", "0"], ["`frame_dt`"]),
+        (["--background", "[0.5]"], ["`background`", "3 numbers"]),
+        (["--material.nu", "0.5"], ["`material.nu`", "0.49"]),
+        (["--material.nu", "0.7"], ["`material.nu`"]),
+        (["--material.E", "0"], ["`material.E`", "positive"]),
+        (["--material.E", "-5"], ["`material.E`"]),
+        (["--material.density", "0"], ["`material.density`"]),
+        (["--material.density", "-1"], ["`material.density`"]),
+        (["--material.thickness", "-0.01"], ["`material.thickness`"]),
+        (["--material.volume", "cube"], ["`material.volume`", "patch, cell"]),
+        (["--wind.flow", "[1.0, 2.0]"], ["`flow`", "3 numbers"]),
+        (["--scene.up", "[0, 0, 0]"], ["`up`", "[0, -1, 0]"]),
+        (["--scene.longest_side", "1.0"], ["longest_side", "metres_per_unit", "not both"]),
+        (["--solver.dx", "0"], ["`dx`"]),
+        (["--solver.formulation", "totl"], ["`formulation`", "total, updated"]),
+        (["--solver.substep", "1.0"], ["`substep` of 1 s", "stable one of 0.0", "lower it"]),
+        (["--solver.max_nodes", "10"], ["`max_nodes`", "coarsen `dx`"]),
+        (["--camera", INSIDE], ["camera", "inside the object", "move it out"]),
+        (["--recorder.images", "false"], ["`recorder.images`"]),
+        (["--config", "/nowhere/at_all.yaml"], ["/nowhere/at_all.yaml", "does not exist"]),
+    ],
+    ids=lambda value: " ".join(value)[:40] if value and value[0].startswith("--") else "",
+)
+def test_bad_settings(arguments, words, tmp_path, capsys):
+    _refuse([*SMALL, *arguments], tmp_path / "run", capsys, *words)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("frames: 2\nbogus: 1\n", ["bogus"]),
+        ("material:\n  E: 1.0\n  stiffness: 2\n", ["stiffness", "material"]),
+        ("material:\n  E: soft\n", ["material.E", "soft"]),
+        ("scene: [1\n  b: }\n", ["bad.yaml", "YAML"]),
+        ("just a sentence\n", ["config"]),
+    ],
+    ids=["top", "nested", "type", "malformed", "sentence"],
+)
+def test_bad_configuration_files(text, words, tmp_path, capsys):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    _refuse(["--config", str(path)], tmp_path / "run", capsys, *words)
+
+
+def test_a_scene_without_a_splat(tmp_path, capsys):
+    _refuse(["--device", "cpu"], tmp_path / "run", capsys, "`scene.ply`", "`scene.generator`")
+
+
+def test_an_output_folder_that_cannot_be_written(tmp_path, capsys):
+    """Below a file, and a file itself."""
+    (tmp_path / "file").write_text("mine")
+    for folder in (tmp_path / "file" / "run", tmp_path / "file"):
+        _refuse(SMALL, folder, capsys, str(folder), "cannot be written", "--output")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_cuda_without_cuda(tmp_path, capsys):
+    _refuse([*SMALL, "--device", "cuda"], tmp_path / "run", capsys, "--device cuda", "use --device auto or cpu")
+
+
+# ---- a run that goes wrong
+
+
+def test_a_diverging_run(tmp_path, capsys):
+    """Exit code 2, a sentence with time, particle, cause and remedy, and what was recorded is there."""
+    code = main([*SMALL, "--solver.cfl", "50", "--frames", "20", "--output", str(tmp_path / "run")])
+    error = capsys.readouterr().err
+    assert code == 2
+    assert "Traceback" not in error
+    sentence = error[error.index("error: ") :]
+    assert "diverged at t = " in sentence
+    assert ", particle " in sentence
+    assert "Courant number" in sentence
+    assert "Remedy: lower `solver.cfl`" in sentence
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["status"] == "diverged"
+    assert summary["reason"] in sentence
+    assert (tmp_path / "run" / "video.mp4").exists()
+
+
+def test_ctrl_c(tmp_path, capsys, monkeypatch):
+    def stop(self, state):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SimulationPipeline, "advance", stop)
+    assert main([*SMALL, "--output", str(tmp_path / "run")]) == 130
+    assert "--resume" in capsys.readouterr().err
+    assert (tmp_path / "run" / "frames" / "00000.png").exists()
