@@ -216,6 +216,8 @@ def pictures(options: argparse.Namespace) -> None:
     import numpy as np
 
     frames = [iio.imread(Path(options.run) / "frames" / f"{int(i):05d}.png") for i in options.frames_shown.split(",")]
+    left, right = (round(float(share) * frames[0].shape[1]) for share in options.columns.split(","))
+    frames = [frame[:, left:right] for frame in frames]
     target = ROOT / "docs" / "pictures" / f"{options.name}.png"
     target.parent.mkdir(parents=True, exist_ok=True)
     iio.imwrite(target, np.concatenate(frames, axis=1))
@@ -238,6 +240,7 @@ def main() -> None:
             command.add_argument("--run", required=True, help="output folder of a run")
             command.add_argument("--name", required=True, help="name of the picture")
             command.add_argument("--frames_shown", default="0,20,40,60", help="frame numbers")
+            command.add_argument("--columns", default="0,1", help="part of the width to keep, as shares")
     options = parser.parse_args()
     options.run_command(options)
 

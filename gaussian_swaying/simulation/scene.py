@@ -101,7 +101,8 @@ class Scene:
     ) -> None:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.area", area, ("coverage", "paper"))
-        check_vector("scene.up", up)
+        if not any(check_vector("scene.up", up)):
+            raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
         if not 0 <= opacity_threshold < 1:
             raise ValueError(f"Expected `scene.opacity_threshold` to lie in [0, 1), but got {opacity_threshold}.")
         if ply is None and generator is None:

@@ -274,7 +274,7 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--material.thickness", "-0.01"], ["`material.thickness`"]),
         (["--material.volume", "cube"], ["`material.volume`", "patch, cell"]),
         (["--wind.flow", "[1.0, 2.0]"], ["`flow`", "3 numbers"]),
-        (["--scene.up", "[0, 0, 0]"], ["`up`", "[0, -1, 0]"]),
+        (["--scene.up", "[0, 0, 0]"], ["`scene.up`", "[0, -1, 0]"]),
         (["--scene.longest_side", "1.0"], ["longest_side", "metres_per_unit", "not both"]),
         (["--solver.dx", "0"], ["`dx`"]),
         (["--solver.formulation", "totl"], ["`formulation`", "total, updated"]),
