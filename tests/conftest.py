@@ -3,7 +3,7 @@
 import os
 
 os.environ["GAUSSIAN_SWAYING_CHECKS"] = "1"
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as tools/sim.py, and for the same reason
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, and for the same reason
 
 import pytest
 import torch

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as tools/sim.py, before torch is imported
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
 
 import torch
 

@@ -3,9 +3,9 @@
 import os
 import sys
 
-# Threads that spin while they wait make a run ten and more times slower as soon as another program wants a core.
-# OpenMP reads this once, so it has to be set before torch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# How long OpenMP's threads spin before they sleep. Its default, much longer, costs nothing on a quiet machine but makes a
+# run a hundred times slower as soon as another program wants a core. Read once, so set before torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 from gaussian_swaying.simulation.config import main
 
