@@ -1,0 +1,110 @@
+"""What a user of the package as a whole relies on: names, light imports, the rule for GPU tests, shipped files."""
+
+import os
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+
+import gaussian_swaying
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def _python(*arguments, **environment):
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | environment,
+        check=False,
+    )
+
+
+def test_every_public_name_is_found_in_its_home():
+    named = {name for names in gaussian_swaying._HOMES.values() for name in names}
+    assert named == set(gaussian_swaying.__all__)
+    for home, names in gaussian_swaying._HOMES.items():
+        module = import_module(f"gaussian_swaying.{home}")
+        for name in names:
+            assert getattr(gaussian_swaying, name) is getattr(module, name)
+            assert getattr(module, name).__doc__
+    with pytest.raises(AttributeError, match="has no attribute 'Windmill'"):
+        gaussian_swaying.Windmill  # noqa: B018
+
+
+def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
+    """gsplat, lightning and the readers of files are loaded where they are used."""
+    modules = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for path in sorted((ROOT / "gaussian_swaying").rglob("*.py"))
+    ]
+    assert len(modules) > 25
+    heavy = [
+        "gsplat",
+        "lightning",
+        "torchmetrics",
+        "plyfile",
+        "imageio",
+        "imageio_ffmpeg",
+        "jsonargparse",
+        "matplotlib",
+    ]
+    done = _python(
+        "-c", f"import sys\nfor m in {modules}: __import__(m)\nprint([h for h in {heavy} if h in sys.modules])"
+    )
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="shows what happens without a GPU")
+def test_gpu_tests_skip_without_a_gpu_and_fail_if_one_is_required():
+    command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "gpu", "tests/aero/test_wind.py"]
+    skipped = _python(*command, GS_REQUIRE_GPU="0")
+    assert skipped.returncode == 0
+    assert "skipped" in skipped.stdout
+    assert "passed" not in skipped.stdout
+    assert _python(*command, GS_REQUIRE_GPU="1").returncode == 1
+
+
+def test_every_dependency_is_pinned():
+    """constraints.txt pins all that pyproject.toml names, and what is installed here is what it pins."""
+    from importlib.metadata import requires, version
+
+    from packaging.requirements import Requirement
+
+    pins = [Requirement(line) for line in (ROOT / "constraints.txt").read_text().splitlines() if line[:1].isalnum()]
+    valid = {pin.name: pin for pin in pins if pin.marker is None or pin.marker.evaluate()}
+    assert all(len(pin.specifier) == 1 and str(pin.specifier).startswith("==") for pin in pins)
+    named = [Requirement(line) for line in requires("gaussian-swaying") or []]
+    needed = [r for r in named if r.marker is None or r.marker.evaluate() or r.marker.evaluate({"extra": "dev"})]
+    assert len(needed) > 15
+    for requirement in needed:
+        pin = valid[requirement.name.lower()]
+        assert requirement.specifier.contains(str(pin.specifier).removeprefix("==")), requirement
+    assert str(valid["torch"].specifier) == "==2.13.0"
+    assert version("gaussian-swaying") == gaussian_swaying.__version__
+
+
+def test_nothing_points_to_a_machine_of_ours():
+    """The repository stands alone: no absolute paths, no files from beside it."""
+    listed = subprocess.run(["git", "ls-files"], capture_output=True, text=True, cwd=ROOT, check=False).stdout.split()
+    for name in listed:
+        path = ROOT / name
+        if (
+            path.suffix in {".py", ".md", ".yaml", ".toml", ".json", ".txt"}
+            and path.exists()
+            and "tests" not in path.parts
+        ):
+            text = path.read_text()
+            assert "../shared" not in text, name
+            assert "/work/" not in text, name
+
+
+def test_changelog_has_this_version_or_unreleased():
+    text = (ROOT / "CHANGELOG.md").read_text()
+    assert "## [Unreleased]" in text or f"## [{gaussian_swaying.__version__}]" in text
+    assert "### Added" in text
