@@ -97,7 +97,7 @@ def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
         pipeline.shader = None
         rest = pipeline.scene.rest()
         camera = pipeline.camera_at(0)
-        plain = pipeline.draw(rest, pipeline.colours(rest, camera), camera).color
+        plain = pipeline.draw(rest, pipeline.colors(rest, camera), camera).color
     error = float((moved - plain).square().mean())
     return float("inf") if error == 0 else -10 * float(torch.log10(torch.tensor(error)))
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -360,9 +361,10 @@ def _read_matrix(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
     return matrix * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenGL y, z -> OpenCV y, z
 
 
-class CameraPath:
+class CameraPath(ABC):
     """Base class of the camera paths that a configuration can name."""
 
+    @abstractmethod
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame.
 
@@ -376,7 +378,6 @@ class CameraPath:
         Returns:
             The camera, on the device and in the precision of ``center``.
         """
-        raise NotImplementedError
 
 
 class OrbitCamera(CameraPath):

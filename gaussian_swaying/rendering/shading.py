@@ -5,6 +5,7 @@ the cosine between its normal and the light, and the Phong model (Phong 1975, "I
 pictures") adds a highlight.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -150,9 +151,10 @@ def _check_rest(relative: bool, rest_normal: Tensor | None) -> Tensor | None:
     return rest_normal if relative else None
 
 
-class Shader(nn.Module):
+class Shader(nn.Module, ABC):
     """Base class of the shaders that a configuration can name."""
 
+    @abstractmethod
     def forward(
         self,
         color: Tensor,
@@ -171,7 +173,6 @@ class Shader(nn.Module):
         Returns:
             Shaded colours, shape (..., 3).
         """
-        raise NotImplementedError
 
 
 class DiffuseShader(Shader):

@@ -21,7 +21,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.force import AeroForce, drag_rate
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.surface import covariance_to_quat_scale, deform_area, deform_normal
+from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_area, deform_normal
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
@@ -29,7 +29,7 @@ from gaussian_swaying.rendering.camera import Camera, CameraPath
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, check_state, diagnose
 from gaussian_swaying.simulation.recorder import Recorder
-from gaussian_swaying.simulation.scene import SceneGaussians, SimulatedScene
+from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that ends above it is done again with shorter substeps
@@ -186,7 +186,7 @@ class SimulationPipeline(nn.Module):
             )
         return camera.to(self.device)
 
-    def colours(self, gaussians: SceneGaussians, camera: Camera) -> Tensor:
+    def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
         """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
         scene = self.scene
         view = torch.nn.functional.normalize(gaussians.means - camera.position.to(gaussians.means), dim=-1)
@@ -202,12 +202,12 @@ class SimulationPipeline(nn.Module):
         colours[moving] = self.shader(colours[moving], normal, rest_normal=rest, view_direction=to_eye)
         return colours
 
-    def shade(self, state: MPMState, camera: Camera) -> tuple[SceneGaussians, Tensor]:
+    def shade(self, state: MPMState, camera: Camera) -> tuple[DeformedGaussians, Tensor]:
         """Deformed Gaussians in scene units and their colours (N, 3)."""
         gaussians = self.scene.deformed(state)
-        return gaussians, self.colours(gaussians, camera)
+        return gaussians, self.colors(gaussians, camera)
 
-    def draw(self, gaussians: SceneGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
+    def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
         """Draw Gaussians given in scene units."""
         opacity = self.scene.model.opacity()
         return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
@@ -218,7 +218,7 @@ class SimulationPipeline(nn.Module):
         gaussians, colours = self.shade(state, camera)
         return self.draw(gaussians, colours, camera)
 
-    def export(self, gaussians: SceneGaussians, path: Path) -> None:
+    def export(self, gaussians: DeformedGaussians, path: Path) -> None:
         """Write deformed Gaussians as a 3DGS .ply that any splat viewer opens, harmonics turned with the patches."""
         from gaussian_swaying.gaussians.spherical_harmonics import rotate_sh
 

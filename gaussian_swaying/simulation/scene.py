@@ -12,7 +12,12 @@ from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, deform_covariance, deform_normal
+from gaussian_swaying.gaussians.surface import (
+    DeformedGaussians,
+    GaussianSurfaceModel,
+    deform_covariance,
+    deform_normal,
+)
 from gaussian_swaying.mpm.linalg import polar_rotation
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.frame import SimFrame
@@ -119,23 +124,6 @@ class Scene:
         return self.generator.generate()
 
 
-@dataclass(frozen=True)
-class SceneGaussians:
-    """All Gaussians of the picture at one moment, in scene units and axes.
-
-    Attributes:
-        means: Positions, shape (N, 3).
-        covariances: Covariances, shape (N, 3, 3).
-        normals: Unit normals, shape (N, 3).
-        rotations: Rotation of each from rest, shape (N, 3, 3).
-    """
-
-    means: Tensor
-    covariances: Tensor
-    normals: Tensor
-    rotations: Tensor
-
-
 class SimulatedScene(nn.Module):
     """Gaussians, material points and patches of one scene, and how the first follow the second.
 
@@ -220,13 +208,13 @@ class SimulatedScene(nn.Module):
         means = self.model.means[self.simulated]
         return means.amin(0), means.amax(0)
 
-    def rest(self) -> SceneGaussians:
+    def rest(self) -> DeformedGaussians:
         """The Gaussians at rest."""
         means = self.model.means.detach()
         eye = torch.eye(3, dtype=means.dtype, device=means.device).expand(len(means), 3, 3)
-        return SceneGaussians(means, self.rest_covariances, self.rest_normals, eye)
+        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye)
 
-    def deformed(self, state: MPMState) -> SceneGaussians:
+    def deformed(self, state: MPMState) -> DeformedGaussians:
         """The Gaussians where the material has taken them: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
 
         Args:
@@ -252,7 +240,7 @@ class SimulatedScene(nn.Module):
         covariances[index] = deform_covariance(gradient, rest.covariances[index])
         normals[index] = deform_normal(gradient, rest.normals[index])
         rotations[index] = polar_rotation(gradient)
-        return SceneGaussians(means, covariances, normals, rotations)
+        return DeformedGaussians(means, covariances, normals, rotations)
 
 
 _MATERIAL_FIELDS = ("E", "nu", "density", "thickness")

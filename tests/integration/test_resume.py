@@ -145,7 +145,7 @@ def _contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def _refused(arguments, folder, capsys, *words):
+def check_refused(arguments, folder, capsys, *words):
     """Exit code 2, one sentence with the words, and nothing changed."""
     before = _contents(folder)
     capsys.readouterr()
@@ -168,11 +168,13 @@ def _refused(arguments, folder, capsys, *words):
     ],
 )
 def test_another_configuration_is_refused_by_name(change, words, stopped, capsys):
-    _refused(_arguments(stopped, "--resume", *change), stopped, capsys, "configuration differs", "--resume", *words)
+    check_refused(
+        _arguments(stopped, "--resume", *change), stopped, capsys, "configuration differs", "--resume", *words
+    )
 
 
 def test_nothing_to_resume(tmp_path, capsys):
-    _refused(_arguments(tmp_path / "none", "--resume"), tmp_path, capsys, "nothing to resume", "checkpoint.pt")
+    check_refused(_arguments(tmp_path / "none", "--resume"), tmp_path, capsys, "nothing to resume", "checkpoint.pt")
     assert not (tmp_path / "none").exists()
 
 
@@ -185,7 +187,7 @@ def test_a_damaged_checkpoint_is_refused(damage, stopped, capsys):
     else:
         file.write_bytes({"truncated": content[: len(content) // 2], "empty": b"", "text": b"hello"}[damage])
     words = ("checkpoint.pt cannot be read", "without --resume")
-    _refused(_arguments(stopped, "--resume"), stopped, capsys, *words)
+    check_refused(_arguments(stopped, "--resume"), stopped, capsys, *words)
 
 
 def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
@@ -195,11 +197,11 @@ def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
     for name in ("position", "velocity", "affine", "F_elastic", "lost"):
         checkpoint["state"][name] = checkpoint["state"][name][:50]
     torch.save(checkpoint, file)
-    _refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
+    check_refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
 
 
 def test_a_refused_run_does_not_move_the_earlier_one(stopped, capsys):
-    _refused(_arguments(stopped, "--wind.flow", "[1, 2]"), stopped, capsys, "flow")
+    check_refused(_arguments(stopped, "--wind.flow", "[1, 2]"), stopped, capsys, "flow")
     assert [path.name for path in stopped.parent.iterdir()] == [stopped.name]
 
 

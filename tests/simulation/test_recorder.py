@@ -170,7 +170,7 @@ def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_pipeline, tmp
     torch.testing.assert_close(found.opacities, cloud.opacities)
     camera = pipeline.camera_at(2).to(dtype=torch.float32)
     seen = sh_to_color(found.sh, found.means - camera.position)
-    torch.testing.assert_close(seen, pipeline.colours(deformed, camera), rtol=0, atol=1e-4)
+    torch.testing.assert_close(seen, pipeline.colors(deformed, camera), rtol=0, atol=1e-4)
     unturned = sh_to_color(cloud.sh, found.means - camera.position)
     assert float((seen - unturned).abs().max()) > 0.01
     torch.testing.assert_close(found.normals, deformed.normals)

@@ -40,7 +40,7 @@ def _code(arguments):
         return stop.code
 
 
-def _refuse(arguments, output, capsys, *words):
+def check_refused(arguments, output, capsys, *words):
     """Exit code 2, one sentence on stderr that holds the words, and nothing left behind."""
     capsys.readouterr()
     before = sorted(output.parent.rglob("*"))
@@ -240,7 +240,7 @@ def _truncate(path):
 def test_a_bad_splat(make, words, tmp_path, capsys):
     path = tmp_path / "splat.ply"
     make(path)
-    _refuse([*SMALL, "--scene.ply", str(path)], tmp_path / "run", capsys, "splat.ply", *words)
+    check_refused([*SMALL, "--scene.ply", str(path)], tmp_path / "run", capsys, "splat.ply", *words)
 
 
 # ---- bad settings
@@ -287,7 +287,7 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
     ids=lambda value: " ".join(value)[:40] if value and value[0].startswith("--") else "",
 )
 def test_bad_settings(arguments, words, tmp_path, capsys):
-    _refuse([*SMALL, *arguments], tmp_path / "run", capsys, *words)
+    check_refused([*SMALL, *arguments], tmp_path / "run", capsys, *words)
 
 
 @pytest.mark.parametrize(
@@ -304,24 +304,24 @@ def test_bad_settings(arguments, words, tmp_path, capsys):
 def test_bad_configuration_files(text, words, tmp_path, capsys):
     path = tmp_path / "bad.yaml"
     path.write_text(text)
-    _refuse(["--config", str(path)], tmp_path / "run", capsys, *words)
+    check_refused(["--config", str(path)], tmp_path / "run", capsys, *words)
 
 
 def test_a_scene_without_a_splat(tmp_path, capsys):
-    _refuse(["--device", "cpu"], tmp_path / "run", capsys, "`scene.ply`", "`scene.generator`")
+    check_refused(["--device", "cpu"], tmp_path / "run", capsys, "`scene.ply`", "`scene.generator`")
 
 
 def test_an_output_folder_that_cannot_be_written(tmp_path, capsys):
     """Below a file, and a file itself."""
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file" / "run", tmp_path / "file"):
-        _refuse(SMALL, folder, capsys, str(folder), "cannot be written", "--output")
+        check_refused(SMALL, folder, capsys, str(folder), "cannot be written", "--output")
     assert (tmp_path / "file").read_text() == "mine"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
 def test_cuda_without_cuda(tmp_path, capsys):
-    _refuse([*SMALL, "--device", "cuda"], tmp_path / "run", capsys, "--device cuda", "use --device auto or cpu")
+    check_refused([*SMALL, "--device", "cuda"], tmp_path / "run", capsys, "--device cuda", "use --device auto or cpu")
 
 
 # ---- a run that goes wrong

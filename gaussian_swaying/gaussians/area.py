@@ -1,0 +1,245 @@
+"""Areas of Gaussian patches: each alone, or so that overlapping ones add up to the surface."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_shape
+
+_RAYS = 32  # directions in which the cell of a patch is measured
+_SLAB = 0.75  # half thickness of one sheet, in neighbour spacings
+_REACH = 5.0  # longest reach of a patch over uncovered surface, in standard deviations
+_CLUSTER = 0.15  # centres closer than this, in neighbour spacings, are one cluster
+_SPIKE = 2.0  # longest reach of a cell, in neighbour spacings
+_FALSE_EDGE = 0.0015  # chance that a direction inside a random surface looks as if the surface ended there
+
+
+def patch_area(log_scales: Tensor) -> Tensor:
+    r"""Area of each Gaussian taken alone, :math:`\pi s_1 s_2` of its two larger scales (Gaussian Swaying).
+
+    Overlapping Gaussians are counted several times: see :func:`coverage_area` for areas that add up to the surface.
+
+    Args:
+        log_scales: Logarithm of the standard deviations [scene units], shape (..., 3).
+
+    Returns:
+        Areas [scene units^2], shape (...).
+
+    Raises:
+        ValueError: If ``log_scales`` has another shape.
+
+    Example:
+        >>> patch_area(torch.tensor([[2.0, 3.0, 0.1]]).log())
+        tensor([18.8496])
+    """
+    check_shape("log_scales", log_scales, 3)
+    return math.pi * (log_scales.sum(-1) - log_scales.amin(-1)).exp()
+
+
+@torch.no_grad()
+def coverage_area(
+    means: Tensor, normals: Tensor, log_scales: Tensor, opacity: Tensor | None = None, neighbours: int = 24
+) -> Tensor:
+    r"""Areas of overlapping patches that add up to the area of the surface they lie on.
+
+    The sum does not depend on how many Gaussians carry the surface nor on how much they overlap, unlike that of
+    :func:`patch_area`. In two steps:
+
+    1. The surface is divided among the centres: each gets the cell of the points nearest to it (Voronoi) in its
+       tangent plane, measured along rays to the bisectors with its nearest neighbours on the same sheet (those less
+       than 3/4 of the local neighbour spacing off the tangent plane). Where the surface ends, the cell ends as far
+       beyond the centre as it reaches inwards. No cell reaches further than two neighbour spacings or five standard
+       deviations of the Gaussians around.
+    2. Each cell is shared among the Gaussians in proportion to their opacity there,
+       :math:`A_i = \sum_j V_j \frac{g_i(x_j)}{\sum_l g_l(x_j)}`,
+       :math:`g_i(x) = o_i \exp(-\lvert x - x_i \rvert^2 / (2 s_{i1} s_{i2}))`: a faint or tiny Gaussian among opaque
+       ones carries little. This keeps the sum.
+
+    Parallel sheets at least one neighbour spacing apart count separately; closer ones count as one. A Gaussian with
+    fewer than three neighbours in reach keeps its :func:`patch_area`. Computed in float64 on the CPU, so the result is
+    the same on every device; not differentiable.
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        normals: Unit normals, of either sign, shape (N, 3).
+        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
+        opacity: Opacities from 0 to 1, shape (N,); None if all are equal.
+        neighbours: Nearest centres to consider for each one, at least 6.
+
+    Returns:
+        Areas [scene units^2], finite and above zero, shape (N,).
+
+    Raises:
+        ValueError: If a tensor does not have the shape above, ``means`` is not finite or ``neighbours`` is below 6.
+    """
+    check_shape("means", means, None, 3)
+    count = means.shape[0]
+    check_shape("normals", normals, count, 3)
+    check_shape("log_scales", log_scales, count, 3)
+    if neighbours < 6:
+        raise ValueError(f"Expected `neighbours` to be at least 6, but got {neighbours}.")
+    if not bool(torch.isfinite(means).all()):
+        raise ValueError("Expected `means` to be finite, but some are NaN or infinite; remove these Gaussians.")
+    weight = torch.ones(count, dtype=torch.float64)
+    if opacity is not None:
+        check_shape("opacity", opacity, count)
+        weight = opacity.detach().cpu().double().clamp_min(1e-6)
+    if count == 0:
+        return means.new_zeros(0)
+    # Gaussians that share a centre form one site; its cell is shared among them by weight at the end.
+    site, owner = torch.unique(means.detach().cpu().double(), dim=0, return_inverse=True)
+    own_area = patch_area(log_scales.detach().cpu().double())
+    load = weight * own_area
+    order = torch.argsort(load, stable=True)
+    rank = torch.empty(count, dtype=torch.long).scatter_(0, order, torch.arange(count))
+    heaviest = torch.zeros(len(site), dtype=torch.long).scatter_reduce_(0, owner, rank, "amax", include_self=False)
+    first = order[heaviest]  # the heaviest Gaussian of a site gives its normal and its size
+    normal = torch.nn.functional.normalize(normals.detach().cpu().double()[first], dim=-1)
+    disc = own_area[first]
+    total = torch.zeros(len(site), dtype=torch.float64).index_add_(0, owner, weight)
+    if len(site) > 3:
+        distance, index = _nearest(site, min(neighbours, len(site) - 1))
+        cell = torch.empty(len(site), dtype=torch.float64)
+        share = torch.zeros(len(site), dtype=torch.float64)
+        for start in range(0, len(site), 8192):
+            rows = slice(start, start + 8192)
+            offset = site[index[rows]] - site[rows, None]
+            cell[rows], same = _cell_area(offset, distance[rows], normal[rows], disc[rows], disc[index[rows]], start)
+            # g of every candidate at this site, the site's own Gaussians first
+            exponent = -0.5 * math.pi * distance[rows].square() / disc[index[rows]]
+            density = torch.cat([total[rows, None], torch.where(same, total[index[rows]] * exponent.exp(), 0)], dim=1)
+            part = density * (cell[rows] / density.sum(1))[:, None]
+            share[rows] += part[:, 0]
+            share.index_add_(0, index[rows].reshape(-1), part[:, 1:].reshape(-1))
+    else:
+        share = disc
+    load_of_site = torch.zeros(len(site), dtype=torch.float64).index_add_(0, owner, load)
+    areas = share[owner] * load / load_of_site[owner]
+    return areas.to(means).clamp_min(torch.finfo(means.dtype).tiny)
+
+
+def _cell_area(
+    offset: Tensor, distance: Tensor, normal: Tensor, disc: Tensor, discs: Tensor, phase: int
+) -> tuple[Tensor, Tensor]:
+    """Areas of the Voronoi cells (B,) in the tangent planes, and which neighbours (B, k) lie on the same sheet."""
+    # Clusters, such as the clones that densification leaves, count once in the estimate of the spacing.
+    close = _CLUSTER * distance[:, -1] * math.sqrt(math.pi / offset.shape[1])
+    gap = torch.cdist(offset, offset, compute_mode="donot_use_mm_for_euclid_dist")
+    repeat = (gap < close[:, None, None]).tril(-1).any(-1) | (distance < close[:, None])
+    spacing = distance[:, -1] * (math.pi / (~repeat).sum(-1).clamp_min(1)).sqrt()
+    size = (disc / math.pi).sqrt()
+    height = (offset * normal[:, None]).sum(-1)
+    same = height.abs() <= _SLAB * spacing[:, None]
+    helper = torch.nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
+    first = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
+    second = torch.linalg.cross(normal, first)
+    flat = torch.stack([(offset * first[:, None]).sum(-1), (offset * second[:, None]).sum(-1)], dim=-1)
+    squared = flat.square().sum(-1)
+    stacked = same & (squared <= 1e-12 * spacing[:, None].square())
+    same &= ~stacked
+
+    # Each cell has its own turn of the rays, spread evenly, so that the error of the quadrature averages out.
+    turn = torch.arange(phase, phase + len(offset), dtype=torch.float64) * 0.6180339887498949 % 1
+    angle = (turn[:, None] + torch.arange(_RAYS)) * (2 * math.pi / _RAYS)
+    ray = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    along = ray @ flat.mT  # (B, rays, k)
+    facing = same[:, None] & (along > 0)
+    reach = torch.where(facing, 0.5 * squared[:, None] / along, torch.inf).amin(-1)
+    cosine = torch.where(same[:, None], along / squared.sqrt().clamp_min(1e-300)[:, None], -1).amax(-1)
+
+    found = same.sum(-1, keepdim=True)
+    local_size = ((disc[:, None] + (same * discs).sum(-1, keepdim=True)) / (math.pi * (1 + found))).sqrt()
+    limit = torch.minimum(_SPIKE * spacing[:, None], _REACH * local_size)
+    # A direction is open if no neighbour lies within an angle of it that m random ones leave empty by chance with
+    # probability _FALSE_EDGE; 60 degrees for m = 16, and less than the 90 degrees that a straight edge leaves empty.
+    half_angle = (math.pi * (1 - _FALSE_EDGE ** (1 / (same & ~repeat).sum(-1, keepdim=True).clamp_min(1)))).clamp(
+        math.radians(50), math.radians(85)
+    )
+    open_cosine = half_angle.cos()
+    # Where the surface ends: up to three straight edges, each as far out as the cell reaches on the other side.
+    for _ in range(3):
+        widest = cosine.argmin(-1, keepdim=True)
+        is_open = cosine.gather(-1, widest) < open_cosine
+        opposite = reach.gather(-1, (widest + _RAYS // 2) % _RAYS)
+        edge = torch.where(opposite > limit, size[:, None], opposite)
+        toward = (ray * ray.gather(1, widest[..., None].expand(-1, -1, 2))).sum(-1)
+        cut = torch.where(is_open & (toward > 1e-6), edge / toward.clamp_min(1e-6), torch.inf)
+        reach = torch.minimum(reach, cut)
+        cosine = torch.where(toward > 0.5, 1, cosine)
+    reach = torch.minimum(reach, limit)
+    area = reach.square().mean(-1) * math.pi
+    near = (same & (squared.sqrt() < 2 * limit)).sum(-1)
+    return torch.where(near < 3, disc, area) / (1 + stacked.sum(-1)), same | stacked
+
+
+def _nearest(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Distances (N, k), ascending, and indices (N, k) of the nearest other points, by grids that coarsen.
+
+    A point is settled on the first grid whose 27 cells around it hold k others within one cell size; only the points
+    not settled yet go on to the grid of twice the cell size. Memory is bounded by chunks of candidate pairs.
+    """
+    total = len(points)
+    low = points.amin(0)
+    extent = float((points.amax(0) - low).amax())
+    distance = torch.empty(total, count, dtype=points.dtype)
+    index = torch.empty(total, count, dtype=torch.long)
+    shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
+    pending = torch.arange(total)
+    level = _first_level(points, low, extent)
+    while len(pending):
+        size = extent * 2.0**-level
+        cells = ((points - low) / size).floor().long()
+        key, order = _cell_key(cells).sort(stable=True)
+        wanted = _cell_key(cells[pending, None] + shifts)
+        begin = torch.searchsorted(key, wanted)
+        length = torch.searchsorted(key, wanted, right=True) - begin
+        candidates = length.sum(-1)
+        last = level <= 0
+        keep = torch.nonzero(candidates > count).squeeze(-1)
+        keep = keep[candidates[keep].argsort(stable=True)]  # rows of one chunk need about the same width
+        settled = torch.zeros(len(pending), dtype=torch.bool)
+        start = 0
+        while start < len(keep):
+            width = max(1, 4_000_000 // int(candidates[keep[min(start + 20_000, len(keep) - 1)]]))
+            rows = keep[start : start + min(width, 20_000)]
+            start += len(rows)
+            near, who = _nearest_among(points, pending[rows], order, begin[rows], length[rows], count)
+            done = torch.ones(len(rows), dtype=torch.bool) if last else near[:, -1] <= size
+            distance[pending[rows[done]]], index[pending[rows[done]]] = near[done], who[done]
+            settled[rows[done]] = True
+        pending = pending[~settled]
+        level -= 1
+    return distance, index
+
+
+def _first_level(points: Tensor, low: Tensor, extent: float) -> int:
+    """The coarsest grid, as halvings of the extent, with at most 32 points in a cell; none is finer than 2^-40."""
+    for level in range(1, 40):
+        cells = ((points - low) / (extent * 2.0**-level)).floor().long()
+        if int(_cell_key(cells).unique(return_counts=True)[1].max()) <= 32:
+            return level
+    return 40
+
+
+def _cell_key(cells: Tensor) -> Tensor:
+    """One number per cell (..., 3); cells 2^20 apart share it, which only adds candidates that are too far away."""
+    x, y, z = (cells & (2**20 - 1)).unbind(-1)
+    return (x << 40) | (y << 20) | z
+
+
+def _nearest_among(
+    points: Tensor, query: Tensor, order: Tensor, begin: Tensor, length: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
+    """The nearest of the points in 27 runs (B, 27) of ``order`` for each query (B,), other than itself."""
+    ends = length.cumsum(-1)
+    column = torch.arange(int(ends[:, -1].max()))
+    run = torch.searchsorted(ends, column.expand(len(query), -1).contiguous(), right=True).clamp_max(26)
+    place = begin.gather(-1, run) + column - (ends - length).gather(-1, run)
+    who = order[place.clamp_max(len(points) - 1)]
+    squared = (points[who] - points[query, None]).square().sum(-1)
+    squared = squared.masked_fill((column >= ends[:, -1:]) | (who == query[:, None]), torch.inf)
+    nearest, at = squared.topk(count, dim=-1, largest=False, sorted=True)
+    return nearest.sqrt(), who.gather(-1, at)

@@ -1,0 +1,188 @@
+"""Areas of patches: each alone by its formula, together against the true area of the surface."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.area import _nearest, coverage_area, patch_area
+from gaussian_swaying.gaussians.surface import quat_to_rotation
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def _unit(*shape, device="cpu", dtype=torch.float64):
+    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
+
+
+def _plane(kind, side):
+    """side^2 points of the unit square."""
+    line = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+    points = torch.cartesian_prod(line, line)
+    if kind == "jittered":
+        points = points + (torch.rand(side**2, 2, dtype=torch.float64) - 0.5) * 0.8 / side
+    if kind == "random":
+        points = torch.rand(side**2, 2, dtype=torch.float64)
+    return torch.nn.functional.pad(points, (0, 1))
+
+
+def _discs(count, area, overlap):
+    """Flat splats of standard deviation overlap x spacing."""
+    scale = math.log(overlap * math.sqrt(area / count))
+    return torch.tensor([scale, scale, scale - 3], dtype=torch.float64).expand(count, 3)
+
+
+def _sum_on_plane(points, overlap=0.5, **kwargs):
+    return float(coverage_area(points, UP.expand(len(points), 3), _discs(len(points), 1, overlap), **kwargs).sum())
+
+
+@pytest.mark.parametrize("overlap", [0.3, 0.5, 1.0])
+@pytest.mark.parametrize("kind", ["regular", "jittered", "random"])
+@pytest.mark.parametrize("side", [32, 100])
+def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
+    """The paper's pi s1 s2 gives 0.28 to 3.1 here."""
+    assert _sum_on_plane(_plane(kind, side), overlap) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", ["regular", "random"])
+def test_sum_at_a_hundred_thousand(kind):
+    assert _sum_on_plane(_plane(kind, 316)) == pytest.approx(1, abs=0.01)
+
+
+def test_each_patch_of_a_regular_plane_has_its_cell():
+    """Not only the sum: borders and corners included, within the angular resolution of the rays."""
+    areas = coverage_area(_plane("regular", 20), UP.expand(400, 3), _discs(400, 1, 0.3)) * 400
+    inner = areas.unflatten(0, (20, 20))[3:-3, 3:-3]
+    torch.testing.assert_close(inner, torch.ones_like(inner), rtol=0, atol=0.03)
+    assert float(areas.min()) > 0.7
+    assert float(areas.max()) < 1.4
+
+
+@pytest.mark.parametrize("overlap", [0.3, 1.0])
+@pytest.mark.parametrize("count", [1000, 10000])
+@pytest.mark.parametrize("kind", ["spiral", "random"])
+def test_sum_is_the_area_of_a_sphere(kind, count, overlap):
+    if kind == "spiral":
+        index = torch.arange(count, dtype=torch.float64)
+        z, angle = 1 - 2 * (index + 0.5) / count, index * math.pi * (3 - math.sqrt(5))
+        radius = (1 - z * z).sqrt()
+        points = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
+    else:
+        points = _unit(count, 3)
+    total = float(coverage_area(points, points, _discs(count, 4 * math.pi, overlap)).sum())
+    assert total == pytest.approx(4 * math.pi, rel=0.03)
+
+
+def test_sum_scales_and_moves_with_the_scene():
+    points, scale = _plane("random", 40), 250.0
+    rotation = quat_to_rotation(_unit(4))
+    moved = scale * points @ rotation.T + 1e3
+    normals = (rotation @ UP).expand(len(points), 3)
+    total = float(coverage_area(moved, normals, _discs(len(points), scale**2, 0.5)).sum())
+    assert total / scale**2 == pytest.approx(_sum_on_plane(points), rel=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["regular", "random"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_shell_counts_each_sheet_from_one_spacing_apart(kind, sign):
+    first, second, spacing = _plane(kind, 60), _plane(kind, 60), 1 / 60
+    normals = torch.cat([UP.expand(3600, 3), sign * UP.expand(3600, 3)])
+
+    def total(gap):
+        points = torch.cat([first, second + gap * spacing * UP])
+        return float(coverage_area(points, normals, _discs(3600, 1, 0.5).repeat(2, 1)).sum())
+
+    assert total(1.0) == pytest.approx(2, rel=0.03)
+    assert total(3.0) == pytest.approx(2, rel=0.03)
+    assert total(0.2) == pytest.approx(1, rel=0.03)
+
+
+def test_clones_thickness_and_sizes_do_not_change_the_sum():
+    """What captures have: copies, centres off the surface, sizes and opacities that vary, noisy normals."""
+    points, count = _plane("random", 60), 3600
+    normals, discs, spacing = UP.expand(count, 3), _discs(count, 1, 0.5), 1 / 60
+    reference = _sum_on_plane(points)
+    copies = coverage_area(points.repeat(3, 1), normals.repeat(3, 1), discs.repeat(3, 1))
+    assert float(copies.sum()) == pytest.approx(reference, rel=1e-9)
+    torch.testing.assert_close(copies[:count], copies[count : 2 * count])
+    near = torch.cat([points, points + 1e-3 * spacing * torch.randn_like(points)])
+    assert float(coverage_area(near, normals.repeat(2, 1), discs.repeat(2, 1)).sum()) == pytest.approx(1, abs=0.03)
+    assert _sum_on_plane(points + 0.1 * spacing * torch.randn(count, 1) * UP) == pytest.approx(1, abs=0.03)
+    sizes, opacity = discs + 0.7 * torch.randn(count, 1), torch.rand(count)
+    assert float(coverage_area(points, normals, sizes, opacity).sum()) == pytest.approx(1, abs=0.03)
+    tilted = torch.nn.functional.normalize(normals + 0.1 * torch.randn(count, 3), dim=-1)
+    assert float(coverage_area(points, tilted, discs).sum()) == pytest.approx(1, abs=0.03)
+
+
+def test_faint_patch_among_opaque_ones_carries_little():
+    points = _plane("regular", 20)
+    opacity = torch.ones(400, dtype=torch.float64)
+    opacity[210] = 0.01
+    areas = coverage_area(points, UP.expand(400, 3), _discs(400, 1, 0.5), opacity)
+    assert float(areas[210]) < 0.05 / 400
+    assert float(areas.sum()) == pytest.approx(_sum_on_plane(points), rel=1e-9)
+
+
+def test_twins_share_by_weight():
+    """Two Gaussians at one centre: what one carries alone, they carry together."""
+    points = _plane("regular", 20)
+    points = torch.cat([points, points[210:211]])
+    opacity = torch.ones(401, dtype=torch.float64)
+    opacity[210], opacity[400] = 0.75, 0.25
+    areas = coverage_area(points, UP.expand(401, 3), _discs(400, 1, 0.5)[:1].expand(401, 3), opacity)
+    alone = coverage_area(points[:400], UP.expand(400, 3), _discs(400, 1, 0.5))
+    torch.testing.assert_close(areas[210] + areas[400], alone[210])
+    torch.testing.assert_close(areas[210], 3 * areas[400])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
+def test_few_or_lonely_gaussians_keep_their_own_area(count, device, dtype):
+    means = 1e3 * torch.rand(count, 3, device=device, dtype=dtype)
+    scales = torch.tensor([0.0, 0.5, -3.0], device=device, dtype=dtype).expand(count, 3)
+    areas = coverage_area(means, torch.nn.functional.normalize(torch.ones_like(means), dim=-1), scales)
+    assert (areas.dtype, areas.device.type) == (dtype, device.type)
+    torch.testing.assert_close(areas, patch_area(scales))
+
+
+def test_wild_input_stays_finite_and_positive():
+    """Floaters, needles, clusters tighter than the neighbour count, lines and coincident points."""
+    cluster = 1e-7 * torch.randn(500, 3)
+    line = torch.stack([torch.linspace(0, 1, 300), torch.zeros(300), torch.zeros(300)], dim=-1)
+    means = torch.cat([torch.rand(2000, 3), cluster, line, torch.full((60, 3), 0.5), torch.tensor([[1e6, 0, 0]])])
+    scales = -4 + 2 * torch.randn(len(means), 3)
+    areas = coverage_area(means, _unit(len(means), 3, dtype=torch.float32), scales, torch.rand(len(means)))
+    assert torch.isfinite(areas).all()
+    assert (areas > 0).all()
+    assert coverage_area(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)
+
+
+def test_same_input_same_areas_and_order_does_not_matter():
+    points, normals = _plane("random", 50), UP.expand(2500, 3)
+    discs = _discs(2500, 1, 0.5)
+    areas = coverage_area(points, normals, discs)
+    assert torch.equal(areas, coverage_area(points, normals, discs))
+    order = torch.randperm(2500)
+    torch.testing.assert_close(coverage_area(points[order], normals, discs), areas[order])
+    torch.testing.assert_close(coverage_area(points, -normals, discs).sum(), areas.sum(), rtol=2e-3, atol=0)
+
+
+def test_coverage_rejects_bad_values():
+    points = _plane("regular", 4)
+    with pytest.raises(ValueError, match="Expected `neighbours` to be at least 6, but got 3"):
+        _sum_on_plane(points, neighbours=3)
+    points[3, 1] = torch.nan
+    with pytest.raises(ValueError, match="Expected `means` to be finite"):
+        _sum_on_plane(points)
+
+
+def test_nearest_matches_brute_force():
+    """Density that varies by orders of magnitude, and a point far away."""
+    points = torch.randn(3000, 3, dtype=torch.float64) * torch.logspace(-4, 1, 3000, dtype=torch.float64)[:, None]
+    points[0] = 1e5
+    distance, index = _nearest(points, 12)
+    everything = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
+    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :12])
+    torch.testing.assert_close(everything.gather(-1, index), distance)
+
+
+# --- the model ---------------------------------------------------------------------------------------------------
