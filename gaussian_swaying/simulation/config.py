@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(scene.frame.describe())
         extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
         text = config_text(parser, settings)
-        pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
+        summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
     except KeyboardInterrupt:
         print("Stopped; what was recorded is kept. Continue with --resume.", file=sys.stderr)
         return 130
@@ -173,6 +173,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"error: {error}", file=sys.stderr)
         return 2
+    seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
+    print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
     for file in pipeline.files:
         print(f"wrote {file}")
     return 0

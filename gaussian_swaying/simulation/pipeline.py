@@ -355,6 +355,8 @@ class SimulationPipeline(nn.Module):
             "seed": self.wind.seed,
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
+            "mass_kg": float(self.solver.points.mass.sum()),
+            "patch_area_m2": float(self.scene.patch_area.sum()),
             "formulation": self.solver.formulation,
             "dtype": str(state.position.dtype).removeprefix("torch."),
             "grid": {"dx_m": self.solver.dx, "resolution": list(state.grid.resolution)},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 import shutil
@@ -284,17 +283,20 @@ def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, T
 
 
 def _first_change(old: str, new: str) -> str:
-    lines = difflib.ndiff(old.splitlines(), new.splitlines())
-    removed: list[str] = []
-    added: list[str] = []
-    for mark, line in ((line[:2], line[2:].strip()) for line in lines):
-        if mark == "  " and (removed or added):
-            break
-        if mark == "- ":
-            removed.append(line)
-        elif mark == "+ ":
-            added.append(line)
-    return f"first at {', '.join(removed) or 'nothing'!r}, now {', '.join(added) or 'nothing'!r}"
+    """The first field in which two configurations differ, by its dotted name."""
+    import yaml
+
+    before, after = _flat(yaml.safe_load(old)), _flat(yaml.safe_load(new))
+    for name in [*after, *before]:
+        if before.get(name) != after.get(name):
+            return f"`{name}` was {before.get(name, 'absent')}, now {after.get(name, 'absent')}"
+    return "in its order"
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    found = {k: v for key, item in items for k, v in _flat(item, f"{name}.{key}" if name else str(key)).items()}
+    return found or {name: value}
 
 
 def _free_name(path: Path) -> Path:

@@ -161,10 +161,10 @@ def check_refused(arguments, folder, capsys, *words):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (["--material.E", "5000"], ["'E: 3000.0'", "'E: 5000.0'"]),
-        (["--wind.seed", "3"], ["seed: 3"]),
-        (["--shader", "null"], ["shader"]),
-        (["--material.regions", '[{"region": {"class_path": "Everything"}, "E": 1.0}]'], ["regions"]),
+        (["--material.E", "5000"], ["`material.E` was", "now 5000.0"]),
+        (["--wind.seed", "3"], ["`wind.seed` was 0, now 3"]),
+        (["--shader", "null"], ["`shader"]),
+        (["--material.regions", '[{"region": {"class_path": "Everything"}, "E": 1.0}]'], ["`material.regions"]),
     ],
 )
 def test_another_configuration_is_refused_by_name(change, words, stopped, capsys):
