@@ -117,8 +117,8 @@ class AeroForce(nn.Module):
     Example:
         >>> aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=2.0)
         >>> up = torch.tensor([[0.0, 0.0, 1.0]])
-        >>> aero(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(1, 3), up, torch.ones(1))
-        tensor([[-0., -0., -9.]])
+        >>> aero(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(1, 3), up, torch.ones(1))[0, 2]
+        tensor(-9.)
     """
 
     def __init__(
@@ -146,6 +146,11 @@ class AeroForce(nn.Module):
         self.C_L: Tensor
         self.air_density, self.law = float(air_density), law
         self.lift_direction, self.unit_tangent = lift_direction, unit_tangent
+
+    @property
+    def idle(self) -> bool:
+        """Whether the force is zero whatever the wind, so that it need not be computed."""
+        return self.air_density == 0 or not any(float(c) for c in (self.C_D, self.C_F, self.C_L))
 
     def forward(self, wind: Tensor, velocity: Tensor, normal: Tensor, area: Tensor) -> Tensor:
         """Force on each patch [N].

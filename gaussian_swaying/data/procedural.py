@@ -9,8 +9,7 @@ import torch
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.ply import GaussianCloud
-
-SH_DC = 0.28209479177387814
+from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
 
 
 class ProceduralScene(ABC):

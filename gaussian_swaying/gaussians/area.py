@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 
 _RAYS = 32  # directions in which the cell of a patch is measured
 _SLAB = 0.75  # half thickness of one sheet, in neighbour spacings
@@ -101,7 +102,7 @@ def coverage_area(
     disc = own_area[first]
     total = torch.zeros(len(site), dtype=torch.float64).index_add_(0, owner, weight)
     if len(site) > 3:
-        distance, index = _nearest(site, min(neighbours, len(site) - 1))
+        distance, index = nearest_neighbours(site, min(neighbours, len(site) - 1))
         cell = torch.empty(len(site), dtype=torch.float64)
         share = torch.zeros(len(site), dtype=torch.float64)
         for start in range(0, len(site), 8192):
@@ -173,73 +174,3 @@ def _cell_area(
     area = reach.square().mean(-1) * math.pi
     near = (same & (squared.sqrt() < 2 * limit)).sum(-1)
     return torch.where(near < 3, disc, area) / (1 + stacked.sum(-1)), same | stacked
-
-
-def _nearest(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Distances (N, k), ascending, and indices (N, k) of the nearest other points, by grids that coarsen.
-
-    A point is settled on the first grid whose 27 cells around it hold k others within one cell size; only the points
-    not settled yet go on to the grid of twice the cell size. Memory is bounded by chunks of candidate pairs.
-    """
-    total = len(points)
-    low = points.amin(0)
-    extent = float((points.amax(0) - low).amax())
-    distance = torch.empty(total, count, dtype=points.dtype)
-    index = torch.empty(total, count, dtype=torch.long)
-    shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
-    pending = torch.arange(total)
-    level = _first_level(points, low, extent)
-    while len(pending):
-        size = extent * 2.0**-level
-        cells = ((points - low) / size).floor().long()
-        key, order = _cell_key(cells).sort(stable=True)
-        wanted = _cell_key(cells[pending, None] + shifts)
-        begin = torch.searchsorted(key, wanted)
-        length = torch.searchsorted(key, wanted, right=True) - begin
-        candidates = length.sum(-1)
-        last = level <= 0
-        keep = torch.nonzero(candidates > count).squeeze(-1)
-        keep = keep[candidates[keep].argsort(stable=True)]  # rows of one chunk need about the same width
-        settled = torch.zeros(len(pending), dtype=torch.bool)
-        start = 0
-        while start < len(keep):
-            width = max(1, 4_000_000 // int(candidates[keep[min(start + 20_000, len(keep) - 1)]]))
-            rows = keep[start : start + min(width, 20_000)]
-            start += len(rows)
-            near, who = _nearest_among(points, pending[rows], order, begin[rows], length[rows], count)
-            done = torch.ones(len(rows), dtype=torch.bool) if last else near[:, -1] <= size
-            distance[pending[rows[done]]], index[pending[rows[done]]] = near[done], who[done]
-            settled[rows[done]] = True
-        pending = pending[~settled]
-        level -= 1
-    return distance, index
-
-
-def _first_level(points: Tensor, low: Tensor, extent: float) -> int:
-    """The coarsest grid, as halvings of the extent, with at most 32 points in a cell; none is finer than 2^-40."""
-    for level in range(1, 40):
-        cells = ((points - low) / (extent * 2.0**-level)).floor().long()
-        if int(_cell_key(cells).unique(return_counts=True)[1].max()) <= 32:
-            return level
-    return 40
-
-
-def _cell_key(cells: Tensor) -> Tensor:
-    """One number per cell (..., 3); cells 2^20 apart share it, which only adds candidates that are too far away."""
-    x, y, z = (cells & (2**20 - 1)).unbind(-1)
-    return (x << 40) | (y << 20) | z
-
-
-def _nearest_among(
-    points: Tensor, query: Tensor, order: Tensor, begin: Tensor, length: Tensor, count: int
-) -> tuple[Tensor, Tensor]:
-    """The nearest of the points in 27 runs (B, 27) of ``order`` for each query (B,), other than itself."""
-    ends = length.cumsum(-1)
-    column = torch.arange(int(ends[:, -1].max()))
-    run = torch.searchsorted(ends, column.expand(len(query), -1).contiguous(), right=True).clamp_max(26)
-    place = begin.gather(-1, run) + column - (ends - length).gather(-1, run)
-    who = order[place.clamp_max(len(points) - 1)]
-    squared = (points[who] - points[query, None]).square().sum(-1)
-    squared = squared.masked_fill((column >= ends[:, -1:]) | (who == query[:, None]), torch.inf)
-    nearest, at = squared.topk(count, dim=-1, largest=False, sorted=True)
-    return nearest.sqrt(), who.gather(-1, at)

@@ -179,7 +179,7 @@ class Not(Region):
 
 
 def select_simulated(
-    means: Tensor, opacities: Tensor, region: Region | None = None, opacity_threshold: float = 0.02
+    means: Tensor, opacities: Tensor, region: Region | None = None, opacity_threshold: float = 0.1
 ) -> Tensor:
     """Choose the Gaussians to simulate: those in a region that are not nearly transparent.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 
 _DEGREE_OF_COEFFICIENTS = {1: 0, 4: 1, 9: 2, 16: 3}
-_C0 = 0.28209479177387814
+SH_DC = 0.28209479177387814
 _C1 = 0.4886025119029199
 _C2 = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
 _C3 = (
@@ -51,7 +51,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     if degree not in (0, 1, 2, 3):
         raise ValueError(f"Expected `degree` to be 0, 1, 2 or 3, but got {degree}.")
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, _C0)]
+    basis = [torch.full_like(x, SH_DC)]
     if degree >= 1:
         basis += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:

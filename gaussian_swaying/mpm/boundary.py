@@ -292,7 +292,8 @@ class VelocityBox(Boundary):
     def __init__(self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
         self.region = region
-        self.velocity = check_vector("velocity", velocity)
+        self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
+        self.velocity: Tensor
 
     def in_frame(self, frame: FrameLike) -> VelocityBox:
         """The box with its region asked in metres."""
@@ -304,4 +305,4 @@ class VelocityBox(Boundary):
         """Drive the nodes inside."""
         assert position is not None
         inside = self.region.contains(position) & self.active(time)
-        return torch.where(inside[..., None], velocity.new_tensor(self.velocity), velocity)
+        return torch.where(inside[..., None], self.velocity.to(velocity), velocity)

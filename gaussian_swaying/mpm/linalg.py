@@ -25,12 +25,13 @@ def determinant(matrix: Tensor, cofactors: Tensor | None = None) -> Tensor:
 
 
 def polar_rotation(matrix: Tensor, iterations: int = 5) -> Tensor:
-    r"""Orthogonal factor R of the polar decomposition F = R S by the scaled Newton iteration.
+    r"""The rotation nearest to F: the factor R of the polar decomposition F = R S, by the scaled Newton iteration.
 
     :math:`X_{k+1} = \tfrac12 (\zeta_k X_k + \zeta_k^{-1} X_k^{-T})` with
     :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F / \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar
-    decomposition - with applications"). Converges quadratically to the nearest orthogonal matrix, so a matrix with
-    negative determinant gives a reflection. The gradient is finite at F = I, unlike that of an SVD.
+    decomposition - with applications"). It converges quadratically to the nearest orthogonal matrix. Where that is a
+    reflection (an inverted element), its axis of smallest stretch is turned round, which gives the nearest rotation
+    (Irving, Teran & Fedkiw 2004). The gradient is finite at F = I, unlike that of an SVD.
 
     Args:
         matrix: Shape (..., 3, 3). A singular matrix gives a finite result that need not be orthogonal.
@@ -51,7 +52,23 @@ def polar_rotation(matrix: Tensor, iterations: int = 5) -> Tensor:
         )
         zeta = ratio.clamp(min=tiny).pow(0.25)
         x = 0.5 * (zeta * x + inverse_transpose / zeta)
-    return x
+    reflected = (determinant(x) < 0)[..., None, None]
+    # the identity stands in for proper rotations, so that their gradient stays clean
+    stretch = torch.where(reflected, x.mT @ matrix, torch.eye(3, dtype=x.dtype, device=x.device))
+    axis = _weakest_axis(0.5 * (stretch + stretch.mT))
+    return torch.where(reflected, x - 2 * (x @ axis) @ axis.mT, x)
+
+
+def _weakest_axis(stretch: Tensor) -> Tensor:
+    """Unit eigenvector (..., 3, 1) of the smallest eigenvalue of positive semidefinite matrices (..., 3, 3)."""
+    power = cofactor(stretch)  # its largest eigenvalue belongs to that vector
+    tiny = torch.finfo(stretch.dtype).tiny ** 0.25
+    for _ in range(6):
+        power = power / power.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=tiny)
+        power = power @ power
+    column = power.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*power.shape[:-1], 1)
+    vector = power.gather(-1, column)
+    return vector / torch.linalg.vector_norm(vector, dim=-2, keepdim=True).clamp(min=tiny)
 
 
 def symmetric_eigenvalues(matrix: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
-from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.boundary import Boundary, FrameLike
 from gaussian_swaying.mpm.constitutive import (
     fixed_corotated_energy,
     fixed_corotated_kirchhoff,
@@ -39,7 +39,8 @@ class MPMSolver(nn.Module):
         formulation: ``total`` or ``updated``.
         gravity: Acceleration [m/s²], z up.
         damping: Rate at which velocities decay [1/s]; 0 for none.
-        cfl: Courant number of the adaptive substep, ``dt = cfl dx / (c + |v|)``; at most 0.47 is always stable.
+        cfl: Courant number of the adaptive substep, ``dt = cfl dx / (c + |v|)``; up to 0.47 is stable near rest for any
+            arrangement of particles and any Poisson's ratio.
         substep: Fixed substep [s] instead of the adaptive one; checked against the stable one.
         max_nodes: Largest grid [nodes]; an object that spreads beyond it is reported instead of eating the memory.
         boundaries: Boundary conditions, applied in order.
@@ -76,7 +77,11 @@ class MPMSolver(nn.Module):
         self.dx, self.formulation, self.damping, self.cfl = float(dx), formulation, float(damping), float(cfl)
         self.substep, self.max_nodes = substep, int(max_nodes)
         self.gravity = check_vector("gravity", gravity)
+        # float64 on the device: no copy in a step, full precision in a float64 run
+        self.register_buffer("_gravity", torch.tensor(self.gravity, dtype=torch.float64), persistent=False)
+        self._gravity: Tensor
         self.boundaries = nn.ModuleList(boundaries)
+        self._acting = self.boundaries  # the same, in metres
         self._points: MaterialPoints | None = None
         self._static: dict[str, Tensor] = {}
         self._stencil: Stencil | None = None
@@ -96,9 +101,6 @@ class MPMSolver(nn.Module):
         """Whether stencils stay at the rest positions."""
         return self.formulation == "total"
 
-    def _conditions(self) -> list[Boundary]:
-        return [b for b in self.boundaries if isinstance(b, Boundary)]
-
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MPMSolver:
         super()._apply(fn, recurse)
         if self._points is not None:
@@ -109,7 +111,7 @@ class MPMSolver(nn.Module):
         """Take the material and compute what never changes: Lamé parameters and, in ``total``, stencil and mass."""
         mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
         self._points, self._static = points, {"mu": mu, "lam": lam}
-        masks = [b.particle_mask(points.position.detach()) for b in self._conditions()]
+        masks = [b.particle_mask(points.position.detach()) for b in _conditions(self._acting)]
         for k, mask in enumerate(masks):
             if mask is not None:
                 self._static[f"pinned_mass_{k}"] = torch.where(mask, points.mass, 0.0)
@@ -123,14 +125,14 @@ class MPMSolver(nn.Module):
         self._stencil = stencil
         self._static["node_mass"] = mass
         self._static["node_inverse_mass"] = _safe_inverse(mass)
-        if any(b.needs_position for b in self.boundaries):
+        if any(b.needs_position for b in _conditions(self._acting)):
             first_moment = scatter(stencil, (points.mass[..., None] * position)[..., None, :])
             self._static["node_rest"] = first_moment * self._static["node_inverse_mass"][..., None]
         for k, mask in enumerate(masks):
             if mask is None:
                 continue
             pinned = scatter(stencil, self._static.pop(f"pinned_mass_{k}")[..., None, None])[..., 0]
-            share = float(getattr(self.boundaries[k], "held_share", 0.0))
+            share = float(getattr(self._acting[k], "held_share", 0.0))
             held = (pinned > share * mass) & (mass > 0)
             if not bool(held.any()):
                 raise ValueError(
@@ -154,13 +156,20 @@ class MPMSolver(nn.Module):
             )
         return grid
 
-    def init_state(self, points: MaterialPoints, velocity: Tensor | None = None, margin: int = 4) -> MPMState:
+    def init_state(
+        self,
+        points: MaterialPoints,
+        velocity: Tensor | None = None,
+        margin: int = 4,
+        frame: FrameLike | None = None,
+    ) -> MPMState:
         """Take the material at rest and return the state at time zero.
 
         Args:
             points: The material, shapes (..., P, ·).
             velocity: Initial velocity [m/s], shape (..., P, 3); zero if None.
             margin: Cells around the object in the first grid of the ``updated`` formulation.
+            frame: The frame from scene units to metres in which the boundaries are given; None if they are in metres.
 
         Returns:
             The state, on the device and with the type of ``points``.
@@ -171,6 +180,12 @@ class MPMSolver(nn.Module):
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
+        if frame is not None:
+            self._acting = nn.ModuleList([b.in_frame(frame) for b in _conditions(self.boundaries)]).to(
+                points.position.device
+            )
+        else:
+            self._acting = self.boundaries
         self._bind(points)
         position = points.position
         if velocity is None:
@@ -215,7 +230,8 @@ class MPMSolver(nn.Module):
                     f"The fixed `substep` of {self.substep:g} s is longer than the stable one of {limit:.4g} s (at dx "
                     f"= {self.dx:g} m and this material): lower it, or set it to null for the adaptive substep."
                 )
-            return substeps_per_frame(frame_dt, self.substep, exact=True)
+            steps = substeps_per_frame(frame_dt, self.substep, exact=True)
+            return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
         return substeps_per_frame(frame_dt, self.cfl / max(float(self.cfl_number(state, 1.0)), 1e-30), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
@@ -223,13 +239,22 @@ class MPMSolver(nn.Module):
         speed = wave_speed(self.points, state.F_elastic, spatial=not self.total_lagrangian)
         return cfl_number(dt, self.dx, speed, None if self.total_lagrangian else state.velocity).detach()
 
-    def fit_grid(self, state: MPMState, horizon: float) -> MPMState:
-        """Move and resize the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds."""
+    def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
+        """Move and resize the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
+
+        Args:
+            state: The state now.
+            horizon: Time that the grid has to serve [s]; reckoned with twice the present speeds, and gravity.
+            margin: Further cells on each side, for what the wind and the boundaries may do.
+
+        Returns:
+            The state with its new grid.
+        """
         if self.total_lagrangian:
             return state
         speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
         reach = (2 * speed + 0.5 * sum(g * g for g in self.gravity) ** 0.5 * horizon) * horizon
-        grid = self._bounding_grid(state.position, margin=3 + min(int(reach / self.dx), 1000))
+        grid = self._bounding_grid(state.position, margin=3 + margin + min(int(reach / self.dx), 1000))
         return state.replace(grid=grid)
 
     def step(self, state: MPMState, dt: float, force: Tensor | None = None) -> MPMState:
@@ -305,7 +330,7 @@ class MPMSolver(nn.Module):
         velocity = self._accelerate(nodes[..., :3] * inverse_mass, None, dt)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = None
-        if any(b.needs_position for b in self.boundaries):
+        if any(b.needs_position for b in _conditions(self._acting)):
             position = state.grid.node_positions(velocity).expand_as(velocity)
 
         def held(k: int) -> Tensor | None:
@@ -333,7 +358,7 @@ class MPMSolver(nn.Module):
         if acceleration is not None:
             velocity = velocity + dt * acceleration
         if any(self.gravity):
-            velocity = velocity + dt * velocity.new_tensor(self.gravity)
+            velocity = velocity + dt * self._gravity.to(velocity)
         if self.damping > 0:
             velocity = velocity * math.exp(-self.damping * dt)
         return velocity
@@ -341,7 +366,7 @@ class MPMSolver(nn.Module):
     def _constrain(
         self, velocity: Tensor, position: Tensor | None, held: Callable[[int], Tensor | None], time: Tensor
     ) -> Tensor:
-        for k, boundary in enumerate(self.boundaries):
+        for k, boundary in enumerate(self._acting):
             velocity = boundary(velocity, position, held(k), time)
         return velocity
 
@@ -355,7 +380,7 @@ class MPMSolver(nn.Module):
             spread = 0.25 * self.dx**2 * state.affine.square().sum((-1, -2))
             kinetic = 0.5 * (points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
         density = fixed_corotated_energy(state.F_elastic, self._static["mu"], self._static["lam"])
-        height = (state.position * state.position.new_tensor(self.gravity)).sum(-1)
+        height = (state.position * self._gravity.to(state.position)).sum(-1)
         return {
             "kinetic": kinetic,
             "elastic": (points.volume * density).sum(-1),
@@ -365,6 +390,10 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
+
+
+def _conditions(modules: nn.ModuleList) -> list[Boundary]:
+    return [b for b in modules if isinstance(b, Boundary)]
 
 
 def _safe_inverse(mass: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ which :func:`bspline_stencil` was built. This is the definition, on any device a
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -58,7 +59,7 @@ def bspline_stencil(position: Tensor, grid: GridSpec, moments: bool = True, snap
         (True, torch.Size([1, 7, 27]))
     """
     check_shape("position", position, "P", 3)
-    dx, resolution = grid.dx, grid.resolution
+    dx = grid.dx
     batch = tuple(position.shape[:-2])
     lattice = position.reshape(-1, 3) / dx
     base = torch.floor(lattice.detach() - 0.5)
@@ -68,17 +69,14 @@ def bspline_stencil(position: Tensor, grid: GridSpec, moments: bool = True, snap
     w = torch.stack([0.5 * (1.5 - f).square(), 0.75 - (f - 1).square(), 0.5 * (f - 0.5).square()], dim=1)
     dw = torch.stack([f - 1.5, 2 - 2 * f, f - 0.5], dim=1) / dx
 
-    first = base.long() - torch.tensor(grid.offset, device=position.device)
-    limit = torch.tensor(resolution, device=position.device) - 3
+    offset, limit, strides, shift = _grid_constants(grid, position.device)
+    first = base.long() - offset
     inside = ((first >= 0) & (first <= limit)).all(-1)
-    strides = (resolution[1] * resolution[2], resolution[2], 1)
-    start = (torch.where(inside[:, None], first, 0) * torch.tensor(strides, device=position.device)).sum(-1)
+    start = (torch.where(inside[:, None], first, 0) * strides).sum(-1)
     if batch:
         scene = torch.arange(inside.numel(), device=position.device) // max(position.shape[-2], 1)
         start = start + scene * grid.node_count
-    reach = torch.arange(3, device=position.device)
-    shift = reach[:, None, None] * strides[0] + reach[:, None] * strides[1] + reach
-    node = (start[:, None] + shift.reshape(-1)).reshape(-1)
+    node = (start[:, None] + shift).reshape(-1)
 
     w = w * inside[:, None, None]
     dw = dw * inside[:, None, None]
@@ -89,10 +87,24 @@ def bspline_stencil(position: Tensor, grid: GridSpec, moments: bool = True, snap
 
     rows = [product(wx, wy, wz), product(gx, wy, wz), product(wx, gy, wz), product(wx, wy, gz)]
     if moments:
-        d = (reach.to(f.dtype)[:, None] - f[:, None, :]) * dx
+        reach = torch.arange(3, device=f.device, dtype=f.dtype)
+        d = (reach[:, None] - f[:, None, :]) * dx
         mx, my, mz = (w * d).unbind(-1)
         rows += [product(mx, wy, wz), product(wx, my, wz), product(wx, wy, mz)]
     return Stencil(node, torch.stack(rows, dim=1), inside.reshape(position.shape[:-1]), batch, grid.node_count)
+
+
+@lru_cache(maxsize=64)
+def _grid_constants(grid: GridSpec, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Offset, largest first node, strides and the 27 shifts, kept on the device so that a step copies nothing to it."""
+    nx, ny, nz = grid.resolution
+    with torch.inference_mode(False):
+        offset = torch.tensor(grid.offset, device=device)
+        limit = torch.tensor([nx - 3, ny - 3, nz - 3], device=device)
+        strides = torch.tensor([ny * nz, nz, 1], device=device)
+        reach = torch.arange(3, device=device)
+        shift = reach[:, None, None] * (ny * nz) + reach[:, None] * nz + reach
+    return offset, limit, strides, shift.reshape(-1)
 
 
 def scatter(stencil: Stencil, coefficients: Tensor) -> Tensor:
@@ -121,21 +133,20 @@ def scatter(stencil: Stencil, coefficients: Tensor) -> Tensor:
     return out.reshape(*stencil.batch, stencil.node_count, columns)
 
 
-def gather(field: Tensor, stencil: Stencil, rows: int | None = None) -> Tensor:
+def gather(field: Tensor, stencil: Stencil) -> Tensor:
     r"""Interpolate a nodal field at the particles: :math:`r_{a,p} = \sum_i b_{a,ip}\, q_i`, the adjoint of scatter.
 
     Args:
         field: Nodal field, shape (..., G, K).
         stencil: Support of each particle.
-        rows: How many rows of the basis to apply (1: value; 4: and gradient; 7: and first moments); all by default.
 
     Returns:
-        Shape (..., P, A, K): row 0 the value, rows 1 to 3 the derivative along x, y, z, rows 4 to 6 the moments.
+        Shape (..., P, A, K): row 0 the value, rows 1 to 3 the derivative along x, y, z, rows 4 to 6 the moments if the
+        stencil has them.
     """
     columns = field.shape[-1]
-    basis = stencil.basis if rows is None else stencil.basis[:, :rows]
     values = field.reshape(-1, columns).index_select(0, stencil.node).reshape(-1, 27, columns)
-    return torch.bmm(basis, values).reshape(*stencil.inside.shape, basis.shape[1], columns)
+    return torch.bmm(stencil.basis, values).reshape(*stencil.inside.shape, -1, columns)
 
 
 def p2g(mass: Tensor, velocity: Tensor, affine: Tensor, stencil: Stencil) -> tuple[Tensor, Tensor]:

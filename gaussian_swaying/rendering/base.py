@@ -1,5 +1,6 @@
 """What every renderer takes and returns."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -56,13 +57,23 @@ class Renderer(Protocol):
 
 
 def make_renderer(device: torch.device | str) -> Renderer:
-    """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise."""
-    if torch.device(device).type == "cuda" and torch.cuda.is_available():
-        from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+    """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
 
-        return GsplatRenderer()
+    Where gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
+    """
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 
+    if torch.device(device).type != "cuda" or not torch.cuda.is_available():
+        return TorchRenderer()
+    from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, gsplat_works
+
+    if gsplat_works():
+        return GsplatRenderer()
+    warnings.warn(
+        "gsplat cannot compile its CUDA kernels here (it needs nvcc of torch's CUDA version): drawing with the slower "
+        "torch renderer instead.",
+        stacklevel=2,
+    )
     return TorchRenderer()
 
 

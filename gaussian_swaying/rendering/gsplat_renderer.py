@@ -8,6 +8,19 @@ from gaussian_swaying.rendering.base import RenderOutput, check_gaussians, finit
 from gaussian_swaying.rendering.camera import Camera
 
 
+def gsplat_works() -> bool:
+    """Whether gsplat's CUDA kernels are there or can be compiled, which takes about a minute the first time."""
+    if not torch.cuda.is_available():
+        return False
+    try:
+        from gsplat.cuda._backend import _C
+    except ModuleNotFoundError:  # another version of gsplat, which keeps its kernels elsewhere
+        return True
+    except Exception:  # the compiler failed; what it says is on the terminal
+        return False
+    return _C is not None
+
+
 def render_gsplat(
     means: Tensor,
     covariances: Tensor,

@@ -166,8 +166,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = config_text(parser, settings)
         summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
     except KeyboardInterrupt:
-        print("Stopped; what was recorded is kept. Continue with --resume.", file=sys.stderr)
+        print("Stopped; what was recorded is kept. If there is a checkpoint, --resume continues.", file=sys.stderr)
         return 130
+    except torch.OutOfMemoryError as error:
+        print(
+            f"error: {error} Remedy: a smaller `scene.region`, a coarser `solver.dx` or a smaller picture.",
+            file=sys.stderr,
+        )
+        return 2
     except (ValueError, TypeError, OSError, SimulationDiverged) as error:
         if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
             raise

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -25,7 +24,7 @@ from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
-from gaussian_swaying.rendering.camera import Camera, CameraPath
+from gaussian_swaying.rendering.camera import Camera, CameraPath, TransformsCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, check_state, diagnose
 from gaussian_swaying.simulation.recorder import Recorder
@@ -70,14 +69,16 @@ class SimulationPipeline(nn.Module):
         check_positive("frame_dt", frame_dt)
         self.scene, self.solver, self.wind, self.aero, self.shader = scene, solver, wind, aero, shader
         self.camera, self.frame_dt = camera, float(frame_dt)
-        solver.boundaries = nn.ModuleList([b.in_frame(scene.frame) for b in solver.boundaries])  # type: ignore[operator]
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
         self.background: Tensor
         self.to(device)
-        self.device = torch.device(device)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
-        self._windless = not bool(self.wind.flows.any()) and len(self.wind.modulations) == 0
         self._most_substeps = sys.maxsize
+
+    @property
+    def device(self) -> torch.device:
+        """Where the components are."""
+        return self.background.device
 
     # ---- simulation
 
@@ -87,7 +88,7 @@ class SimulationPipeline(nn.Module):
         Raises:
             ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long.
         """
-        state = self.solver.init_state(self.scene.points)
+        state = self.solver.init_state(self.scene.points, frame=self.scene.frame)
         self._most_substeps = MAX_GROWTH * self._substeps(state)
         return state
 
@@ -101,7 +102,7 @@ class SimulationPipeline(nn.Module):
         """Advance by one frame.
 
         A frame whose material stiffened so much that its substep was too long is thrown away and done again with a
-        shorter one.
+        shorter one; so is one in which a particle outran the grid of the ``updated`` formulation, on a larger grid.
 
         Args:
             state: The state at the start of the frame.
@@ -112,20 +113,29 @@ class SimulationPipeline(nn.Module):
         Raises:
             SimulationDiverged: If the frame does not end well.
         """
-        steps = self._substeps(state)
-        for retry in range(MAX_RETRIES + 1):
-            if steps > self._most_substeps:
-                self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
-            try:
-                end = self._roll(self.solver.fit_grid(state, self.frame_dt), steps)
-            except FloatingPointError as error:
-                raise SimulationDiverged(float(state.time), None, str(error), "lower `solver.cfl`") from error
-            dt = self.frame_dt / steps
-            cfl = float(self.solver.cfl_number(end, dt))
-            if self.solver.substep is not None or cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl) or retry == MAX_RETRIES:
-                break
-            growth = cfl / self.solver.cfl if math.isfinite(cfl) else 4.0
-            steps = int(steps * min(growth * 1.1, 4.0)) + 1
+        margin = 0
+        try:
+            steps = self._substeps(state)
+            for retry in range(MAX_RETRIES + 1):
+                if steps > self._most_substeps:
+                    self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
+                end = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
+                dt = self.frame_dt / steps
+                cfl = float(self.solver.cfl_number(end, dt))
+                outrun = bool((end.lost & ~state.lost).any())
+                too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
+                if retry == MAX_RETRIES or not (outrun or too_long):
+                    break
+                if outrun:
+                    margin = 4 * max(margin, 4)
+                if too_long:
+                    growth = cfl / self.solver.cfl if math.isfinite(cfl) else 4.0
+                    steps = int(steps * min(growth * 1.1, 4.0)) + 1
+        except (FloatingPointError, ValueError) as error:
+            # a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN
+            cause = str(error).rstrip(".")
+            remedy = "follow it, or lower `solver.cfl` and weaken what drives the object"
+            raise SimulationDiverged(float(state.time), None, cause, remedy) from error
         check_state(self.solver, end)
         if not cfl <= MAX_CFL:
             self._give_up(
@@ -145,7 +155,7 @@ class SimulationPipeline(nn.Module):
 
     def _roll(self, state: MPMState, steps: int) -> MPMState:
         dt = self.frame_dt / steps
-        if self._windless:
+        if self.aero.idle:
             return self.solver.rollout(state, dt, steps)
         offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
         winds = self.wind(state.time + offsets)
@@ -155,7 +165,7 @@ class SimulationPipeline(nn.Module):
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
-        if self._windless:
+        if self.aero.idle:
             return 1
         times = state.time + torch.linspace(0, self.frame_dt, 5, dtype=torch.float64, device=self.device)
         wind = torch.linalg.vector_norm(self.wind(times), dim=-1).amax().to(state.velocity.dtype)
@@ -168,15 +178,19 @@ class SimulationPipeline(nn.Module):
     # ---- picture
 
     def camera_at(self, frame: int) -> Camera:
-        """The camera of a frame, on the device.
-
-        Raises:
-            ValueError: If it lies inside the box of the object at rest.
-        """
+        """The camera of a frame, on the device."""
         scene = self.scene
         up = scene.frame.rotation[2]
-        camera = self.camera(frame, frame * self.frame_dt, scene.center, up, scene.size)
-        low, high = scene.bounds()
+        return self.camera(frame, frame * self.frame_dt, scene.center, up, scene.size).to(self.device)
+
+    def check_camera(self, frame: int) -> None:
+        """Raise ValueError if the camera of a frame lies inside the box of the object at rest.
+
+        Not asked of cameras of a capture, which stood where they stood: around an object or in a room.
+        """
+        if isinstance(self.camera, TransformsCamera):
+            return
+        camera, (low, high) = self.camera_at(frame), self.scene.bounds()
         eye = camera.position.to(low)
         if bool(((eye > low) & (eye < high)).all()):
             raise ValueError(
@@ -184,7 +198,6 @@ class SimulationPipeline(nn.Module):
                 f"{[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene units): move "
                 "it out with `camera.init_args.radius` or `eye`."
             )
-        return camera.to(self.device)
 
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
         """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
@@ -268,7 +281,8 @@ class SimulationPipeline(nn.Module):
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         check_positive("frames", frames)
-        self.camera_at(0)
+        for frame in range(frames):
+            self.check_camera(frame)
         state = self.start()  # what is refused is refused before anything is written
         checkpoint = recorder.open(output, config, resume)
         first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
@@ -280,6 +294,11 @@ class SimulationPipeline(nn.Module):
                     f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
                 )
             first, log = checkpoint["frame"] + 1, checkpoint["log"]
+            if first > frames:
+                raise ValueError(
+                    f"The run in {output} has {first} frames already, and `frames` asks for {frames}: ask for more, or "
+                    "leave out --resume."
+                )
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
         bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
@@ -290,8 +309,8 @@ class SimulationPipeline(nn.Module):
                         state, health = self.advance(state)
                     else:
                         health = diagnose(self.solver, state, 0, 0.0)
-                log.append(health.as_dict())
                 self._record(recorder, state, frame, walls)
+                log.append(health.as_dict())
                 with walls("writing"):
                     if recorder.checkpoint_every and (frame + 1) % recorder.checkpoint_every == 0:
                         recorder.write_checkpoint(
@@ -310,7 +329,7 @@ class SimulationPipeline(nn.Module):
             status, reason = "diverged", str(error)
             raise
         except KeyboardInterrupt:
-            status, reason = "interrupted", "stopped by the user; continue with --resume"
+            status, reason = "interrupted", "stopped by the user"
             raise
         except Exception as error:
             status, reason = "failed", str(error)
@@ -320,10 +339,15 @@ class SimulationPipeline(nn.Module):
             summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log, frames, walls, peak) | (settings or {})
             # the video of a run that was stopped early is made too: nothing that was recorded is lost
-            with walls("writing"):
-                files = recorder.close(done, summary)
-            summary["wall_s"] = dict(walls.seconds)
-            self.files = files
+            self.files = []
+            try:
+                with walls("writing"):
+                    self.files = recorder.close(done, summary, 1 / self.frame_dt)
+            except OSError as error:
+                if status == "complete":
+                    raise
+                print(f"{error}", file=sys.stderr)  # what stopped the run matters more
+        summary["wall_s"] = dict(walls.seconds)
         recorder.write_summary(summary)
         return summary
 
@@ -406,8 +430,13 @@ class _PeakMemory:
             torch.cuda.reset_peak_memory_stats(device)
 
     def read(self) -> dict[str, int | None]:
-        unit = 1 if sys.platform == "darwin" else 1024
-        host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+        try:
+            import resource
+        except ImportError:  # Windows
+            host = None
+        else:
+            unit = 1 if sys.platform == "darwin" else 1024
+            host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
         device = torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
         return {"host": host, "device": device}
 

@@ -64,7 +64,7 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
         command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-an", "-vcodec", "libx264"]
         command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
-        command += ["-movflags", "+faststart", str(temporary)]
+        command += ["-movflags", "+faststart", str(temporary.resolve())]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
         assert process.stdin is not None
         assert process.stderr is not None
@@ -90,7 +90,7 @@ class Recorder:
         ply_every: Write the deformed Gaussians as a 3DGS .ply every so many frames; 0 for never.
         trajectory: Keep position (float32, metres, z up) and F (float16) of the simulated particles per frame.
         checkpoint_every: Keep the state for ``--resume`` every so many frames; 0 for never.
-        fps: Frames per second of the video.
+        fps: Frames per second of the video; null for real time, 1 / frame_dt.
     """
 
     def __init__(
@@ -100,15 +100,16 @@ class Recorder:
         ply_every: int = 0,
         trajectory: bool = True,
         checkpoint_every: int = 1,
-        fps: float = 25.0,
+        fps: float | None = None,
     ) -> None:
         for name, value in (("ply_every", ply_every), ("checkpoint_every", checkpoint_every)):
             check_positive(f"recorder.{name}", value, allow_zero=True)
-        check_positive("recorder.fps", fps)
+        if fps is not None:
+            check_positive("recorder.fps", fps)
         if video and not images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
         self.images, self.video, self.trajectory = images, video, trajectory
-        self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), float(fps)
+        self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), fps
         self._folder: Path | None = None
 
     @property
@@ -140,6 +141,9 @@ class Recorder:
             checkpoint = self._load_checkpoint(path, config)
             self._folder = path
             self._make_folders()
+            for folder in (path, *(path / name for name in ("frames", "ply", "trajectory"))):
+                for leftover in folder.glob(".*.*.*"):  # of a run that was killed while it wrote
+                    leftover.unlink()
             return checkpoint
         try:
             if (path / MARKER).exists():
@@ -219,12 +223,13 @@ class Recorder:
         files = [self.folder / "frames" / f"{index:05d}.png" for index in range(count)]
         return [file for file in files if file.exists()]
 
-    def close(self, frames: int, summary: dict[str, Any]) -> list[Path]:
+    def close(self, frames: int, summary: dict[str, Any], real_time_fps: float = 25.0) -> list[Path]:
         """Pack the trajectory, encode the video and write the summary of the frames recorded so far.
 
         Args:
             frames: Number of frames recorded.
             summary: What goes to ``summary.json``.
+            real_time_fps: Frames per second at which the video shows the simulated time.
 
         Returns:
             The files and folders of the run, for telling the user.
@@ -240,7 +245,7 @@ class Recorder:
             made.append(self.folder / "frames")
             files = self.frame_files(frames)
             if self.video and files:  # last: it needs another program
-                encode_video(files, self.folder / "video.mp4", self.fps)
+                encode_video(files, self.folder / "video.mp4", self.fps or real_time_fps)
                 made.append(self.folder / "video.mp4")
         return made
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.data.procedural import ProceduralScene
+from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
 from gaussian_swaying.gaussians.surface import (
@@ -153,7 +154,8 @@ class SimulatedScene(nn.Module):
         self.register_buffer("simulated", simulated)
         carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
         self.register_buffer("carried", carried)
-        self.register_buffer("anchor", nearest(cloud.means[carried], cloud.means[simulated]))
+        _, anchor = nearest_neighbours(cloud.means[simulated].double(), 1, cloud.means[carried])
+        self.register_buffer("anchor", anchor[:, 0])
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
         position = self.frame.point_to_sim(cloud.means[simulated].double())
@@ -201,7 +203,8 @@ class SimulatedScene(nn.Module):
     def size(self) -> float:
         """Longest side of the simulated part at rest, scene units."""
         low, high = self.bounds()
-        return float((high - low).amax())
+        largest = self.model.scales[self.simulated].amax().exp()  # a single Gaussian has a size too
+        return max(float((high - low).amax()), float(largest))
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Smallest and largest corner of the simulated part at rest, scene units, each of shape (3,)."""
@@ -244,24 +247,6 @@ class SimulatedScene(nn.Module):
 
 
 _MATERIAL_FIELDS = ("E", "nu", "density", "thickness")
-
-
-def nearest(queries: Tensor, points: Tensor, chunk: int = 2**26) -> Tensor:
-    """Index of the nearest point for each query, by exhaustive search in chunks.
-
-    Args:
-        queries: Shape (M, 3).
-        points: Shape (P, 3).
-        chunk: Largest number of distances in memory.
-
-    Returns:
-        Shape (M,), int64.
-    """
-    rows = max(1, chunk // max(len(points), 1))
-    # not by matrix products: far from the origin they lose the differences that decide
-    exact = "donot_use_mm_for_euclid_dist"
-    parts = [torch.cdist(q, points, compute_mode=exact).argmin(1) for q in queries.split(rows)] if len(queries) else []
-    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.long, device=points.device)
 
 
 def cell_volume(position: Tensor, dx: float) -> Tensor:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.area import _nearest, coverage_area, patch_area
+from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.surface import quat_to_rotation
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -173,16 +173,3 @@ def test_coverage_rejects_bad_values():
     points[3, 1] = torch.nan
     with pytest.raises(ValueError, match="Expected `means` to be finite"):
         _sum_on_plane(points)
-
-
-def test_nearest_matches_brute_force():
-    """Density that varies by orders of magnitude, and a point far away."""
-    points = torch.randn(3000, 3, dtype=torch.float64) * torch.logspace(-4, 1, 3000, dtype=torch.float64)[:, None]
-    points[0] = 1e5
-    distance, index = _nearest(points, 12)
-    everything = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(torch.inf)
-    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :12])
-    torch.testing.assert_close(everything.gather(-1, index), distance)
-
-
-# --- the model ---------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The fixed-corotated law against its energy, symmetry and small-strain limit."""
 
+import pytest
 import torch
 
 from gaussian_swaying.mpm.constitutive import (
@@ -57,5 +58,17 @@ def test_crushed_and_inverted_elements_stay_finite():
     F = torch.tensor([[0.0, 0, 0], [1, 1, 0], [1, 1, -1]]).diag_embed()
     mu, lam = MU.float(), LAM.float()
     assert bool(torch.isfinite(fixed_corotated_pk1(F, mu, lam)).all())
-    # the volume term pushes an inverted element back: the stress along its flipped axis is tensile towards J > 0
-    assert float(fixed_corotated_pk1(F[2], mu, lam)[2, 2]) < 0
+
+
+def test_inverted_element_is_pushed_back():
+    """Without the volume term too: a reflection costs energy, and the stress drives its flipped axis towards J > 0."""
+    F = torch.diag(torch.tensor([1.2, 1.1, -0.6], dtype=torch.float64))
+    mu, lam = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
+    stress = fixed_corotated_pk1(F, mu, lam)
+    torch.testing.assert_close(stress, 2 * (F - torch.eye(3, dtype=torch.float64)), rtol=0, atol=1e-9)
+    assert float(stress[2, 2]) < -3
+    assert float(fixed_corotated_energy(F, mu, lam)) == pytest.approx(0.2**2 + 0.1**2 + 1.6**2)
+    G = (torch.eye(3, dtype=torch.float64) + 0.05 * torch.randn(20, 3, 3, dtype=torch.float64)) @ F
+    G.requires_grad_()
+    (expected,) = torch.autograd.grad(fixed_corotated_energy(G, mu, lam).sum(), G)
+    torch.testing.assert_close(fixed_corotated_pk1(G, mu, lam), expected, rtol=0, atol=1e-7)

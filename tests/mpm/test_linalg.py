@@ -22,16 +22,26 @@ def test_cofactor_and_determinant(device, dtype):
 
 
 def test_polar_rotation_matches_svd(device, dtype):
-    """Condition numbers up to 50; reflections come out as reflections."""
+    """Condition numbers up to 50; inverted matrices give the nearest rotation, not a reflection."""
     F = _matrices(device, dtype, spread=0.4)
     F = F[torch.linalg.cond(F.double()) < 50]
-    u, _, vh = torch.linalg.svd(F.double())
-    iterations = 5 if dtype == torch.float32 else 8
+    u, s, vh = torch.linalg.svd(F.double())
+    R = polar_rotation(F, 5 if dtype == torch.float32 else 8)
     # forward error of a polar factor: eps times the condition number
-    torch.testing.assert_close(
-        polar_rotation(F, iterations), (u @ vh).to(dtype), rtol=0, atol=100 * torch.finfo(dtype).eps
-    )
-    assert bool((torch.linalg.det(F) < 0).any()), "the test should meet an inverted matrix"
+    tol = 100 * torch.finfo(dtype).eps
+    proper = torch.linalg.det(F) > 0
+    torch.testing.assert_close(R[proper], (u @ vh).to(dtype)[proper], rtol=0, atol=tol)
+    eye = torch.eye(3, dtype=dtype, device=device).expand_as(R)
+    torch.testing.assert_close(R.mT @ R, eye, rtol=0, atol=tol)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(len(R), dtype=dtype, device=device), rtol=0, atol=tol)
+    # the nearest rotation has tr(R^T F) = s1 + s2 - s3
+    inverted = ~proper
+    assert int(inverted.sum()) > 5, "the test should meet inverted matrices"
+    best = s[inverted] @ torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64, device=device)
+    found = (R * F).double()[inverted].sum((-1, -2))
+    torch.testing.assert_close(found, best, rtol=0, atol=5e-3)
+    clear = s[inverted][:, 1] > 1.5 * s[inverted][:, 2]
+    torch.testing.assert_close(found[clear], best[clear], rtol=0, atol=1e-4 if dtype == torch.float32 else 1e-5)
 
 
 def test_polar_rotation_is_objective(device):

@@ -105,6 +105,15 @@ def test_adaptive_and_fixed_substeps():
     assert fixed.substeps(fixed.init_state(points), 0.04) == 200
 
 
+def test_rounding_does_not_lengthen_a_fixed_substep_beyond_the_stable_one():
+    points = _points(torch.rand(20, 3, dtype=torch.float64))
+    solver = MPMSolver(dx=0.1)
+    solver.init_state(points)
+    limit = solver.stable_substep()
+    fixed = MPMSolver(dx=0.1, substep=limit)
+    assert fixed.substeps(fixed.init_state(points), 1.49 * limit) == 2
+
+
 def test_fixed_substep_above_the_stable_one_is_refused():
     points = _points(torch.rand(20, 3, dtype=torch.float64))
     solver = MPMSolver(dx=0.1, substep=0.04)

@@ -70,18 +70,48 @@ def test_strong_drag_on_light_patches_shortens_the_substep(make_pipeline):
     assert math.isfinite(health.kinetic)
 
 
-def test_without_wind_the_aerodynamics_are_not_asked(make_pipeline, monkeypatch):
+def test_aerodynamics_are_asked_only_where_they_can_push(make_pipeline, monkeypatch):
     calls = []
     forward = AeroForce.forward
     monkeypatch.setattr(AeroForce, "forward", lambda self, *a: calls.append(1) or forward(self, *a))
-    _, (health,) = _advance(make_pipeline(wind=WindField()), 1)
-    assert calls == []
-    assert health.kinetic > 0
+    for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce(air_density=0.0)):
+        assert aero.idle
+        _, (health,) = _advance(make_pipeline(aero=aero), 1)
+        assert calls == []
+        assert health.kinetic > 0
     _, (health,) = _advance(make_pipeline(), 1)
     assert len(calls) == health.substeps
-    calls.clear()
-    _advance(make_pipeline(wind=WindField(modulations=[GaussianGust(0.3)])), 1)
-    assert calls
+
+
+def test_still_air_resists_a_fall(make_pipeline):
+    """No wind is not no air: a light free flag falls slower than in a vacuum, broadside most of all."""
+    light = Material(E=1e3, density=10.0, thickness=1e-3)
+    speed = []
+    for air in (0.0, 1.225):
+        aero = AeroForce(C_D=1.0, C_F=1.0, air_density=air)
+        pipeline = make_pipeline(wind=WindField(), aero=aero, material=light, pinned=False)
+        state, _ = _advance(pipeline, 5)
+        speed.append(-float(state.velocity[:, 2].mean()))
+    assert speed[0] == pytest.approx(9.8 * 0.2, rel=1e-4)
+    assert speed[1] < 0.9 * speed[0]
+
+
+def test_a_solver_can_serve_two_pipelines(make_pipeline):
+    """Boundaries stay as they were given, in scene units."""
+    one = make_pipeline()
+    given = list(one.solver.boundaries)
+    one.start()
+    two = SimulationPipeline(one.scene, one.solver, one.wind, one.aero, None, one.camera)
+    two.start()
+    assert list(two.solver.boundaries) == given
+
+
+def test_a_grid_that_was_outrun_is_enlarged(make_pipeline):
+    """A strong wind takes an unpinned flag farther in one frame than its speed at the start foretells."""
+    pipeline = make_pipeline(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
+    state, _ = _advance(pipeline, 3)
+    assert not bool(state.lost.any())
+    assert float((state.position - pipeline.scene.points.position).norm(dim=-1).max()) > 0.1
 
 
 def test_the_wind_blows_the_flag_its_way(make_pipeline):
@@ -181,11 +211,11 @@ def test_the_camera_orbits_the_object_in_scene_units(up, make_cloud, make_pipeli
 def test_a_camera_inside_the_object_is_an_error(make_cloud, make_pipeline):
     inside = make_pipeline(make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 0.5], target=[2.0, 0.5, 0.5]))
     with pytest.raises(ValueError, match=r"camera at \[0.5, 0.5, 0.5\] lies inside the object"):
-        inside.camera_at(0)
+        inside.check_camera(0)
     outside = make_pipeline(
         make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 3.0], target=[0.5, 0.4, 0.5])
     )
-    outside.camera_at(0)
+    outside.check_camera(0)
 
 
 # ---- colours

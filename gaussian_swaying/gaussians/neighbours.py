@@ -1,0 +1,90 @@
+"""Nearest neighbours in plain torch, on grids that coarsen."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Distances and indices of the nearest points, exact and deterministic, computed on the CPU.
+
+    A query is settled on the first grid whose 27 cells around it hold enough points within one cell size; only those
+    not settled yet go on to the grid of twice the cell size. Memory is bounded by chunks of candidate pairs.
+
+    Args:
+        points: Points to find, shape (N, 3).
+        count: How many to find for each query, at most N (N - 1 without ``queries``).
+        queries: Where to search from, shape (M, 3); None for the points themselves, each without itself.
+
+    Returns:
+        Distances, ascending, and indices, each of shape (M, count).
+    """
+    points = points.detach().cpu()
+    own = queries is None
+    places = points if queries is None else queries.detach().cpu().to(points.dtype)
+    both = points if queries is None else torch.cat([points, places])
+    distance = torch.empty(len(places), count, dtype=points.dtype)
+    index = torch.empty(len(places), count, dtype=torch.long)
+    if len(places) == 0:
+        return distance, index
+    low = both.amin(0)
+    extent = max(float((both.amax(0) - low).amax()), torch.finfo(points.dtype).tiny * 1e20)
+    shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
+    pending = torch.arange(len(places))
+    level = _first_level(points, low, extent)
+    while len(pending):
+        size = extent * 2.0**-level
+        key, order = _cell_key(((points - low) / size).floor().long()).sort(stable=True)
+        wanted = _cell_key(((places[pending] - low) / size).floor().long()[:, None] + shifts)
+        begin = torch.searchsorted(key, wanted)
+        length = torch.searchsorted(key, wanted, right=True) - begin
+        candidates = length.sum(-1)
+        last = level <= 0
+        keep = torch.nonzero(candidates >= count + own).squeeze(-1)
+        keep = keep[candidates[keep].argsort(stable=True)]  # rows of one chunk need about the same width
+        settled = torch.zeros(len(pending), dtype=torch.bool)
+        start = 0
+        while start < len(keep):
+            width = max(1, 4_000_000 // int(candidates[keep[min(start + 20_000, len(keep) - 1)]]))
+            rows = keep[start : start + min(width, 20_000)]
+            start += len(rows)
+            query = pending[rows]
+            itself = query if own else torch.full_like(query, -1)
+            near, who = _nearest_among(points, places[query], itself, order, begin[rows], length[rows], count)
+            done = torch.ones(len(rows), dtype=torch.bool) if last else near[:, -1] <= size
+            distance[query[done]], index[query[done]] = near[done], who[done]
+            settled[rows[done]] = True
+        pending = pending[~settled]
+        level -= 1
+    return distance, index
+
+
+def _first_level(points: Tensor, low: Tensor, extent: float) -> int:
+    """The coarsest grid, as halvings of the extent, with at most 32 points in a cell; none is finer than 2^-40."""
+    for level in range(1, 40):
+        cells = ((points - low) / (extent * 2.0**-level)).floor().long()
+        if int(_cell_key(cells).unique(return_counts=True)[1].max()) <= 32:
+            return level
+    return 40
+
+
+def _cell_key(cells: Tensor) -> Tensor:
+    """One number per cell (..., 3); cells 2^20 apart share it, which only adds candidates that are too far away."""
+    x, y, z = (cells & (2**20 - 1)).unbind(-1)
+    return (x << 40) | (y << 20) | z
+
+
+def _nearest_among(
+    points: Tensor, place: Tensor, itself: Tensor, order: Tensor, begin: Tensor, length: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
+    """The nearest of the points in 27 runs (B, 27) of ``order`` for each place (B, 3), other than ``itself`` (B,)."""
+    ends = length.cumsum(-1)
+    column = torch.arange(int(ends[:, -1].max()))
+    run = torch.searchsorted(ends, column.expand(len(place), -1).contiguous(), right=True).clamp_max(26)
+    at = begin.gather(-1, run) + column - (ends - length).gather(-1, run)
+    who = order[at.clamp_max(len(points) - 1)]
+    squared = (points[who] - place[:, None]).square().sum(-1)
+    squared = squared.masked_fill((column >= ends[:, -1:]) | (who == itself[:, None]), torch.inf)
+    nearest, chosen = squared.topk(count, dim=-1, largest=False, sorted=True)
+    return nearest.sqrt(), who.gather(-1, chosen)

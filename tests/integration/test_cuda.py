@@ -1,0 +1,64 @@
+"""The main job on a GPU: the same command, the same motion, resumed there too."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.boundary import EnclosingBox, PinnedRegion, Plane
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.config import main
+from gaussian_swaying.simulation.recorder import load_trajectory
+
+pytestmark = pytest.mark.gpu
+FLAG = str(Path(__file__).resolve().parents[2] / "configs" / "sim" / "flag.yaml")
+SMALL = ["--config", FLAG, "--scene.generator.init_args.spacing", "0.05", "--solver.dx", "0.1", "--camera.width", "64"]
+
+
+def _run(folder, device, frames, *more):
+    assert main([*SMALL, "--device", device, "--frames", str(frames), "--output", str(folder), *more]) == 0
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_same_motion_as_on_the_cpu_and_a_gpu_is_found_without_asking(tmp_path):
+    on_gpu = _run(tmp_path / "gpu", "auto", 6)
+    assert on_gpu["device"] == torch.cuda.get_device_name()
+    assert on_gpu["peak_memory_bytes"]["device"] > 0
+    on_cpu = _run(tmp_path / "cpu", "cpu", 6)
+    assert on_cpu["substeps"] == on_gpu["substeps"]
+    ends = [load_trajectory(tmp_path / name / "trajectory.npz", 5)[0] for name in ("gpu", "cpu")]
+    # float32 round-off over 300 substeps of a stable motion
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-3)
+    assert (tmp_path / "gpu" / "video.mp4").stat().st_size > 1000
+
+
+def test_resume(tmp_path):
+    _run(tmp_path / "run", "cuda", 3)
+    resumed = _run(tmp_path / "run", "cuda", 6, "--resume")
+    whole = _run(tmp_path / "whole", "cuda", 6)
+    assert resumed["frames"] == whole["frames"] == 6
+    ends = [load_trajectory(tmp_path / name / "trajectory.npz", 5)[0] for name in ("run", "whole")]
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_step_never_makes_the_host_wait(formulation):
+    points = MaterialPoints.create(
+        torch.rand(500, 3, device="cuda"), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
+    )
+    boundaries = [
+        PinnedRegion(Box([None, None, 0.8], [None, None, None])),
+        Plane([0, 0, -1], [0, 0, 1]),
+        EnclosingBox([-2, -2, -2], [3, 3, 3]),
+    ]
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=boundaries).to("cuda")
+    state = solver.step(solver.init_state(points), 1e-4)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        end = solver.step(state, 1e-4, torch.zeros(500, 3, device="cuda"))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert bool(torch.isfinite(end.position).all())
