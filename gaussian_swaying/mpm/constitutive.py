@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from gaussian_swaying.mpm.linalg import cofactor, determinant, polar_rotation
+from gaussian_swaying.mpm.linalg import cofactor, determinant, matmul3, polar_rotation
 
 
 def lame_parameters(youngs_modulus: Tensor, poisson_ratio: Tensor) -> tuple[Tensor, Tensor]:
@@ -58,4 +58,4 @@ def fixed_corotated_kirchhoff(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     Returns:
         Symmetric, shape (..., 3, 3).
     """
-    return fixed_corotated_pk1(F, mu, lam) @ F.mT
+    return matmul3(fixed_corotated_pk1(F, mu, lam), F.mT)

@@ -18,6 +18,11 @@ def cofactor(matrix: Tensor) -> Tensor:
     return torch.linalg.cross(matrix.roll(-1, -2), matrix.roll(-2, -2), dim=-1)
 
 
+def matmul3(a: Tensor, b: Tensor) -> Tensor:
+    """Product of 3x3 matrices (..., 3, 3), ten times faster on a GPU than its batched product of small matrices."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
 def determinant(matrix: Tensor, cofactors: Tensor | None = None) -> Tensor:
     """Determinant of 3x3 matrices (..., 3, 3), from the cofactors if they are at hand; shape (...)."""
     cofactors = cofactor(matrix) if cofactors is None else cofactors
@@ -31,7 +36,8 @@ def polar_rotation(matrix: Tensor, iterations: int = 5) -> Tensor:
     :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F / \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar
     decomposition - with applications"). It converges quadratically to the nearest orthogonal matrix. Where that is a
     reflection (an inverted element), its axis of smallest stretch is turned round, which gives the nearest rotation
-    (Irving, Teran & Fedkiw 2004). The gradient is finite at F = I, unlike that of an SVD.
+    (Irving, Teran & Fedkiw 2004); that axis counts as constant in the gradient. The gradient is finite at F = I, unlike
+    that of an SVD.
 
     Args:
         matrix: Shape (..., 3, 3). A singular matrix gives a finite result that need not be orthogonal.
@@ -53,22 +59,32 @@ def polar_rotation(matrix: Tensor, iterations: int = 5) -> Tensor:
         zeta = ratio.clamp(min=tiny).pow(0.25)
         x = 0.5 * (zeta * x + inverse_transpose / zeta)
     reflected = (determinant(x) < 0)[..., None, None]
-    # the identity stands in for proper rotations, so that their gradient stays clean
-    stretch = torch.where(reflected, x.mT @ matrix, torch.eye(3, dtype=x.dtype, device=x.device))
-    axis = _weakest_axis(0.5 * (stretch + stretch.mT))
-    return torch.where(reflected, x - 2 * (x @ axis) @ axis.mT, x)
+    # the identity stands in for proper rotations, so that nothing odd happens to them
+    stretch = torch.where(reflected, matmul3(x.mT, matrix), torch.eye(3, dtype=x.dtype, device=x.device))
+    axis = _weakest_axis(0.5 * (stretch + stretch.mT)).detach()
+    turned = x - 2 * (x * axis[..., None, :]).sum(-1, keepdim=True) * axis[..., None, :]
+    return torch.where(reflected, turned, x)
 
 
 def _weakest_axis(stretch: Tensor) -> Tensor:
-    """Unit eigenvector (..., 3, 1) of the smallest eigenvalue of positive semidefinite matrices (..., 3, 3)."""
-    power = cofactor(stretch)  # its largest eigenvalue belongs to that vector
-    tiny = torch.finfo(stretch.dtype).tiny ** 0.25
-    for _ in range(6):
-        power = power / power.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=tiny)
-        power = power @ power
-    column = power.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None].expand(*power.shape[:-1], 1)
-    vector = power.gather(-1, column)
-    return vector / torch.linalg.vector_norm(vector, dim=-2, keepdim=True).clamp(min=tiny)
+    """Unit eigenvector (..., 3) of the smallest eigenvalue of positive semidefinite matrices (..., 3, 3)."""
+    eye = torch.eye(3, dtype=stretch.dtype, device=stretch.device)
+    shifted = stretch - symmetric_eigenvalues(stretch)[..., 2, None, None] * eye
+    tiny = torch.finfo(stretch.dtype).eps * (1 + stretch.abs().amax((-1, -2)))[..., None]
+    # the cofactors of a matrix of rank two are the outer product of its null vector; at rank one or less, where the
+    # eigenvalue is repeated, any vector orthogonal to the largest row will do
+    vector = _largest_row(cofactor(shifted))
+    row = _largest_row(shifted)
+    across = torch.linalg.cross(row, eye[row.abs().argmin(-1)], dim=-1)
+    size, width = (torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (vector, across))
+    fallback = torch.where(width > tiny, across / width.clamp(min=tiny), eye[2])
+    return torch.where(size > tiny * row.abs().amax(-1, keepdim=True), vector / size.clamp(min=tiny * tiny), fallback)
+
+
+def _largest_row(matrix: Tensor) -> Tensor:
+    """The row (..., 3) of largest norm."""
+    index = matrix.square().sum(-1).argmax(-1)[..., None, None].expand(*matrix.shape[:-2], 1, 3)
+    return matrix.gather(-2, index).squeeze(-2)
 
 
 def symmetric_eigenvalues(matrix: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from gaussian_swaying.mpm.constitutive import (
     fixed_corotated_pk1,
     lame_parameters,
 )
+from gaussian_swaying.mpm.linalg import matmul3
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather, scatter, scatter_momentum
@@ -342,13 +343,13 @@ class MPMSolver(nn.Module):
         lost = state.lost | ~stencil.inside
         identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         update = identity + dt * gradient
-        F = update @ state.F_elastic
+        F = matmul3(update, state.F_elastic)
         return state.replace(
             position=state.position + dt * new_velocity,
             velocity=new_velocity,
             affine=affine,
             F_elastic=F,
-            F_total=F if state.F_total is state.F_elastic else update @ state.F_total,
+            F_total=F if state.F_total is state.F_elastic else matmul3(update, state.F_total),
             lost=lost,
             time=state.time + dt,
         )

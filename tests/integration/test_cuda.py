@@ -15,7 +15,10 @@ from gaussian_swaying.simulation.recorder import load_trajectory
 
 pytestmark = pytest.mark.gpu
 FLAG = str(Path(__file__).resolve().parents[2] / "configs" / "sim" / "flag.yaml")
+BOX = '{"class_path": "Box", "init_args": {"min": [null, null, null], "max": [0.03, null, null]}}'
+POLE = f'[{{"class_path": "PinnedRegion", "init_args": {{"region": {BOX}}}}}]'
 SMALL = ["--config", FLAG, "--scene.generator.init_args.spacing", "0.05", "--solver.dx", "0.1", "--camera.width", "64"]
+SMALL += ["--solver.boundaries", POLE]
 
 
 def _run(folder, device, frames, *more):
