@@ -181,12 +181,11 @@ class MPMSolver(nn.Module):
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
+        self._acting = self.boundaries
         if frame is not None:
-            self._acting = nn.ModuleList([b.in_frame(frame) for b in _conditions(self.boundaries)]).to(
-                points.position.device
-            )
-        else:
-            self._acting = self.boundaries
+            self._acting = nn.ModuleList([b.in_frame(frame) for b in _conditions(self.boundaries)])
+        self._points = None
+        self.to(points.position.device)  # the solver goes where its material is
         self._bind(points)
         position = points.position
         if velocity is None:

@@ -57,7 +57,7 @@ def test_a_step_never_makes_the_host_wait(formulation):
         Plane([0, 0, -1], [0, 0, 1]),
         EnclosingBox([-2, -2, -2], [3, 3, 3]),
     ]
-    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=boundaries).to("cuda")
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=boundaries)
     state = solver.step(solver.init_state(points), 1e-4)
     torch.cuda.set_sync_debug_mode("error")
     try:
