@@ -4,7 +4,7 @@ import os
 import sys
 
 # How long OpenMP's threads spin before they sleep. The default, much longer, is no faster on a quiet machine, but makes
-# a run a hundred times slower as soon as another program wants a core. Read once, so set before torch is imported.
+# a run tens of times slower as soon as another program wants a core. Read once, so set before torch is imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 from gaussian_swaying.simulation.config import main

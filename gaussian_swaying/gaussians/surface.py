@@ -167,11 +167,7 @@ def deform_normal(deformation_gradient: Tensor, normals: Tensor) -> Tensor:
         ValueError: If a tensor does not have the shape above.
     """
     cof, vector = _cofactor_times(deformation_gradient, normals)
-    vector = torch.where(determinant(deformation_gradient, cof)[..., None] < 0, -vector, vector)
-    largest = vector.detach().abs().amax(-1, keepdim=True)
-    flat = largest == 0
-    vector = torch.where(flat, normals, vector / torch.where(flat, 1, largest))  # scaled: squares cannot underflow
-    return vector / vector.square().sum(-1, keepdim=True).sqrt()
+    return _unit_normal(vector, determinant(deformation_gradient, cof), normals)
 
 
 def deform_area(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -> Tensor:
@@ -191,12 +187,40 @@ def deform_area(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) ->
     return _cofactor_times(deformation_gradient, normals)[1].norm(dim=-1) * areas
 
 
+def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals and areas after a deformation: :func:`deform_normal` and :func:`deform_area` from one cofactor matrix.
+
+    Args:
+        deformation_gradient: Total deformation gradient F, shape (..., 3, 3).
+        normals: Unit normals N at rest, shape (..., 3).
+        areas: Areas A at rest [scene units^2], shape (...).
+
+    Returns:
+        Shapes (..., 3) and (...).
+
+    Raises:
+        ValueError: If a tensor does not have the shape above.
+    """
+    cof, vector = _cofactor_times(deformation_gradient, normals)
+    normal = _unit_normal(vector, determinant(deformation_gradient, cof), normals)
+    return normal, vector.norm(dim=-1) * areas
+
+
+def _unit_normal(vector: Tensor, determinants: Tensor, normals: Tensor) -> Tensor:
+    """F^-T N made unit from cof(F) N (..., 3) and det F (...); the normals at rest where that is zero."""
+    vector = torch.where(determinants[..., None] < 0, -vector, vector)
+    largest = vector.detach().abs().amax(-1, keepdim=True)
+    flat = largest == 0
+    vector = torch.where(flat, normals, vector / torch.where(flat, 1, largest))  # scaled: squares cannot underflow
+    return vector / vector.square().sum(-1, keepdim=True).sqrt()
+
+
 def _cofactor_times(deformation_gradient: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
     """The cofactors of F (..., 3, 3) and their product with N (..., 3)."""
     check_shape("deformation_gradient", deformation_gradient, 3, 3)
     check_shape("normals", normals, 3)
     cof = cofactor(deformation_gradient)
-    return cof, (cof @ normals[..., None]).squeeze(-1)
+    return cof, (cof * normals[..., None, :]).sum(-1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,7 +32,7 @@ def render_gsplat(
 ) -> RenderOutput:
     """Draw Gaussians with ``gsplat.rasterization`` (Ye et al. 2025, arXiv 2409.06765) in float32.
 
-    gsplat compiles its kernels at the first call, which takes minutes once.
+    gsplat compiles its kernels at the first call, see :func:`gsplat_works`.
 
     Args:
         means: Centres [scene units], on a CUDA device, shape (N, 3).

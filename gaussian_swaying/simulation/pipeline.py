@@ -20,7 +20,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.force import AeroForce, drag_rate
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_area, deform_normal
+from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
@@ -94,8 +94,7 @@ class SimulationPipeline(nn.Module):
 
     def force(self, state: MPMState, wind: Tensor) -> Tensor:
         """Wind force on every particle [N], shape (..., P, 3), at an air velocity [m/s] of shape (3,)."""
-        normal = deform_normal(state.F_total, self.scene.patch_normal)
-        area = deform_area(state.F_total, self.scene.patch_normal, self.scene.patch_area)
+        normal, area = deform_patch(state.F_total, self.scene.patch_normal, self.scene.patch_area)
         return self.aero(wind, state.velocity, normal, area)
 
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
@@ -133,9 +132,7 @@ class SimulationPipeline(nn.Module):
                     steps = int(steps * min(growth * 1.1, 4.0)) + 1
         except (FloatingPointError, ValueError) as error:
             # a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN
-            cause = str(error).rstrip(".")
-            remedy = "follow it, or lower `solver.cfl` and weaken what drives the object"
-            raise SimulationDiverged(float(state.time), None, cause, remedy) from error
+            self._give_up(state, str(error).rstrip("."))
         check_state(self.solver, end)
         if not cfl <= MAX_CFL:
             self._give_up(
@@ -190,7 +187,7 @@ class SimulationPipeline(nn.Module):
         """
         if isinstance(self.camera, TransformsCamera):
             return
-        camera, (low, high) = self.camera_at(frame), self.scene.bounds()
+        camera, (low, high) = self.camera_at(frame), self.scene.bounds
         eye = camera.position.to(low)
         if bool(((eye > low) & (eye < high)).all()):
             raise ValueError(

@@ -136,6 +136,12 @@ class SimulatedScene(nn.Module):
         material: What they are made of.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
         dtype: Precision of the simulation.
+
+    Attributes:
+        points: The material, for the solver.
+        frame: Scene units to metres.
+        bounds: Smallest and largest corner of the simulated part at rest [scene units].
+        size: Its longest side [scene units].
     """
 
     def __init__(self, scene: Scene, material: Material, dx: float, dtype: torch.dtype = torch.float32) -> None:
@@ -149,6 +155,10 @@ class SimulatedScene(nn.Module):
         self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
+        means = cloud.means[simulated]
+        self.bounds = (means.amin(0), means.amax(0))
+        largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
+        self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
         normals = self.model.normals()
         areas = GaussianSurfaceModel.from_cloud(cloud.select(chosen), requires_grad=False).areas(scene.area)
         self.register_buffer("simulated", simulated)
@@ -198,18 +208,6 @@ class SimulatedScene(nn.Module):
     def center(self) -> Tensor:
         """Centre of the simulated part at rest, scene units, shape (3,)."""
         return self.frame.origin
-
-    @property
-    def size(self) -> float:
-        """Longest side of the simulated part at rest, scene units."""
-        low, high = self.bounds()
-        largest = self.model.scales[self.simulated].amax().exp()  # a single Gaussian has a size too
-        return max(float((high - low).amax()), float(largest))
-
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        """Smallest and largest corner of the simulated part at rest, scene units, each of shape (3,)."""
-        means = self.model.means[self.simulated]
-        return means.amin(0), means.amax(0)
 
     def rest(self) -> DeformedGaussians:
         """The Gaussians at rest."""

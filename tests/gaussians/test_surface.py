@@ -15,6 +15,7 @@ from gaussian_swaying.gaussians.surface import (
     deform_area,
     deform_covariance,
     deform_normal,
+    deform_patch,
     quat_to_rotation,
     rotation_to_quat,
     smallest_axis_normal,
@@ -126,6 +127,9 @@ def test_deformed_normal_and_area_match_a_mapped_plane():
     torch.testing.assert_close(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), rtol=0, atol=1e-8)
     area = torch.rand(30, dtype=torch.float64)
     torch.testing.assert_close(deform_area(f, normal, area), cross.norm(dim=-1) * area, rtol=1e-7, atol=0)
+    both = deform_patch(f, normal, area)
+    assert torch.equal(both[0], deform_normal(f, normal))
+    assert torch.equal(both[1], deform_area(f, normal, area))
 
 
 def test_deformed_normal_matches_the_inverse(device, dtype):

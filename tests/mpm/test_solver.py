@@ -140,6 +140,25 @@ def test_batch_equals_scenes_alone(formulation, device):
             torch.testing.assert_close(state.F_total[i, j], end.F_total, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_each_particle_has_its_own_material(formulation):
+    """Two blocks far apart in one run, of different E, nu and density, move as each does alone."""
+    parts, ends = [], []
+    for shift, e, nu, density in ((0.0, 1e4, 0.2, 50.0), (2.0, 4e4, 0.45, 200.0)):
+        position = _block(count=60).position + torch.tensor([shift, 0.0, 0.0], dtype=torch.float64)
+        part = MaterialPoints.create(position, volume=1e-3, density=density, youngs_modulus=e, poisson_ratio=nu)
+        parts.append(part)
+        alone = MPMSolver(dx=0.1, formulation=formulation)
+        velocity = 0.5 * (position - position.mean(0))
+        ends.append(alone.rollout(alone.init_state(part, velocity), 5e-4, 40).F_elastic)
+    fields = [torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(MaterialPoints)]
+    together = MPMSolver(dx=0.1, formulation=formulation)
+    velocity = torch.cat([0.5 * (part.position - part.position.mean(0)) for part in parts])
+    end = together.rollout(together.init_state(MaterialPoints(*fields), velocity), 5e-4, 40)
+    torch.testing.assert_close(end.F_elastic, torch.cat(ends), rtol=0, atol=1e-11)
+    assert float((ends[0] - ends[1]).abs().max()) > 1e-4
+
+
 def test_formulations_agree_on_a_vibrating_block():
     """A free block in its first stretching mode, over most of a period, within the discretisation error of either."""
     axis = (torch.arange(12, dtype=torch.float64) + 0.5) / 30

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, deform_area, deform_normal
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, deform_patch
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -42,7 +42,7 @@ def _fly(formulation, law, wind, gravity, seconds):
         steps = solver.substeps(state, 0.04)
         state = solver.fit_grid(state, 0.04)
         for _ in range(steps):
-            n, a = deform_normal(state.F_total, normal), deform_area(state.F_total, normal, area)
+            n, a = deform_patch(state.F_total, normal, area)
             state = solver.step(state, 0.04 / steps, aero(flow, state.velocity, n, a))
     return float((points.mass * state.velocity[:, 1]).sum() / points.mass.sum())
 
