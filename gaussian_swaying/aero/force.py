@@ -83,7 +83,7 @@ def aero_force(
     return (0.5 * air_density) * area[..., None] * (pressure + shear + lifting)
 
 
-def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: float, air_density: float) -> Tensor:
+def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | float, air_density: float) -> Tensor:
     r"""Rate :math:`\rho A C v_r / m` [1/s] at which drag changes a patch's velocity; explicit steps need dt < 2 / rate.
 
     Args:
@@ -97,6 +97,24 @@ def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: float, air
         Shape (..., P).
     """
     return air_density * coefficient * area * speed / mass
+
+
+def semi_implicit(force: Tensor, rate: Tensor, dt: float) -> Tensor:
+    r"""A drag force as it acts over a substep that it slows the patch down in: stable however light the patch.
+
+    Drag taken at the end of the step, :math:`v^+ = (v + k u) / (1 + k)` with :math:`k = \Delta t\, \rho A C v_r / 2m`,
+    is the explicit step with the force divided by :math:`1 + k`. It differs from the explicit one by
+    O(:math:`\Delta t`).
+
+    Args:
+        force: Force [N], shape (..., P, 3).
+        rate: From :func:`drag_rate` [1/s], shape (..., P).
+        dt: Substep [s].
+
+    Returns:
+        Force [N], shape (..., P, 3).
+    """
+    return force / (1 + 0.5 * dt * rate)[..., None]
 
 
 class AeroForce(nn.Module):
@@ -113,6 +131,8 @@ class AeroForce(nn.Module):
         law: ``paper`` or ``projected``.
         lift_direction: ``side`` or ``lift``.
         unit_tangent: Normalise the tangential flow direction.
+        drag_step: ``explicit``, or ``semi_implicit`` (see :func:`semi_implicit`), which needs no shorter substep for
+            very light things in strong wind.
 
     Example:
         >>> aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=2.0)
@@ -130,9 +150,11 @@ class AeroForce(nn.Module):
         law: str = "paper",
         lift_direction: str = "side",
         unit_tangent: bool = False,
+        drag_step: str = "explicit",
     ) -> None:
         super().__init__()
         check_choice("law", law, LAWS)
+        check_choice("drag_step", drag_step, ("explicit", "semi_implicit"))
         check_choice("lift_direction", lift_direction, ("side", "lift"))
         for name, value in (("C_D", C_D), ("C_F", C_F), ("air_density", air_density)):
             check_positive(name, value, allow_zero=True)
@@ -145,14 +167,27 @@ class AeroForce(nn.Module):
         self.C_F: Tensor
         self.C_L: Tensor
         self.air_density, self.law = float(air_density), law
-        self.lift_direction, self.unit_tangent = lift_direction, unit_tangent
+        self.lift_direction, self.unit_tangent, self.drag_step = lift_direction, unit_tangent, drag_step
 
     @property
     def idle(self) -> bool:
         """Whether the force is zero whatever the wind, so that it need not be computed."""
         return self.air_density == 0 or not any(float(c) for c in (self.C_D, self.C_F, self.C_L))
 
-    def forward(self, wind: Tensor, velocity: Tensor, normal: Tensor, area: Tensor) -> Tensor:
+    def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
+        """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component."""
+        coefficient = (self.C_D + self.C_F + self.C_L.abs()).to(speed.dtype)
+        return drag_rate(speed, area, mass, coefficient, self.air_density)
+
+    def forward(
+        self,
+        wind: Tensor,
+        velocity: Tensor,
+        normal: Tensor,
+        area: Tensor,
+        mass: Tensor | None = None,
+        dt: float | None = None,
+    ) -> Tensor:
         """Force on each patch [N].
 
         Args:
@@ -160,11 +195,16 @@ class AeroForce(nn.Module):
             velocity: Patch velocity [m/s], shape (..., P, 3).
             normal: Unit normal of either sign, shape (..., P, 3).
             area: Patch area [m²], shape (..., P).
+            mass: Mass of the patch [kg], shape (..., P), for ``drag_step="semi_implicit"``.
+            dt: Substep [s], for the same.
 
         Returns:
             Shape (..., P, 3).
+
+        Raises:
+            ValueError: If ``drag_step`` is ``semi_implicit`` and ``mass`` or ``dt`` is missing.
         """
-        return aero_force(
+        force = aero_force(
             wind,
             velocity,
             normal,
@@ -177,6 +217,14 @@ class AeroForce(nn.Module):
             lift_direction=self.lift_direction,
             unit_tangent=self.unit_tangent,
         )
+        if self.drag_step == "explicit":
+            return force
+        if mass is None or dt is None:
+            raise ValueError(
+                'Expected `mass` and `dt` with `drag_step` "semi_implicit": give both, or set it to explicit.'
+            )
+        speed = torch.linalg.vector_norm(wind.to(velocity.dtype) - velocity, dim=-1)
+        return semi_implicit(force, self.rate(speed, area, mass), dt)
 
     def extra_repr(self) -> str:
         """Settings, for printing."""

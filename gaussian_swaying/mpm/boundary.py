@@ -2,6 +2,9 @@
 
 A condition changes nodal velocities after the momentum update. Where a node "is" depends on the formulation: a lattice
 point in ``updated``, the centre of the mass that it carries in ``total``.
+
+A condition that holds particles holds the nodes that carry them: in ``updated`` all that they touch, in ``total`` those
+in which they have more than a share of the mass.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -33,6 +37,36 @@ class FrameLike(Protocol):
     def direction_to_sim(self, directions: Tensor) -> Tensor:
         """Directions (..., 3) turned into the z-up frame."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """What a boundary may know about the grid nodes besides their velocity.
+
+    Attributes:
+        time: Time at the start of the substep [s], scalar float64 tensor.
+        dt: Substep [s].
+        position: Where the nodes are [m], shape (..., G, 3), for a boundary with ``needs_position``.
+        lattice: Where the lattice points are [m], shape (..., G, 3), for one with ``needs_lattice``: in ``total`` they
+            have moved with the material, and a velocity that is affine in them moves it rigidly up to its border.
+        share: Share of each node's mass that belongs to the particles of the boundary, shape (..., G), if it has any.
+        threshold: Share above which such a node is held.
+        held_mass: Mass of those particles [kg], shape (...).
+    """
+
+    time: Tensor
+    dt: float
+    position: Tensor | None = None
+    lattice: Tensor | None = None
+    share: Tensor | None = None
+    threshold: float = 0.0
+    held_mass: Tensor | None = None
+
+    @property
+    def held(self) -> Tensor:
+        """Nodes that the particles of the boundary hold, bool, shape (..., G)."""
+        assert self.share is not None
+        return self.share > self.threshold
 
 
 class RegionInFrame(Region):
@@ -93,11 +127,14 @@ class Boundary(nn.Module, ABC):
 
     Attributes:
         needs_position: Whether :meth:`forward` looks at where nodes are.
-        held_share: Share of a node's mass that must belong to the particles of :meth:`particle_mask`, or None if the
-            condition has no particles of its own.
+        needs_lattice: Whether it looks at where lattice points are.
+        held_share: Share of a node's mass above which the particles of :meth:`particle_mask` hold it in ``total``; None
+            if the condition acts on particles without holding nodes.
     """
 
     needs_position = False
+    needs_lattice = False
+    held_share: float | None = None
 
     def __init__(self, start: float = 0.0, end: float | None = None) -> None:
         super().__init__()
@@ -114,45 +151,33 @@ class Boundary(nn.Module, ABC):
         """Particles that the condition holds, from their rest positions (..., P, 3); None if it holds none."""
         return None
 
+    def release_time(self, rest_position: Tensor) -> Tensor | None:
+        """Time at which each particle is let go [s], shape (..., P); None if only ``end`` counts."""
+        return None
+
     def active(self, time: Tensor) -> Tensor:
         """Whether the condition acts at a time [s]; scalar bool tensor, so that no GPU has to wait."""
         return (time >= self.start) & (time < self.end)
 
     @abstractmethod
-    def forward(self, velocity: Tensor, position: Tensor | None, held: Tensor | None, time: Tensor) -> Tensor:
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Return the node velocity (..., G, 3) [m/s] with the condition applied.
 
         Args:
             velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
-            position: Where the nodes are [m], shape (..., G, 3), if ``needs_position``.
-            held: Nodes that the particles of the condition hold, bool, shape (..., G), if it has any.
-            time: Time [s], scalar tensor.
+            nodes: What else is known about them.
         """
 
 
-class PinnedRegion(Boundary):
-    """Holds the grid nodes of the particles whose rest position lies in a region.
+class _OfParticles(Boundary):
+    """Base of the conditions that act on the particles of a region, wherever they go."""
 
-    A pin that only reset its particles would let a sheet slide off, since their neighbours keep moving the shared
-    nodes. So the nodes are held: in ``updated`` all that the particles touch, in ``total`` those in which they hold
-    more than ``held_share`` of the mass.
-
-    Args:
-        region: Where the pinned particles rest, in scene units.
-        held_share: Share of the nodal mass in ``total``, between 0 and 1.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    def __init__(self, region: Region, held_share: float = 0.3, start: float = 0.0, end: float | None = None) -> None:
+    def __init__(self, region: Region, start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
-        if not 0 <= held_share < 1:
-            raise ValueError(f"Expected `held_share` to lie in [0, 1), but got {held_share}.")
         self.region = region
-        self.held_share = held_share
 
-    def in_frame(self, frame: FrameLike) -> PinnedRegion:
-        """The pin with its region asked in metres."""
+    def in_frame(self, frame: FrameLike) -> Boundary:
+        """The condition with its region asked in metres."""
         moved = copy.copy(self)
         moved.region = RegionInFrame(self.region, frame)
         return moved
@@ -167,16 +192,179 @@ class PinnedRegion(Boundary):
                 if isinstance(inner, RegionInFrame)
                 else _bounds(rest_position.reshape(-1, 3))
             )
+            name = type(self).__name__
             raise ValueError(
-                f"The pin {inner!r} holds no particle: the simulated particles lie between {where}; move or enlarge "
-                "`region` of the PinnedRegion."
+                f"The region {inner!r} of the {name} holds no particle: the simulated particles lie between {where}; "
+                "move or enlarge `region`."
             )
         return mask
 
-    def forward(self, velocity: Tensor, position: Tensor | None, held: Tensor | None, time: Tensor) -> Tensor:
+
+class PinnedRegion(_OfParticles):
+    """Holds the grid nodes of the particles whose rest position lies in a region.
+
+    A pin that only reset its particles would let a sheet slide off, since their neighbours keep moving the shared
+    nodes. So the nodes are held: in ``updated`` all that the particles touch, in ``total`` those in which they hold
+    more than ``held_share`` of the mass.
+
+    Args:
+        region: Where the pinned particles rest, in scene units.
+        held_share: Share of the nodal mass in ``total``, between 0 and 1.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    def __init__(self, region: Region, held_share: float = 0.3, start: float = 0.0, end: float | None = None) -> None:
+        super().__init__(region, start, end)
+        if not 0 <= held_share < 1:
+            raise ValueError(f"Expected `held_share` to lie in [0, 1), but got {held_share}.")
+        self.held_share = held_share
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Hold the nodes."""
-        assert held is not None
-        return torch.where((held & self.active(time))[..., None], torch.zeros_like(velocity), velocity)
+        return torch.where((nodes.held & self.active(nodes.time))[..., None], torch.zeros_like(velocity), velocity)
+
+
+class Handle(PinnedRegion):
+    """Moves the particles of a region as a rigid body: a pin that travels and turns.
+
+    Each substep takes the held nodes to exactly where the rigid motion has them at its end, so a handle that turns for
+    minutes neither grows nor drifts. Once the window closes it lets go.
+
+    Args:
+        region: Where the held particles rest, in scene units.
+        velocity: Velocity [m/s], z up.
+        angular_velocity: Axis of the rotation times its rate [rad/s], z up.
+        pivot: Point about which it turns, in scene units at time ``start``; it travels with ``velocity``.
+        held_share: Share of the nodal mass in ``total``, between 0 and 1.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+    """
+
+    needs_lattice = True
+
+    def __init__(
+        self,
+        region: Region,
+        velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        pivot: Sequence[float] = (0.0, 0.0, 0.0),
+        held_share: float = 0.3,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
+        super().__init__(region, held_share, start, end)
+        turn = check_vector("angular_velocity", angular_velocity)
+        self.rate = math.sqrt(sum(c * c for c in turn))
+        for name, value in (
+            ("velocity", check_vector("velocity", velocity)),
+            ("axis", [c / self.rate if self.rate > 0 else 0.0 for c in turn]),
+            ("pivot", check_vector("pivot", pivot)),
+        ):
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        self.velocity: Tensor
+        self.axis: Tensor
+        self.pivot: Tensor
+
+    def in_frame(self, frame: FrameLike) -> Handle:
+        """The handle with its region and pivot in metres."""
+        moved = copy.copy(self)
+        moved.region = RegionInFrame(self.region, frame)
+        moved._buffers = dict(self._buffers) | {"pivot": frame.point_to_sim(self.pivot)}
+        return moved
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        """Take the held nodes along."""
+        assert nodes.lattice is not None
+        driven = self.velocity.to(velocity).expand_as(velocity)
+        if self.rate > 0:
+            pivot = self.pivot + self.velocity * (nodes.time - self.start)
+            axis = self.axis.to(velocity).expand_as(velocity)
+            arm = nodes.lattice - pivot.to(velocity)
+            across = torch.linalg.cross(axis, arm, dim=-1)
+            # the chord of the arc (Rodrigues), not the tangent: the velocity whose explicit step ends on the circle
+            angle = self.rate * nodes.dt
+            inward = (2 * math.sin(angle / 2) ** 2 / nodes.dt) * torch.linalg.cross(axis, across, dim=-1)
+            driven = driven + (math.sin(angle) / nodes.dt) * across + inward
+        return torch.where((nodes.held & self.active(nodes.time))[..., None], driven, velocity)
+
+
+class SequentialRelease(PinnedRegion):
+    """Holds the particles of a region and lets them go one after the other, as a front passes over them.
+
+    Args:
+        region: Where the held particles rest, in scene units.
+        direction: Direction in which the front travels, in scene axes.
+        start: Time at which the front meets the first particle [s]; before it all are held.
+        end: Time at which it passes the last one [s].
+        held_share: Share of the nodal mass in ``total``, between 0 and 1.
+    """
+
+    def __init__(
+        self,
+        region: Region,
+        direction: Sequence[float] = (0.0, 0.0, 1.0),
+        start: float = 0.0,
+        end: float = 1.0,
+        held_share: float = 0.3,
+    ) -> None:
+        super().__init__(region, held_share, start, end)
+        if not math.isfinite(self.end):
+            raise ValueError(f"Expected `end` of the SequentialRelease to be a finite time, but got {end}.")
+        if not any(check_vector("direction", direction)):
+            raise ValueError("Expected `direction` of the SequentialRelease not to be zero.")
+        self.register_buffer("direction", torch.tensor([float(c) for c in direction], dtype=torch.float64))
+        self.direction: Tensor
+
+    def in_frame(self, frame: FrameLike) -> SequentialRelease:
+        """The release with its region and direction in metres, z up."""
+        moved = copy.copy(self)
+        moved.region = RegionInFrame(self.region, frame)
+        moved._buffers = dict(self._buffers) | {"direction": frame.direction_to_sim(self.direction)}
+        return moved
+
+    def release_time(self, rest_position: Tensor) -> Tensor:
+        """When the front passes each particle [s], shape (..., P), float64."""
+        mask = self.region.contains(rest_position)
+        along = (rest_position.double() * self.direction.to(rest_position.device)).sum(-1)
+        low = along.where(mask, math.inf).amin(-1, keepdim=True)
+        high = along.where(mask, -math.inf).amax(-1, keepdim=True)
+        part = (along - low) / (high - low).clamp(min=torch.finfo(torch.float64).tiny)
+        return self.start + part * (self.end - self.start)
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        """Hold the nodes of those not yet released."""
+        return torch.where(nodes.held[..., None], torch.zeros_like(velocity), velocity)
+
+
+class Impulse(_OfParticles):
+    """Pushes the particles of a region: a knock, or a force for some time.
+
+    The impulse is spread evenly over the window and over the mass of the region; it arrives whole whatever the substep.
+
+    Args:
+        region: Where the pushed particles rest, in scene units.
+        impulse: Impulse on the region as a whole [N s], z up.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s].
+    """
+
+    def __init__(self, region: Region, impulse: Sequence[float], start: float = 0.0, end: float = 0.04) -> None:
+        super().__init__(region, start, end)
+        if not math.isfinite(self.end):
+            raise ValueError(f"Expected `end` of the Impulse to be a finite time, but got {end}.")
+        self.register_buffer("impulse", torch.tensor(check_vector("impulse", impulse), dtype=torch.float64))
+        self.impulse: Tensor
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        """Add the part of the impulse that falls into the substep."""
+        assert nodes.share is not None
+        assert nodes.held_mass is not None
+        overlap = (nodes.time + nodes.dt).clamp(max=self.end) - nodes.time.clamp(min=self.start)
+        part = (overlap.clamp(min=0) / (self.end - self.start)).to(velocity)
+        # a scene of the batch without any such particle has no share to push
+        per_mass = nodes.share / nodes.held_mass.clamp(min=torch.finfo(velocity.dtype).tiny)[..., None]
+        return velocity + per_mass[..., None] * (part * self.impulse.to(velocity))
 
 
 class Plane(Boundary):
@@ -220,13 +408,13 @@ class Plane(Boundary):
         moved.point, moved.normal = frame.point_to_sim(self.point), frame.direction_to_sim(self.normal)
         return moved
 
-    def forward(self, velocity: Tensor, position: Tensor | None, held: Tensor | None, time: Tensor) -> Tensor:
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Stop the nodes at or behind the plane."""
-        assert position is not None
+        assert nodes.position is not None
         normal = self.normal.to(velocity)
-        behind = ((position - self.point.to(velocity)) * normal).sum(-1) <= 0
+        behind = ((nodes.position - self.point.to(velocity)) * normal).sum(-1) <= 0
         stopped = plane_velocity(velocity, normal, self.kind, self.friction)
-        return torch.where((behind & self.active(time))[..., None], stopped, velocity)
+        return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
 
 
 class EnclosingBox(Boundary):
@@ -270,10 +458,10 @@ class EnclosingBox(Boundary):
         moved._modules = {"planes": nn.ModuleList([p.in_frame(frame) for p in self.planes])}  # type: ignore[operator]
         return moved
 
-    def forward(self, velocity: Tensor, position: Tensor | None, held: Tensor | None, time: Tensor) -> Tensor:
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Stop the nodes at or beyond each face."""
         for plane in self.planes:
-            velocity = plane(velocity, position, held, time)
+            velocity = plane(velocity, nodes)
         return velocity
 
 
@@ -301,8 +489,8 @@ class VelocityBox(Boundary):
         moved.region = RegionInFrame(self.region, frame)
         return moved
 
-    def forward(self, velocity: Tensor, position: Tensor | None, held: Tensor | None, time: Tensor) -> Tensor:
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Drive the nodes inside."""
-        assert position is not None
-        inside = self.region.contains(position) & self.active(time)
+        assert nodes.position is not None
+        inside = self.region.contains(nodes.position) & self.active(nodes.time)
         return torch.where(inside[..., None], self.velocity.to(velocity), velocity)

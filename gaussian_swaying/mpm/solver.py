@@ -6,16 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
+import torch.utils.checkpoint
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
-from gaussian_swaying.mpm.boundary import Boundary, FrameLike
-from gaussian_swaying.mpm.constitutive import (
-    fixed_corotated_energy,
-    fixed_corotated_kirchhoff,
-    fixed_corotated_pk1,
-    lame_parameters,
-)
+from gaussian_swaying.mpm.boundary import Boundary, FrameLike, Nodes
+from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
+from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.linalg import matmul3
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
@@ -25,25 +22,30 @@ ForceFunction = Callable[[MPMState], Tensor]
 
 
 class MPMSolver(nn.Module):
-    """Material point method for elastic bodies, in two formulations over one set of transfers.
+    """Material point method in two formulations over one set of transfers.
 
     ``total`` (total Lagrangian MPM; de Vaucorbeil, Nguyen & Hutchinson 2020): stencils at the rest positions, computed
-    once; nodal displacement and velocity are the state. For things that keep their neighbours: flags, leaves, cords.
-    It cannot tear, and has no transfer dissipation.
+    once; nodal displacement and velocity are the state. For elastic things that keep their neighbours: flags, leaves,
+    cords. It cannot tear, and has no transfer dissipation.
 
     ``updated`` (the paper and PhysGaussian): stencils at the current positions, momentum on the particles (APIC, Jiang
-    et al. 2015). For material that mixes or touches itself. A soft sheet tears numerically once local stretch times
-    particle spacing nears two cells.
+    et al. 2015). For material that flows, mixes or touches itself; plastic laws and fluids need it. A soft sheet tears
+    numerically once local stretch times particle spacing nears two cells.
 
     Args:
         dx: Grid spacing [m].
         formulation: ``total`` or ``updated``.
         gravity: Acceleration [m/s²], z up.
         damping: Rate at which velocities decay [1/s]; 0 for none.
+        stiffness_damping: Time [s] by which the stress looks ahead: damps a vibration of circular frequency omega with
+            the ratio stiffness_damping * omega / 2, and rigid motion not at all; it shortens the stable substep.
         cfl: Courant number of the adaptive substep, ``dt = cfl dx / (c + |v|)``; up to 0.47 is stable near rest for any
             arrangement of particles and any Poisson's ratio.
         substep: Fixed substep [s] instead of the adaptive one; checked against the stable one.
         max_nodes: Largest grid [nodes]; an object that spreads beyond it is reported instead of eating the memory.
+        mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
+        deterministic: On a GPU, sum in a fixed order, so that the same run gives the same bits; slower. On a CPU it is
+            so anyway.
         boundaries: Boundary conditions, applied in order.
 
     Example:
@@ -62,20 +64,29 @@ class MPMSolver(nn.Module):
         formulation: str = "total",
         gravity: Sequence[float] = (0.0, 0.0, -9.8),
         damping: float = 0.0,
+        stiffness_damping: float = 0.0,
         cfl: float = 0.4,
         substep: float | None = None,
         max_nodes: int = 64_000_000,
+        mls: bool = False,
+        deterministic: bool = False,
         boundaries: Sequence[Boundary] = (),
     ) -> None:
         super().__init__()
         check_positive("dx", dx)
         check_choice("formulation", formulation, ("total", "updated"))
         check_positive("damping", damping, allow_zero=True)
+        check_positive("stiffness_damping", stiffness_damping, allow_zero=True)
+        if mls and formulation != "updated":
+            raise ValueError(
+                "`mls` is a variant of the updated formulation: set `formulation` to updated, or `mls` to false."
+            )
         check_positive("cfl", cfl)
         if substep is not None:
             check_positive("substep", substep)
         check_positive("max_nodes", max_nodes)
         self.dx, self.formulation, self.damping, self.cfl = float(dx), formulation, float(damping), float(cfl)
+        self.stiffness_damping, self.mls, self.deterministic = float(stiffness_damping), mls, deterministic
         self.substep, self.max_nodes = substep, int(max_nodes)
         self.gravity = check_vector("gravity", gravity)
         # float64 on the device: no copy in a step, full precision in a float64 run
@@ -84,6 +95,7 @@ class MPMSolver(nn.Module):
         self.boundaries = nn.ModuleList(boundaries)
         self._acting = self.boundaries  # the same, in metres
         self._points: MaterialPoints | None = None
+        self._laws: LawDispatch | None = None
         self._static: dict[str, Tensor] = {}
         self._stencil: Stencil | None = None
         self._grid = GridSpec(self.dx, (0, 0, 0), (0, 0, 0))
@@ -98,6 +110,13 @@ class MPMSolver(nn.Module):
         return self._points
 
     @property
+    def laws(self) -> LawDispatch:
+        """The laws of the material given to :meth:`init_state`, bound to its particles."""
+        if self._laws is None:
+            raise RuntimeError("The solver has no material yet: call `init_state(points)` first.")
+        return self._laws
+
+    @property
     def total_lagrangian(self) -> bool:
         """Whether stencils stay at the rest positions."""
         return self.formulation == "total"
@@ -109,39 +128,57 @@ class MPMSolver(nn.Module):
         return self
 
     def _bind(self, points: MaterialPoints) -> None:
-        """Take the material and compute what never changes: Lamé parameters and, in ``total``, stencil and mass."""
-        mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
-        self._points, self._static = points, {"mu": mu, "lam": lam}
-        masks = [b.particle_mask(points.position.detach()) for b in _conditions(self._acting)]
-        for k, mask in enumerate(masks):
-            if mask is not None:
-                self._static[f"pinned_mass_{k}"] = torch.where(mask, points.mass, 0.0)
-        if not self.total_lagrangian:
-            return
-        position = points.position.detach()
-        grid = self._bounding_grid(position, margin=0)
-        snap = torch.finfo(position.dtype).eps ** 0.5
-        stencil = bspline_stencil(position, grid, moments=False, snap=snap)
-        mass = scatter(stencil, points.mass[..., None, None])[..., 0]
-        self._stencil = stencil
-        self._static["node_mass"] = mass
-        self._static["node_inverse_mass"] = _safe_inverse(mass)
-        if any(b.needs_position for b in _conditions(self._acting)):
-            first_moment = scatter(stencil, (points.mass[..., None] * position)[..., None, :])
-            self._static["node_rest"] = first_moment * self._static["node_inverse_mass"][..., None]
-        for k, mask in enumerate(masks):
+        """Take the material and compute what never changes: its laws and, in ``total``, stencil and mass."""
+        self._points, self._laws, self._static = points, LawDispatch(points), {}
+        if self.total_lagrangian and self._laws.plastic:
+            raise ValueError(
+                f"The law {self._laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
+                "`solver.formulation` to updated, or choose an elastic law."
+            )
+        static, position, conditions = self._static, points.position, _conditions(self._acting)
+        for k, boundary in enumerate(conditions):
+            mask = boundary.particle_mask(position.detach())
             if mask is None:
                 continue
-            pinned = scatter(stencil, self._static.pop(f"pinned_mass_{k}")[..., None, None])[..., 0]
-            share = float(getattr(self._acting[k], "held_share", 0.0))
-            held = (pinned > share * mass) & (mass > 0)
-            if not bool(held.any()):
+            static[f"pinned_mass_{k}"] = torch.where(mask, points.mass, 0.0)
+            static[f"held_mass_{k}"] = static[f"pinned_mass_{k}"].sum(-1)
+            release = boundary.release_time(position.detach())
+            if release is not None:
+                static[f"release_{k}"] = release
+        if not self.total_lagrangian:
+            return
+        grid = self._bounding_grid(position, margin=0)
+        snap = torch.finfo(position.dtype).eps ** 0.5
+        stencil = bspline_stencil(position, grid, moments=False, snap=snap, deterministic=self.deterministic)
+        mass = scatter(stencil, points.mass[..., None, None])[..., 0]
+        self._stencil = stencil
+        static["node_mass"] = mass
+        static["node_inverse_mass"] = _safe_inverse(mass)
+        if any(b.needs_position for b in conditions):
+            first_moment = scatter(stencil, (points.mass[..., None] * position)[..., None, :])
+            static["node_rest"] = first_moment * static["node_inverse_mass"][..., None]
+        for k, boundary in enumerate(conditions):
+            if f"pinned_mass_{k}" not in static:
+                continue
+            share = self._share(k, stencil, static["node_inverse_mass"], None)
+            threshold = boundary.held_share
+            if threshold is not None and not bool((share > threshold).any()):
+                count = int((static[f"pinned_mass_{k}"] > 0).sum())
                 raise ValueError(
-                    f"The pin {k} holds {int(mask.sum())} particles but no grid node: none of them has more than "
-                    f"{share:g} of the mass of a node; enlarge `region` of the PinnedRegion or lower its `held_share`."
+                    f"The pin {k} holds {count} particles but no grid node: none of them has more than "
+                    f"{threshold:g} of the mass of a node; enlarge `region` of the {type(boundary).__name__} or lower "
+                    "its `held_share`."
                 )
-            self._static[f"held_{k}"] = held
+            if f"release_{k}" not in static:
+                static[f"share_{k}"] = share
         self._grid = grid
+
+    def _share(self, k: int, stencil: Stencil, inverse_mass: Tensor, time: Tensor | None) -> Tensor:
+        """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
+        mass = self._static[f"pinned_mass_{k}"]
+        if time is not None and f"release_{k}" in self._static:
+            mass = torch.where(self._static[f"release_{k}"] > time, mass, 0.0)
+        return scatter(stencil, mass[..., None, None])[..., 0] * inverse_mass
 
     def _bounding_grid(self, position: Tensor, margin: int) -> GridSpec:
         flat = position.detach().reshape(-1, 3)
@@ -177,7 +214,8 @@ class MPMSolver(nn.Module):
 
         Raises:
             TypeError: If ``points`` is not a MaterialPoints.
-            ValueError: If a pin holds nothing, the grid is too large or ``velocity`` has another shape.
+            ValueError: If a pin holds nothing, the grid is too large, ``velocity`` has another shape, or a plastic law
+                or a fluid meets the ``total`` formulation.
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
@@ -202,6 +240,7 @@ class MPMSolver(nn.Module):
             lost=torch.zeros(position.shape[:-1], dtype=torch.bool, device=position.device),
             time=torch.zeros((), dtype=torch.float64, device=position.device),
             grid=self._grid if self.total_lagrangian else self._bounding_grid(position, margin),
+            internal=self.laws.initial_internal(),
         )
         if not self.total_lagrangian:
             return state
@@ -214,8 +253,9 @@ class MPMSolver(nn.Module):
 
     def stable_substep(self, state: MPMState | None = None) -> float:
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
-        F = None if state is None else state.F_elastic.detach()
-        return float(stable_limit(self.points, self.dx, F, spatial=not self.total_lagrangian).amin())
+        F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
+        limit = stable_limit(self.points, self.dx, F, internal, spatial=not self.total_lagrangian)
+        return damped_substep(float(limit.amin()), self.stiffness_damping)
 
     def substeps(self, state: MPMState, frame_dt: float) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
@@ -232,12 +272,21 @@ class MPMSolver(nn.Module):
                 )
             steps = substeps_per_frame(frame_dt, self.substep, exact=True)
             return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
-        return substeps_per_frame(frame_dt, self.cfl / max(float(self.cfl_number(state, 1.0)), 1e-30), exact=False)
+        longest = self.cfl / max(float(self._cells_per_second(state)), 1e-30)
+        return substeps_per_frame(frame_dt, damped_substep(longest, self.stiffness_damping), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
-        """Largest Courant number ``dt (c + |v|) / dx`` of a substep; in ``total`` without v, as stencils rest."""
-        speed = wave_speed(self.points, state.F_elastic, spatial=not self.total_lagrangian)
-        return cfl_number(dt, self.dx, speed, None if self.total_lagrangian else state.velocity).detach()
+        """Largest Courant number ``dt (c + |v|) / dx`` of a substep; in ``total`` without v, as stencils rest.
+
+        With stiffness damping it is that of the undamped substep which is as stable.
+        """
+        return math.sqrt(dt * dt + 2 * self.stiffness_damping * dt) * self._cells_per_second(state)
+
+    def _cells_per_second(self, state: MPMState) -> Tensor:
+        """How many cells the fastest wave crosses in a second."""
+        F = state.F_elastic.detach()
+        speed = wave_speed(self.points, F, state.internal, spatial=not self.total_lagrangian)
+        return cfl_number(1.0, self.dx, speed, None if self.total_lagrangian else state.velocity).detach()
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
         """Move and resize the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
@@ -273,10 +322,33 @@ class MPMSolver(nn.Module):
         advance = self._step_total if self.total_lagrangian else self._step_updated
         return advance(state, dt, force)
 
-    def rollout(self, state: MPMState, dt: float, steps: int, force_fn: ForceFunction | None = None) -> MPMState:
-        """Advance by several substeps; ``force_fn(state)`` gives the force of each [N], shape (..., P, 3)."""
-        for _ in range(steps):
-            state = self.step(state, dt, None if force_fn is None else force_fn(state))
+    def rollout(
+        self, state: MPMState, dt: float, steps: int, force_fn: ForceFunction | None = None, checkpoint: int = 0
+    ) -> MPMState:
+        """Advance by several substeps.
+
+        Args:
+            state: The state now.
+            dt: Substep [s].
+            steps: Number of substeps.
+            force_fn: Gives the force of each substep [N], shape (..., P, 3), from its state.
+            checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
+                in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
+
+        Returns:
+            The state ``steps * dt`` later.
+        """
+
+        def advance(state: MPMState, count: int) -> MPMState:
+            for _ in range(count):
+                state = self.step(state, dt, None if force_fn is None else force_fn(state))
+            return state
+
+        if checkpoint <= 0:
+            return advance(state, steps)
+        for first in range(0, steps, checkpoint):
+            count = min(checkpoint, steps - first)
+            state = torch.utils.checkpoint.checkpoint(advance, state, count, use_reentrant=False)
         return state
 
     def _step_total(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
@@ -284,18 +356,24 @@ class MPMSolver(nn.Module):
         assert state.node_velocity is not None
         displacement = state.node_displacement
         assert displacement is not None
-        points, static = self.points, self._static
-        stress = fixed_corotated_pk1(state.F_elastic, static["mu"], static["lam"]) * points.volume[..., None, None]
+        points, static, laws = self.points, self._static, self.laws
+        F = state.F_elastic
+        stress = laws.pk1(F, None)
+        if self.stiffness_damping > 0:
+            stress = stress + kelvin_voigt_pk1(F, state.affine, laws.mu, laws.lam, self.stiffness_damping)
+        stress = stress * points.volume[..., None, None]
         value = torch.zeros_like(state.position) if force is None else force
         node_force = scatter(self._stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
         inverse_mass = static["node_inverse_mass"][..., None]
         velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, dt)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
-        position = None
+        position = lattice = None
         if "node_rest" in static:
             shift = (state.position - points.position) * points.mass[..., None]
             position = static["node_rest"] + scatter(self._stencil, shift[..., None, :]) * inverse_mass
-        velocity = self._constrain(velocity, position, lambda k: static.get(f"held_{k}"), state.time)
+        if any(b.needs_lattice for b in _conditions(self._acting)):
+            lattice = state.grid.node_positions(velocity) + displacement
+        velocity = self._constrain(velocity, self._stencil, inverse_mass[..., 0], position, lattice, state.time, dt)
         state = state.replace(time=state.time + dt)
         return self._read_particles(state, displacement + dt * velocity, velocity)
 
@@ -307,6 +385,7 @@ class MPMSolver(nn.Module):
         return state.replace(
             position=self.points.position + rows[..., 0, :3],
             velocity=rows[..., 0, 3:],
+            affine=rows[..., 1:4, 3:].mT,
             F_elastic=F,
             F_total=F,
             node_displacement=displacement,
@@ -314,9 +393,14 @@ class MPMSolver(nn.Module):
         )
 
     def _step_updated(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
-        points, static = self.points, self._static
-        stencil = bspline_stencil(state.position, state.grid)
-        stress = fixed_corotated_kirchhoff(state.F_elastic, static["mu"], static["lam"])
+        points, laws = self.points, self.laws
+        stencil = bspline_stencil(state.position, state.grid, gradients=not self.mls, deterministic=self.deterministic)
+        F = state.F_elastic
+        stress = laws.kirchhoff(F, state.internal)
+        if self.stiffness_damping > 0:
+            rate = matmul3(state.affine, F)
+            viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, self.stiffness_damping)
+            stress = stress + matmul3(viscous, F.mT)
         nodes = scatter_momentum(
             points.mass,
             state.velocity,
@@ -324,33 +408,32 @@ class MPMSolver(nn.Module):
             None if force is None else dt * force,
             dt * points.volume[..., None, None] * stress,
             stencil,
+            4.0 / self.dx**2 if self.mls else None,
         )
-        mass = nodes[..., 3]
-        inverse_mass = _safe_inverse(mass)[..., None]
+        inverse_mass = _safe_inverse(nodes[..., 3])[..., None]
         velocity = self._accelerate(nodes[..., :3] * inverse_mass, None, dt)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = None
-        if any(b.needs_position for b in _conditions(self._acting)):
+        if any(b.needs_position or b.needs_lattice for b in _conditions(self._acting)):
             position = state.grid.node_positions(velocity).expand_as(velocity)
-
-        def held(k: int) -> Tensor | None:
-            pinned = static.get(f"pinned_mass_{k}")
-            return None if pinned is None else scatter(stencil, pinned[..., None, None])[..., 0] > 0
-
-        velocity = self._constrain(velocity, position, held, state.time)
+        velocity = self._constrain(velocity, stencil, inverse_mass[..., 0], position, position, state.time, dt)
         new_velocity, affine, gradient = g2p(velocity, stencil, self.dx)
-        lost = state.lost | ~stencil.inside
         identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         update = identity + dt * gradient
-        F = matmul3(update, state.F_elastic)
+        F, internal = matmul3(update, F), state.internal
+        F_total = F
+        if laws.plastic:
+            F_total = matmul3(update, state.F_total)
+            F, internal = laws.return_map(F, internal, dt)
         return state.replace(
             position=state.position + dt * new_velocity,
             velocity=new_velocity,
             affine=affine,
             F_elastic=F,
-            F_total=F if state.F_total is state.F_elastic else matmul3(update, state.F_total),
-            lost=lost,
+            F_total=F_total,
+            lost=state.lost | ~stencil.inside,
             time=state.time + dt,
+            internal=internal,
         )
 
     def _accelerate(self, velocity: Tensor, acceleration: Tensor | None, dt: float) -> Tensor:
@@ -364,10 +447,25 @@ class MPMSolver(nn.Module):
         return velocity
 
     def _constrain(
-        self, velocity: Tensor, position: Tensor | None, held: Callable[[int], Tensor | None], time: Tensor
+        self,
+        velocity: Tensor,
+        stencil: Stencil,
+        inverse_mass: Tensor,
+        position: Tensor | None,
+        lattice: Tensor | None,
+        time: Tensor,
+        dt: float,
     ) -> Tensor:
-        for k, boundary in enumerate(self._acting):
-            velocity = boundary(velocity, position, held(k), time)
+        """Apply the boundary conditions to node velocities, in order."""
+        static = self._static
+        for k, boundary in enumerate(_conditions(self._acting)):
+            share = None
+            if f"pinned_mass_{k}" in static:
+                share = static.get(f"share_{k}")
+                share = self._share(k, stencil, inverse_mass, time) if share is None else share
+            threshold = (boundary.held_share or 0.0) if self.total_lagrangian else 0.0
+            held_mass = static.get(f"held_mass_{k}")
+            velocity = boundary(velocity, Nodes(time, dt, position, lattice, share, threshold, held_mass))
         return velocity
 
     def energies(self, state: MPMState) -> dict[str, Tensor]:
@@ -379,13 +477,27 @@ class MPMSolver(nn.Module):
             # lumped APIC kinetic energy: the affine part carries D = dx²/4 per particle (Jiang et al. 2015)
             spread = 0.25 * self.dx**2 * state.affine.square().sum((-1, -2))
             kinetic = 0.5 * (points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
-        density = fixed_corotated_energy(state.F_elastic, self._static["mu"], self._static["lam"])
+        density = self.laws.energy(state.F_elastic, state.internal)
         height = (state.position * self._gravity.to(state.position)).sum(-1)
         return {
             "kinetic": kinetic,
             "elastic": (points.volume * density).sum(-1),
             "potential": -(points.mass * height).sum(-1),
         }
+
+    def momenta(self, state: MPMState) -> dict[str, Tensor]:
+        """Linear [kg m/s] and angular momentum about the origin [kg m²/s], each of shape (..., 3)."""
+        if state.node_velocity is not None:
+            assert state.node_displacement is not None
+            momentum = self._static["node_mass"][..., None] * state.node_velocity
+            place = state.grid.node_positions(momentum) + state.node_displacement
+            return {"linear": momentum.sum(-2), "angular": torch.linalg.cross(place, momentum, dim=-1).sum(-2)}
+        momentum = self.points.mass[..., None] * state.velocity
+        # what the affine velocity adds: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)
+        spin = state.affine * (self.points.mass * self.dx**2 / 4)[..., None, None]
+        own = torch.stack([spin[..., i, j] - spin[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
+        angular = torch.linalg.cross(state.position, momentum, dim=-1) + own
+        return {"linear": momentum.sum(-2), "angular": angular.sum(-2)}
 
     def extra_repr(self) -> str:
         """Settings, for printing."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_finite, check_shape
+from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +62,10 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
     return GridSpec(dx, (offset[0], offset[1], offset[2]), (resolution[0], resolution[1], resolution[2]))
 
 
+_DEFAULT: tuple[ConstitutiveLaw, ...] = (FixedCorotated(),)
+_FIELDS = ("mass", "volume", "youngs_modulus", "poisson_ratio")
+
+
 @dataclass(frozen=True, slots=True)
 class MaterialPoints:
     """The material at rest: what the solver moves, and never changes itself.
@@ -73,6 +78,8 @@ class MaterialPoints:
         volume: Rest volume [m³], shape (..., P).
         youngs_modulus: Young's modulus E [Pa], shape (..., P).
         poisson_ratio: Poisson's ratio nu, shape (..., P).
+        laws: The constitutive laws of the run.
+        law_index: Which of ``laws`` holds for each particle, int64, shape (..., P); None if there is only one.
     """
 
     position: Tensor
@@ -80,16 +87,24 @@ class MaterialPoints:
     volume: Tensor
     youngs_modulus: Tensor
     poisson_ratio: Tensor
+    laws: tuple[ConstitutiveLaw, ...] = _DEFAULT
+    law_index: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("position", self.position, "P", 3)
         batch = tuple(self.position.shape[:-1])
-        for name in ("mass", "volume", "youngs_modulus", "poisson_ratio"):
+        for name in (*_FIELDS, *(["law_index"] if self.law_index is not None else [])):
             value = getattr(self, name)
             if tuple(value.shape) != batch:
                 raise ValueError(f"Expected `{name}` of shape {batch}, but got {tuple(value.shape)}.")
             check_finite(name, value)
         check_finite("position", self.position)
+        if (self.law_index is None) != (len(self.laws) == 1):
+            raise ValueError(
+                f"Expected `law_index` to say which of the {len(self.laws)} `laws` holds for each particle."
+                if self.law_index is None
+                else f"Expected several `laws` beside `law_index`, but got {len(self.laws)}."
+            )
 
     @classmethod
     def create(
@@ -100,6 +115,8 @@ class MaterialPoints:
         density: Tensor | float,
         youngs_modulus: Tensor | float,
         poisson_ratio: Tensor | float,
+        law: ConstitutiveLaw | Sequence[ConstitutiveLaw] | None = None,
+        law_index: Tensor | None = None,
     ) -> MaterialPoints:
         """Build the points from per-point tensors or numbers that hold for all of them.
 
@@ -109,12 +126,19 @@ class MaterialPoints:
             density: Density at rest [kg/m³].
             youngs_modulus: Young's modulus [Pa].
             poisson_ratio: Poisson's ratio, in (-1, 0.5).
+            law: Constitutive law, or several; fixed corotated elasticity if None.
+            law_index: With several laws, which of them holds for each particle, int64, shape (..., P).
 
         Returns:
             The points, every field expanded to shape (..., P).
 
         Raises:
             ValueError: If a value lies outside its physical range.
+
+        Example:
+            >>> from gaussian_swaying.mpm.materials import Sand
+            >>> sand = MaterialPoints.create(torch.rand(10, 3), volume=1e-6, density=1600.0, youngs_modulus=1e6,
+            ...                              poisson_ratio=0.3, law=Sand(friction_angle=30.0))
         """
         check_shape("position", position, "P", 3)
 
@@ -131,7 +155,26 @@ class MaterialPoints:
         rho = field("density", density, 0.0, inf, "to be positive and finite [kg/m³]")
         e = field("E", youngs_modulus, 0.0, inf, "(Young's modulus) to be positive and finite [Pa]")
         nu = field("nu", poisson_ratio, -1.0, 0.5, "(Poisson's ratio) to lie between -1 and 0.5, both excluded")
-        return cls(position, rho * v, v, e, nu)
+        laws = _DEFAULT if law is None else (law,) if isinstance(law, ConstitutiveLaw) else tuple(law)
+        if law_index is not None:
+            law_index = law_index.to(position.device, torch.long).expand(position.shape[:-1])
+            if not bool(((law_index >= 0) & (law_index < len(laws))).all()):
+                raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the number of `law`s less one.")
+        return cls(position, rho * v, v, e, nu, laws, law_index)
+
+    @classmethod
+    def join(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
+        """Several bodies as one: the points of all, one after the other, each with its own law."""
+        laws: list[ConstitutiveLaw] = []
+        index = []
+        for part in parts:
+            laws += [law for law in part.laws if not any(law is known for known in laws)]
+            place = [next(k for k, known in enumerate(laws) if known is law) for law in part.laws]
+            own = torch.zeros_like(part.mass, dtype=torch.long) if part.law_index is None else part.law_index
+            index.append(torch.tensor(place, device=own.device)[own])
+        fields = {name: torch.cat([getattr(part, name) for part in parts], -1) for name in _FIELDS}
+        position = torch.cat([part.position for part in parts], -2)
+        return cls(position, **fields, laws=tuple(laws), law_index=torch.cat(index, -1) if len(laws) > 1 else None)
 
     @property
     def count(self) -> int:
@@ -139,8 +182,10 @@ class MaterialPoints:
         return self.position.shape[-2]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> MaterialPoints:
-        """Apply a function to every tensor (``.to``, ``.detach``)."""
-        return MaterialPoints(*(function(getattr(self, f.name)) for f in dataclasses.fields(self)))
+        """Apply a function to every tensor (``.detach``, indexing); the law of each particle stays an integer."""
+        moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
+        index = None if self.law_index is None else function(self.law_index).long()
+        return MaterialPoints(**moved, laws=self.laws, law_index=index)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +198,8 @@ class MPMState:
     Attributes:
         position: Particle position [m], shape (..., P, 3).
         velocity: Particle velocity [m/s], shape (..., P, 3).
-        affine: APIC affine velocity [1/s], shape (..., P, 3, 3); zero in ``total``.
+        affine: Velocity gradient [1/s], shape (..., P, 3, 3): APIC's affine velocity in ``updated``, the rate of F in
+            ``total``.
         F_elastic: Elastic deformation gradient, drives the stress, shape (..., P, 3, 3).
         F_total: Total deformation gradient, drives covariances and normals, shape (..., P, 3, 3).
         lost: Particles that left the grid since the run began, shape (..., P), bool.
@@ -161,6 +207,8 @@ class MPMState:
         grid: The nodes in use.
         node_displacement: Nodal displacement [m], shape (..., G, 3), or None.
         node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
+        internal: The internal variable of each particle's plastic law (see its class), shape (..., P), or None if no
+            law has one.
     """
 
     position: Tensor
@@ -173,6 +221,7 @@ class MPMState:
     grid: GridSpec
     node_displacement: Tensor | None = None
     node_velocity: Tensor | None = None
+    internal: Tensor | None = None
 
     def replace(self, **changes: Any) -> MPMState:
         """A copy with some fields changed."""

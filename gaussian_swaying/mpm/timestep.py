@@ -12,63 +12,61 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.constitutive import lame_parameters
-from gaussian_swaying.mpm.linalg import cofactor, determinant, symmetric_eigenvalues
+from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.state import MaterialPoints
 
 
-def wave_speed(points: MaterialPoints, F: Tensor | None = None, *, spatial: bool = False) -> Tensor:
+def wave_speed(
+    points: MaterialPoints, F: Tensor | None = None, internal: Tensor | None = None, *, spatial: bool = False
+) -> Tensor:
     r"""Speed of the fastest elastic wave [m/s]: :math:`\sqrt{(\lambda + 2 \mu) / \rho}` at rest.
 
-    A stretched fixed-corotated material is stiffer: its Hessian holds :math:`\lambda \operatorname{cof} F \otimes
-    \operatorname{cof} F`, so lambda is multiplied by the square of the largest singular value of the cofactor matrix.
+    A deformed material may be stiffer; its law says how much (``ConstitutiveLaw.moduli``).
 
     Args:
         points: Material, shapes (..., P).
-        F: Deformation gradient, shape (..., P, 3, 3); None for the rest state.
+        F: Elastic deformation gradient, shape (..., P, 3, 3); None for the rest state.
+        internal: Internal variable of the law, shape (..., P), if any has one.
         spatial: Also account for the stretch of space (``updated`` formulation: waves cross a stretched cell sooner).
 
     Returns:
         Shape (..., P).
     """
-    mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
     density = points.mass / points.volume
     if F is None:
+        mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
         return ((lam + 2 * mu) / density).sqrt()
-    cof = cofactor(F)
-    area_stretch = symmetric_eigenvalues(cof.mT @ cof)[..., 0].clamp(min=1.0)
-    squared = (lam * area_stretch + 2 * mu) / density
+    squared = LawDispatch(points).moduli(F, internal)[0] / density
     if spatial:
         squared = squared * symmetric_eigenvalues(F.mT @ F)[..., 0].clamp(min=1.0)
     return squared.sqrt()
 
 
-def stable_limit(points: MaterialPoints, dx: float, F: Tensor | None = None, *, spatial: bool = False) -> Tensor:
+def stable_limit(
+    points: MaterialPoints, dx: float, F: Tensor | None = None, internal: Tensor | None = None, *, spatial: bool = False
+) -> Tensor:
     r"""Longest substep [s] that is stable for every arrangement of particles (see the head of this file).
-
-    :math:`K = 2 \mu + \lambda (\lVert \operatorname{cof} F \rVert^2 + |J - 1| \lVert F \rVert)`, which is
-    :math:`2 \mu + 3 \lambda` at rest.
 
     Args:
         points: Material, shapes (..., P).
         dx: Grid spacing [m].
-        F: Deformation gradient, shape (..., P, 3, 3); None for the rest state.
+        F: Elastic deformation gradient, shape (..., P, 3, 3); None for the rest state, where
+            :math:`K = 2 \mu + 3 \lambda`.
+        internal: Internal variable of the law, shape (..., P), if any has one.
         spatial: As in :func:`wave_speed`.
 
     Returns:
         Shape (..., P).
     """
-    mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
     density = points.mass / points.volume
     if F is None:
+        mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
         stiffness = 2 * mu + 3 * lam.clamp(min=0)
     else:
-        cof = cofactor(F)
-        volume_change = (determinant(F, cof) - 1).abs()
-        norm = F.square().sum((-1, -2))
-        growth = cof.square().sum((-1, -2)) + volume_change * norm.sqrt()
-        stiffness = 2 * mu + lam.clamp(min=0) * growth
+        stiffness = LawDispatch(points).moduli(F, internal)[1]
         if spatial:
-            stiffness = stiffness * (norm / 3).clamp(min=1.0)
+            stiffness = stiffness * (F.square().sum((-1, -2)) / 3).clamp(min=1.0)
     return dx * (density / stiffness).sqrt() * (2 / math.sqrt(6))
 
 

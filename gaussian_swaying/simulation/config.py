@@ -181,6 +181,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
+    if summary["torn_particles"]:
+        print(
+            f"warning: {summary['torn_particles']} particles are farther than two cells from a neighbour, so the "
+            "material fell apart numerically: use `solver.formulation: total`, or a coarser `solver.dx`.",
+            file=sys.stderr,
+        )
     for file in pipeline.files:
         print(f"wrote {file}")
     return 0

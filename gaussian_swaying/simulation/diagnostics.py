@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 import torch
+from torch import Tensor
 
+from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.linalg import determinant, singular_values
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
@@ -38,7 +40,16 @@ class FrameDiagnostics:
         kinetic: Kinetic energy [J].
         elastic: Elastic energy [J].
         potential: Potential energy of gravity [J].
+        wind_work: Work of the wind on the material during the frame [J].
+        momentum_x: Linear momentum [kg m/s].
+        momentum_y: Linear momentum [kg m/s].
+        momentum_z: Linear momentum [kg m/s].
+        angular_momentum_x: Angular momentum about the origin [kg m²/s].
+        angular_momentum_y: Angular momentum about the origin [kg m²/s].
+        angular_momentum_z: Angular momentum about the origin [kg m²/s].
         lost: Particles that left the grid.
+        torn: Particles of elastic material of which a neighbour at rest is now farther than two cells, so that the grid
+            no longer ties them together; only in ``updated``.
         J_min: Smallest determinant of F.
         J_max: Largest determinant of F.
         stretch_min: Smallest singular value of F.
@@ -53,7 +64,15 @@ class FrameDiagnostics:
     kinetic: float
     elastic: float
     potential: float
+    wind_work: float
+    momentum_x: float
+    momentum_y: float
+    momentum_z: float
+    angular_momentum_x: float
+    angular_momentum_y: float
+    angular_momentum_z: float
     lost: int
+    torn: int
     J_min: float
     J_max: float
     stretch_min: float
@@ -66,7 +85,45 @@ class FrameDiagnostics:
         return asdict(self)
 
 
-def diagnose(solver: MPMSolver, state: MPMState, substeps: int, dt: float) -> FrameDiagnostics:
+class TearingGauge:
+    """Counts the particles that a sheet has numerically torn apart.
+
+    In the ``updated`` formulation two particles feel each other through common grid nodes. Neighbours that drift more
+    than two cells apart share none, and the sheet between them is gone without any law having broken it.
+
+    Args:
+        solver: A solver with its material; plastic laws and fluids may flow apart and are not counted.
+        count: Neighbours of each particle that are watched, those within two cells at rest.
+    """
+
+    def __init__(self, solver: MPMSolver, count: int = 4) -> None:
+        position = solver.points.position.detach()
+        flat = position.reshape(-1, *position.shape[-2:])
+        self.reach = 2 * solver.dx
+        count = min(count, position.shape[-2] - 1)
+        found = [nearest_neighbours(scene, count) for scene in flat]
+        distance, index = (torch.stack(values).to(position.device) for values in zip(*found, strict=True))
+        own = torch.arange(position.shape[-2], device=position.device)[:, None]
+        self.neighbour = torch.where(distance <= self.reach, index, own)
+        self.elastic = solver.laws.elastic_particles()
+
+    def __call__(self, position: Tensor) -> Tensor:
+        """Which particles are torn off a neighbour, from positions (..., P, 3) [m]; bool, shape (scenes, P)."""
+        flat = position.reshape(-1, *position.shape[-2:])
+        scene = torch.arange(len(flat), device=flat.device)[:, None, None]
+        apart = torch.linalg.vector_norm(flat[scene, self.neighbour] - flat[:, :, None], dim=-1)
+        torn = (apart > self.reach).any(-1)
+        return torn if self.elastic is None else torn & self.elastic.reshape(torn.shape)
+
+
+def diagnose(
+    solver: MPMSolver,
+    state: MPMState,
+    substeps: int,
+    dt: float,
+    wind_work: Tensor | float = 0.0,
+    tearing: TearingGauge | None = None,
+) -> FrameDiagnostics:
     """Measure the health of a state (one GPU synchronisation).
 
     Args:
@@ -74,11 +131,15 @@ def diagnose(solver: MPMSolver, state: MPMState, substeps: int, dt: float) -> Fr
         state: The state at the end of the frame.
         substeps: Substeps of the frame.
         dt: Length of a substep [s].
+        wind_work: Work of the wind during the frame [J].
+        tearing: Counts torn particles; none are counted without it.
 
     Returns:
         The measurements.
     """
-    energies = solver.energies(state)
+    energies, momenta = solver.energies(state), solver.momenta(state)
+    momentum = torch.cat([momenta[name].double().reshape(-1, 3).sum(0) for name in ("linear", "angular")])
+    torn = state.time.new_zeros(()) if tearing is None else tearing(state.position).sum().double()
     stretch = singular_values(state.F_total)
     volume = determinant(state.F_total)
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
@@ -87,7 +148,10 @@ def diagnose(solver: MPMSolver, state: MPMState, substeps: int, dt: float) -> Fr
             state.time,
             solver.cfl_number(state, dt).double(),
             *(energies[name].sum().double() for name in ("kinetic", "elastic", "potential")),
+            torch.as_tensor(wind_work, dtype=torch.float64, device=state.time.device),
+            *momentum,
             state.lost.sum().double(),
+            torn,
             volume.amin().double(),
             volume.amax().double(),
             stretch.amin(),
@@ -96,9 +160,12 @@ def diagnose(solver: MPMSolver, state: MPMState, substeps: int, dt: float) -> Fr
             moved.amax().double(),
         ]
     ).tolist()
-    names = ("time", "cfl", "kinetic", "elastic", "potential", "lost", "J_min", "J_max", "stretch_min", "stretch_max")
+    axes = [f"{kind}momentum_{axis}" for kind in ("", "angular_") for axis in "xyz"]
+    names = ("time", "cfl", "kinetic", "elastic", "potential", "wind_work", *axes, "lost", "torn", "J_min", "J_max")
+    names += ("stretch_min", "stretch_max")
     found = dict(zip((*names, "displacement_mean", "displacement_max"), values, strict=True))
-    return FrameDiagnostics(substeps=substeps, lost=int(found.pop("lost")), **found)
+    lost, torn = int(found.pop("lost")), int(found.pop("torn"))
+    return FrameDiagnostics(substeps=substeps, lost=lost, torn=torn, **found)
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

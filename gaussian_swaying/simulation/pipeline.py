@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 import gaussian_swaying
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.aero.force import AeroForce, drag_rate
+from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
@@ -26,7 +26,13 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
 from gaussian_swaying.rendering.camera import Camera, CameraPath, TransformsCamera
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, check_state, diagnose
+from gaussian_swaying.simulation.diagnostics import (
+    FrameDiagnostics,
+    SimulationDiverged,
+    TearingGauge,
+    check_state,
+    diagnose,
+)
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import SimulatedScene
 
@@ -74,6 +80,7 @@ class SimulationPipeline(nn.Module):
         self.to(device)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
         self._most_substeps = sys.maxsize
+        self._tearing: TearingGauge | None = None
 
     @property
     def device(self) -> torch.device:
@@ -90,12 +97,13 @@ class SimulationPipeline(nn.Module):
         """
         state = self.solver.init_state(self.scene.points, frame=self.scene.frame)
         self._most_substeps = MAX_GROWTH * self._substeps(state)
+        self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
 
-    def force(self, state: MPMState, wind: Tensor) -> Tensor:
-        """Wind force on every particle [N], shape (..., P, 3), at an air velocity [m/s] of shape (3,)."""
+    def force(self, state: MPMState, wind: Tensor, dt: float) -> Tensor:
+        """Wind force on every particle [N] over a substep, shape (..., P, 3), at an air velocity [m/s], shape (3,)."""
         normal, area = deform_patch(state.F_total, self.scene.patch_normal, self.scene.patch_area)
-        return self.aero(wind, state.velocity, normal, area)
+        return self.aero(wind, state.velocity, normal, area, self.scene.points.mass, dt)
 
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
         """Advance by one frame.
@@ -118,7 +126,7 @@ class SimulationPipeline(nn.Module):
             for retry in range(MAX_RETRIES + 1):
                 if steps > self._most_substeps:
                     self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
-                end = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
+                end, work = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 dt = self.frame_dt / steps
                 cfl = float(self.solver.cfl_number(end, dt))
                 outrun = bool((end.lost & ~state.lost).any())
@@ -138,7 +146,7 @@ class SimulationPipeline(nn.Module):
             self._give_up(
                 end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
             )
-        return end, diagnose(self.solver, end, steps, dt)
+        return end, diagnose(self.solver, end, steps, dt, work, self._tearing)
 
     def _give_up(self, state: MPMState, cause: str) -> NoReturn:
         """Raise SimulationDiverged, blaming the particle with the largest deformation."""
@@ -150,26 +158,30 @@ class SimulationPipeline(nn.Module):
     def _substeps(self, state: MPMState) -> int:
         return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
 
-    def _roll(self, state: MPMState, steps: int) -> MPMState:
+    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
+        """The state some substeps later, and the work of the wind on the way [J]."""
         dt = self.frame_dt / steps
+        work = torch.zeros((), dtype=torch.float64, device=self.device)
         if self.aero.idle:
-            return self.solver.rollout(state, dt, steps)
+            return self.solver.rollout(state, dt, steps), work
         offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
         winds = self.wind(state.time + offsets)
         for k in range(steps):
-            state = self.solver.step(state, dt, self.force(state, winds[k]))
-        return state
+            force = self.force(state, winds[k], dt)
+            after = self.solver.step(state, dt, force)
+            # at the mean velocity: exactly what the step adds to the kinetic energy
+            work = work + (0.5 * dt) * torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
+            state = after
+        return state, work
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
-        if self.aero.idle:
+        if self.aero.idle or self.aero.drag_step == "semi_implicit":
             return 1
         times = state.time + torch.linspace(0, self.frame_dt, 5, dtype=torch.float64, device=self.device)
         wind = torch.linalg.vector_norm(self.wind(times), dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
-        coefficient = float(self.aero.C_D + self.aero.C_F + self.aero.C_L.abs())
-        mass = self.solver.points.mass
-        rate = drag_rate(speed, self.scene.patch_area, mass, coefficient, self.aero.air_density).amax()
+        rate = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
         return int(float(rate) * self.frame_dt) + 1
 
     # ---- picture
@@ -392,7 +404,9 @@ class SimulationPipeline(nn.Module):
             "energy_start_J": energy[0] if energy else None,
             "energy_end_J": energy[-1] if energy else None,
             "largest_cfl": max((entry["cfl"] for entry in log), default=None),
+            "wind_work_J": sum(entry["wind_work"] for entry in log),
             "lost_particles": int(log[-1]["lost"]) if log else 0,
+            "torn_particles": int(log[-1]["torn"]) if log else 0,
             "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),

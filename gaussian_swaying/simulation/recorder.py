@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import shutil
@@ -20,7 +21,8 @@ from gaussian_swaying._checks import check_positive
 
 MARKER = "run.json"
 # what a run writes, and so must not find in a folder that no run made
-_OURS = ("frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "config.yaml", "video.mp4")
+_OURS = ("frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "diagnostics.csv")
+_OURS += ("config.yaml", "video.mp4")
 
 
 @contextmanager
@@ -38,6 +40,14 @@ def write_json(path: Path, value: Any) -> None:
     """Write JSON, whole or not at all."""
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(value, indent=2) + "\n")
+
+
+def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Write dicts of the same keys as CSV with a header, whole or not at all."""
+    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else [])
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
@@ -82,7 +92,7 @@ class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
-    ``checkpoint.pt``, ``summary.json``, ``config.yaml``, ``video.mp4``.
+    ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
     Args:
         images: Write a PNG per frame.
@@ -250,8 +260,10 @@ class Recorder:
         return made
 
     def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write ``summary.json``."""
+        """Write ``summary.json``, and its entry ``per_frame`` as ``diagnostics.csv`` too."""
         write_json(self.folder / "summary.json", summary)
+        if summary.get("per_frame"):
+            write_table(self.folder / "diagnostics.csv", summary["per_frame"])
 
     def _pack_trajectory(self, frames: int) -> None:
         """Join the frames into one .npz, copying their arrays without unpacking all of them at once."""

@@ -20,6 +20,7 @@ from gaussian_swaying.gaussians.surface import (
     deform_normal,
 )
 from gaussian_swaying.mpm.linalg import polar_rotation
+from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.frame import SimFrame
 
@@ -34,6 +35,7 @@ class MaterialRegion:
         nu: Poisson's ratio; unchanged if null.
         density: Density [kg/m³]; unchanged if null.
         thickness: Thickness of the surface [m]; unchanged if null.
+        law: Constitutive law; unchanged if null.
     """
 
     region: Region
@@ -41,6 +43,7 @@ class MaterialRegion:
     nu: float | None = None
     density: float | None = None
     thickness: float | None = None
+    law: ConstitutiveLaw | None = None
 
 
 @dataclass
@@ -54,6 +57,8 @@ class Material:
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
         volume: ``patch`` (area x thickness) or ``cell`` (PhysGaussian's rule for solids: cell volume / particles in
             it).
+        law: Constitutive law, for example ``Sand``; fixed corotated elasticity if null. All but ``FixedCorotated``,
+            ``NeoHookean`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
         regions: Parts made of something else; later entries win.
     """
 
@@ -62,6 +67,7 @@ class Material:
     density: float = 200.0
     thickness: float = 0.01
     volume: str = "patch"
+    law: ConstitutiveLaw | None = None
     regions: list[MaterialRegion] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -180,6 +186,7 @@ class SimulatedScene(nn.Module):
         self.patch_area: Tensor
         count = len(simulated)
         fields = {name: torch.full((count,), getattr(material, name), dtype=dtype) for name in _MATERIAL_FIELDS}
+        laws, law_index = [material.law or FixedCorotated()], torch.zeros(count, dtype=torch.long)
         for entry in material.regions:
             inside = entry.region.contains(cloud.means[simulated])
             if not bool(inside.any()):
@@ -187,6 +194,9 @@ class SimulatedScene(nn.Module):
             for name in _MATERIAL_FIELDS:
                 if getattr(entry, name) is not None:
                     fields[name][inside] = getattr(entry, name)
+            if entry.law is not None:
+                law_index[inside] = len(laws)
+                laws.append(entry.law)
         if material.volume == "patch":
             volume = self.patch_area * fields["thickness"]
         else:
@@ -197,6 +207,8 @@ class SimulatedScene(nn.Module):
             density=fields["density"],
             youngs_modulus=fields["E"],
             poisson_ratio=fields["nu"],
+            law=laws,
+            law_index=law_index if len(laws) > 1 else None,
         )
 
     def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001

@@ -151,10 +151,9 @@ def test_each_particle_has_its_own_material(formulation):
         alone = MPMSolver(dx=0.1, formulation=formulation)
         velocity = 0.5 * (position - position.mean(0))
         ends.append(alone.rollout(alone.init_state(part, velocity), 5e-4, 40).F_elastic)
-    fields = [torch.cat([getattr(part, f.name) for part in parts]) for f in dataclasses.fields(MaterialPoints)]
     together = MPMSolver(dx=0.1, formulation=formulation)
     velocity = torch.cat([0.5 * (part.position - part.position.mean(0)) for part in parts])
-    end = together.rollout(together.init_state(MaterialPoints(*fields), velocity), 5e-4, 40)
+    end = together.rollout(together.init_state(MaterialPoints.join(parts), velocity), 5e-4, 40)
     torch.testing.assert_close(end.F_elastic, torch.cat(ends), rtol=0, atol=1e-11)
     assert float((ends[0] - ends[1]).abs().max()) > 1e-4
 

@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying.mpm.materials import FixedCorotated, Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge, check_state, diagnose
 
 
 def _solver(**settings):
@@ -34,8 +35,15 @@ def test_numbers_of_a_known_state():
         lost=lost,
         time=torch.tensor(0.6, dtype=torch.float64),
     )
-    health = diagnose(solver, state, 12, 1e-3)
+    health = diagnose(solver, state, 12, 1e-3, wind_work=torch.tensor(3.5))
     assert health.time == pytest.approx(0.6)
+    assert health.wind_work == 3.5
+    assert (health.momentum_x, health.momentum_y, health.momentum_z) == (0.0, 0.0, pytest.approx(30 * 2.0 * 2.0))
+    # r x p with p along z: (y, -x, 0) times 4 kg m/s each
+    x, y, _ = state.position.sum(0).tolist()
+    assert health.angular_momentum_x == pytest.approx(4.0 * y)
+    assert health.angular_momentum_y == pytest.approx(-4.0 * x)
+    assert health.angular_momentum_z == pytest.approx(0.0, abs=1e-12)
     assert (health.substeps, health.lost) == (12, 2)
     assert health.kinetic == pytest.approx(0.5 * 30 * 2.0 * 4.0)
     assert health.potential == pytest.approx(9.8 * 2.0 * float(state.position[:, 2].sum()))
@@ -56,6 +64,38 @@ def test_extremes_are_those_of_single_particles():
     F[4, 0, 0], F[9, 1, 1] = 3.0, -0.5
     health = diagnose(solver, state.replace(F_total=F), 1, 1e-3)
     assert (health.J_min, health.J_max) == (pytest.approx(-0.5), pytest.approx(3.0))
+
+
+def _row(spacing=0.1, count=6, law=None):
+    """Particles along x, one or two to a cell of 0.1 m."""
+    position = torch.zeros(count, 3, dtype=torch.float64)
+    position[:, 0] = torch.arange(count) * spacing
+    points = MaterialPoints.create(position, volume=1e-3, density=1.0, youngs_modulus=1e3, poisson_ratio=0.3, law=law)
+    solver = MPMSolver(dx=0.1, formulation="updated")
+    return solver, solver.init_state(points)
+
+
+def test_torn_particles_are_counted():
+    """A gap of more than two cells opens between the third and the fourth particle of a row."""
+    solver, state = _row()
+    gauge = TearingGauge(solver, count=2)
+    shift = torch.zeros_like(state.position)
+    for gap, torn in ((0.0, 0), (0.09, 0), (0.11, 2), (0.21, 2), (5.0, 2)):
+        shift[3:, 0] = gap
+        # the two inner neighbours of the gap are 0.1 m apart at rest, so 0.2 m once the gap is 0.1 m
+        assert int(gauge(state.position + shift).sum()) == torn, gap
+        assert diagnose(solver, state.replace(position=state.position + shift), 1, 1e-3, tearing=gauge).torn == torn
+    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    assert not bool(gauge(state.position @ turn.T + 7.0).any())
+
+
+def test_what_was_apart_at_rest_or_flows_is_not_torn():
+    solver, state = _row(spacing=0.25)
+    assert not bool(TearingGauge(solver)(state.position).any())
+    solver, state = _row(law=Sand())
+    assert not bool(TearingGauge(solver)(10 * state.position).any())
+    solver, state = _row(law=FixedCorotated())
+    assert bool(TearingGauge(solver)(10 * state.position).all())
 
 
 def test_a_healthy_state_passes():

@@ -1,5 +1,6 @@
 """What a run leaves on disk, and what it leaves when something breaks."""
 
+import csv
 import json
 import math
 import subprocess
@@ -97,6 +98,7 @@ def test_files_of_a_run(make_pipeline, tmp_path):
     assert _names(tmp_path / "run") == [
         "checkpoint.pt",
         "config.yaml",
+        "diagnostics.csv",
         "frames",
         "frames/00000.png",
         "frames/00001.png",
@@ -112,10 +114,21 @@ def test_files_of_a_run(make_pipeline, tmp_path):
     assert (tmp_path / "run" / "config.yaml").read_text() == "frames: 3\n"
 
 
+def test_diagnostics_are_a_table_too(make_pipeline, tmp_path):
+    """One row per frame with the numbers of summary.json, readable by any spreadsheet."""
+    summary = _run(make_pipeline(), tmp_path / "run")
+    with (tmp_path / "run" / "diagnostics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(summary["per_frame"]) == 3
+    for row, entry in zip(rows, summary["per_frame"], strict=True):
+        assert {name: float(value) for name, value in row.items()} == pytest.approx(entry)
+    assert float(rows[-1]["wind_work"]) > 0
+
+
 def test_what_is_switched_off_is_not_written(make_pipeline, tmp_path):
     recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0)
     _run(make_pipeline(), tmp_path / "run", recorder=recorder)
-    assert _names(tmp_path / "run") == ["run.json", "summary.json"]
+    assert _names(tmp_path / "run") == ["diagnostics.csv", "run.json", "summary.json"]
     with pytest.raises(ValueError, match=r"`recorder.images`"):
         Recorder(images=False)
     for name, value in (("ply_every", -1), ("checkpoint_every", -1), ("fps", 0.0)):

@@ -1,0 +1,49 @@
+"""Damping in proportion to stiffness: a viscous stress beside the elastic one."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.linalg import matmul3
+
+
+def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: float) -> Tensor:
+    r"""Viscous first Piola-Kirchhoff stress :math:`\beta F (2 \mu \dot E + \lambda \operatorname{tr}(\dot E) I)` [Pa].
+
+    :math:`E = \tfrac12 (F^T F - I)` is the Green strain, so rigid motion is not damped. About the rest state a mode of
+    circular frequency :math:`\omega` is damped with the ratio :math:`\zeta = \beta \omega / 2` (Rayleigh damping,
+    stiffness part).
+
+    Args:
+        F: Deformation gradient, shape (..., 3, 3).
+        F_rate: Its rate [1/s], shape (..., 3, 3).
+        mu: Shear modulus [Pa], shape (...).
+        lam: First Lamé parameter [Pa], shape (...).
+        time: :math:`\beta` [s].
+
+    Returns:
+        Shape (..., 3, 3).
+    """
+    product = matmul3(F.mT, F_rate)
+    rate = 0.5 * (product + product.mT)
+    eye = torch.eye(3, dtype=F.dtype, device=F.device)
+    trace = rate.diagonal(dim1=-2, dim2=-1).sum(-1)
+    stress = 2 * mu[..., None, None] * rate + (lam * trace)[..., None, None] * eye
+    return time * matmul3(F, stress)
+
+
+def damped_substep(limit: float, time: float) -> float:
+    r"""Substep that is as stable with stiffness damping as ``limit`` is without.
+
+    Symplectic Euler with the damping force of the last velocity is stable for
+    :math:`\omega^2 (\Delta t^2 + 2 \beta \Delta t) \le 4` (Jury's criterion for one mode).
+
+    Args:
+        limit: Substep without damping [s].
+        time: :math:`\beta` [s].
+
+    Returns:
+        Substep [s].
+    """
+    return limit if time == 0 else limit**2 / (time + math.sqrt(time**2 + limit**2))

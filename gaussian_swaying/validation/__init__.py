@@ -1,0 +1,1 @@
+"""Problems with known answers, for the tests and for the accuracy benchmark."""

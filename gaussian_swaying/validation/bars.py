@@ -1,0 +1,187 @@
+r"""Bars along x: a standing wave, a bar under its own weight, and a block that vibrates freely.
+
+Fixed corotated elasticity is linear in one dimension at any strain: :math:`P_{11} = (\lambda + 2 \mu)(F_{11} - 1)` in a
+bar that is confined laterally and :math:`E (F_{11} - 1)` for :math:`\nu = 0`, both from its energy by hand. So the
+linear wave equation and the linear bar are exact at finite amplitude.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice
+from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.boundary import Boundary, PinnedRegion
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.validation.settings import Axial, Result, Settings, block, fit_sinusoid, follow
+
+LENGTH, YOUNG, DENSITY = 25.0, 100.0, 1.0  # [m], [Pa], [kg/m³]: the vibrating bar of Buzzi et al. 2008, c = 10 m/s
+_CLAMP = 2  # cells of material inside a clamp: no stencil reaches beyond
+
+
+def vibrating_bar(
+    cells: int,
+    settings: Settings,
+    ends: str = "free",
+    confined: bool = True,
+    poisson_ratio: float = 0.3,
+    periods: int = 4,
+    strain: float = 0.1,
+) -> Result:
+    r"""The lowest standing wave of a bar, started from its velocity.
+
+    :math:`u = a\, \varphi(X) \sin \omega t` with :math:`c = \sqrt{(\lambda + 2 \mu) / \rho}` and, for ``free`` ends,
+    :math:`\varphi = \cos(\pi X / L),\ \omega = \pi c / L`; ``fixed``: :math:`\varphi = \sin(\pi X / L)`, the same
+    :math:`\omega`; ``fixed-free``: :math:`\varphi = \sin(\pi X / 2L),\ \omega = \pi c / 2L` (textbook wave equation).
+    The middle of the free bar stands still, so either half of it is a fixed-free bar with an ideal clamp.
+
+    Args:
+        cells: Cells along the bar.
+        settings: The numerics.
+        ends: ``free``, ``fixed-free`` or ``fixed``; a fixed end is a :class:`PinnedRegion` of two cells beyond it.
+        confined: Hold all motion across the bar; needed unless ``poisson_ratio`` is 0.
+        poisson_ratio: Poisson's ratio.
+        periods: Periods to follow.
+        strain: Amplitude of the strain.
+
+    Returns:
+        ``error`` (of the frequency, relative), ``frequency`` [Hz], ``loss`` (part of the amplitude lost per period),
+        ``end_shift`` (by how many cells each fixed end seems further out than it is) and the common quantities.
+    """
+    check_choice("ends", ends, ("free", "fixed-free", "fixed"))
+    nu, dx = poisson_ratio, LENGTH / cells
+    speed = math.sqrt(YOUNG * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / DENSITY)
+    wave = math.pi / LENGTH / (2 if ends == "fixed-free" else 1)
+    omega = wave * speed
+    first, last = -_CLAMP if ends != "free" else 0, cells + (_CLAMP if ends == "fixed" else 0)
+    across = 0 if confined else 1
+    points = block(
+        dx,
+        (first, 0, 0),
+        (last, across, across),
+        settings,
+        density=DENSITY,
+        youngs_modulus=YOUNG,
+        poisson_ratio=nu,
+    )
+    boundaries: list[Boundary] = [Axial((1, 2))] if confined else []
+    if ends != "free":
+        boundaries.append(PinnedRegion(Box([None] * 3, [0.0, None, None])))
+    if ends == "fixed":
+        boundaries.append(PinnedRegion(Box([LENGTH, None, None], [None] * 3)))
+    rest = points.position[:, 0]
+    inside = (rest > 0) & (rest < LENGTH)
+    mode = torch.where(inside, torch.cos(wave * rest) if ends == "free" else torch.sin(wave * rest), 0.0)
+    velocity = torch.zeros_like(points.position)
+    velocity[:, 0] = strain * speed * mode
+    solver = settings.solver(dx, boundaries=boundaries)
+    state = solver.init_state(points, velocity)
+
+    def amplitude(state: MPMState) -> Tensor:
+        return ((state.position[:, 0] - rest) * mode).sum() / mode.square().sum()
+
+    period = 2 * math.pi / omega
+    run = follow(solver, state, period / 16, 16 * periods, amplitude)
+    found, rate = fit_sinusoid(run.time, run.series)
+    fixed = {"free": 0, "fixed-free": 1, "fixed": 2}[ends]
+    return run.result(
+        abs(found / omega - 1),
+        frequency=found / (2 * math.pi),
+        loss=1 - math.exp(-rate * 2 * math.pi / found),
+        end_shift=(omega / found - 1) * cells / fixed if fixed else 0.0,
+    )
+
+
+def hanging_bar(cells: int, settings: Settings, strain: float = 0.3, settle: float = 20.0) -> Result:
+    r"""A bar hung at its top, stretched by its own weight: :math:`u = \rho g (L X - X^2 / 2) / E`, X from the top.
+
+    Exact at finite strain for fixed corotated elasticity with :math:`\nu = 0` (equilibrium in the rest configuration).
+    Gravity acts at once, and critical damping of the lowest mode brings the bar to rest.
+
+    Args:
+        cells: Cells along the bar.
+        settings: The numerics.
+        strain: Strain at the top, rho g L / E; twice the stretch of the bar as a whole.
+        settle: Time to follow, in units of 1 / circular frequency of the lowest mode.
+
+    Returns:
+        ``error`` (of the displacement of the lowest points, relative to the closed form there), ``profile`` (root mean
+        square of the error of all points, relative to the tip), ``end_shift`` (by how many cells the clamp seems
+        further up than it is), ``residual`` (speed of the tip, relative to its displacement and frequency) and the
+        common quantities.
+    """
+    dx, speed = LENGTH / cells, math.sqrt(YOUNG / DENSITY)
+    gravity = strain * YOUNG / (DENSITY * LENGTH)
+    points = block(
+        dx, (-_CLAMP, 0, 0), (cells, 1, 1), settings, density=DENSITY, youngs_modulus=YOUNG, poisson_ratio=0.0
+    )
+    omega = math.pi * speed / (2 * LENGTH)
+    solver = settings.solver(
+        dx,
+        boundaries=[PinnedRegion(Box([None] * 3, [0.0, None, None]))],
+        gravity=(gravity, 0.0, 0.0),
+        damping=2 * omega,
+    )
+    rest = points.position[:, 0].double().cpu()
+    exact = (DENSITY * gravity / YOUNG * (LENGTH * rest - rest.square() / 2)).clamp(min=0)
+    tip = rest > rest.max() - 0.1 * dx
+    run = follow(solver, solver.init_state(points), settle / omega / 8, 8, lambda s: s.position[:, 0])
+    moved = run.series[-1] - rest
+    drop, known = moved[tip].mean(), exact[tip].mean()
+    velocity = run.state.velocity[:, 0].double().cpu()[tip].abs().max()
+    hung = rest > 0
+    return run.result(
+        float(abs(drop / known - 1)),
+        profile=float((moved - exact)[hung].square().mean().sqrt() / known),
+        end_shift=float((drop - known) / (strain * dx)),
+        residual=float(velocity / (omega * known)),
+    )
+
+
+def free_block(settings: Settings, periods: int = 100, cells: int = 4, strain: float = 0.05) -> Result:
+    """An elastic cube that vibrates freely in its lowest stretching mode, and spins and flies slowly.
+
+    Args:
+        settings: The numerics.
+        periods: Periods of a wave across the cube and back, 2 L / c, to follow.
+        cells: Cells along an edge of 1 m.
+        strain: Amplitude of the strain rate in units of the circular frequency of that wave.
+
+    Returns:
+        ``error`` (the largest change of the energy averaged over a period, relative to the first period), ``growth``
+        (the largest energy at the end of any frame over the first one, less 1), ``kept`` (mean energy of the last
+        period over that of the first), ``linear`` and ``angular`` (largest relative change of the momenta),
+        ``substep`` (mean, in units of 1 / that circular frequency) and the common quantities.
+    """
+    dx, young, density, nu = 1.0 / cells, 1e4, 100.0, 0.3
+    points = block(dx, (0, 0, 0), (cells,) * 3, settings, density=density, youngs_modulus=young, poisson_ratio=nu)
+    speed = math.sqrt(young * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / density)
+    omega = math.pi * speed
+    arm = points.position - 0.5
+    velocity = torch.zeros_like(arm)
+    velocity[:, 0] = -strain * speed * torch.cos(math.pi * points.position[:, 0])
+    spin = arm.new_tensor([0.02, -0.03, 0.05]) * omega
+    velocity = velocity + torch.linalg.cross(spin.expand_as(arm), arm) + 0.01 * speed
+    solver = settings.solver(dx)
+
+    def watch(state: MPMState) -> Tensor:
+        energies, momenta = solver.energies(state), solver.momenta(state)
+        total = energies["kinetic"] + energies["elastic"]
+        return torch.cat([total[None], momenta["linear"], momenta["angular"]])
+
+    frames = 16
+    run = follow(solver, solver.init_state(points, velocity), 2 / speed / frames, frames * periods, watch)
+    energy, linear, angular = run.series[:, 0], run.series[:, 1:4], run.series[:, 4:]
+    mean = energy[1:].reshape(periods, frames).mean(-1)
+    return run.result(
+        float((mean / mean[0] - 1).abs().max()),
+        growth=float(energy.max() / energy[0] - 1),
+        kept=float(mean[-1] / mean[0]),
+        rise=float((mean[1:] / mean[:-1] - 1).max()) if periods > 1 else 0.0,
+        linear=float((linear - linear[0]).norm(dim=-1).max() / linear[0].norm()),
+        angular=float((angular - angular[0]).norm(dim=-1).max() / angular[0].norm()),
+        substep=omega * float(run.state.time) / run.substeps,
+    )

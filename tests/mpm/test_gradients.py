@@ -1,0 +1,260 @@
+"""Gradients through whole substeps: every input against finite differences, and what long rollouts keep in memory."""
+
+import math
+import weakref
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_iter
+
+from gaussian_swaying.aero.force import AeroForce, aero_force
+from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.materials import FixedCorotated, NeoHookean
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+STEPS, DT, DX, COUNT = 5, 8e-3, 0.15, 15
+SETTINGS = {
+    "total": {"formulation": "total"},
+    "updated": {"formulation": "updated"},
+    "mls": {"formulation": "updated", "mls": True},
+}
+LAWS = {"fixed_corotated": FixedCorotated, "neo_hookean": NeoHookean}
+
+
+def _rest():
+    """A slanting patch of particles, none of them near a plane of half cells, to be held at its upper edge."""
+    generator = torch.Generator().manual_seed(4)
+    x, z = torch.meshgrid(torch.arange(3) * 0.09 + 0.03, torch.arange(5) * 0.09 + 0.02, indexing="ij")
+    position = torch.stack([x, 0.11 + 0.3 * x, z], dim=-1).reshape(-1, 3).double()
+    position = position + 0.02 * torch.rand(COUNT, 3, generator=generator, dtype=torch.float64)
+    return position, 0.5 * torch.randn(COUNT, 3, generator=generator, dtype=torch.float64)
+
+
+REST, VELOCITY = _rest()
+HELD = REST[:, 2] > 0.35
+INPUTS = {  # what each is divided by, so that a derivative says what a relative change does
+    "position": (REST, DX),
+    "velocity": (VELOCITY, 1.0),
+    "youngs_modulus": (4e3, 4e3),
+    "poisson_ratio": (0.3, 0.3),
+    "density": (40.0, 40.0),
+    "wind": (torch.tensor([2.0, 5.0, 1.0], dtype=torch.float64), 5.0),
+    "C_D": (0.6, 0.6),
+    "C_F": (0.4, 0.4),
+    "C_L": (0.2, 0.2),
+}
+FIELDS = ("position", "velocity", "youngs_modulus", "poisson_ratio", "density")
+
+
+def _leaf(name):
+    value, scale = INPUTS[name]
+    return (torch.as_tensor(value, dtype=torch.float64) / scale).clone().requires_grad_()
+
+
+def _patches():
+    normal = torch.tensor([-0.3, 1.0, 0.1], dtype=torch.float64).expand(COUNT, 3)
+    return normal / normal.norm(dim=-1, keepdim=True), torch.full((COUNT,), 0.09**2, dtype=torch.float64)
+
+
+def _start(values, law, **settings):
+    """The solver, its state at rest and the force of the wind, all from tensors that may want gradients."""
+    points = MaterialPoints.create(
+        values["position"],
+        volume=0.09**2 * 0.01,
+        density=values["density"],
+        youngs_modulus=values["youngs_modulus"],
+        poisson_ratio=values["poisson_ratio"],
+        law=law,
+        law_index=None if isinstance(law, FixedCorotated | NeoHookean) else torch.arange(COUNT) % 2,
+    )
+    solver = MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None, None, 0.35], [None, None, None]))], **settings)
+    state = solver.init_state(points, values["velocity"])
+    rest_normal, rest_area = _patches()
+
+    def force(state):
+        normal, area = deform_patch(state.F_total, rest_normal, rest_area)
+        coefficients = {"drag": values["C_D"], "friction": values["C_F"], "lift": values["C_L"]}
+        return aero_force(values["wind"], state.velocity, normal, area, **coefficients)
+
+    return solver, state, force
+
+
+def _values(name=None, leaf=None):
+    """All inputs in SI units, one of them from a scaled leaf."""
+    values = {key: torch.as_tensor(value, dtype=torch.float64) for key, (value, _) in INPUTS.items()}
+    if name is not None:
+        values[name] = leaf * INPUTS[name][1]
+    return values
+
+
+def _check(name, law, **settings):
+    """Five substeps against central differences, and a gradient that is there at all."""
+    generator = torch.Generator().manual_seed(5)
+    weights = torch.randn(4, 12 * COUNT, generator=generator, dtype=torch.float64)
+
+    def run(leaf):
+        solver, state, force = _start(_values(name, leaf), law, **settings)
+        state = solver.rollout(state, DT, STEPS, force)
+        return torch.cat([state.position, state.F_total.flatten(-2)], dim=-1).flatten()
+
+    leaf = _leaf(name)
+    # in full for a few numbers and four mixtures of the outputs, else along one random direction
+    few = leaf.numel() <= 3
+    checked = (lambda leaf: weights @ run(leaf)) if few else run
+    assert torch.autograd.gradcheck(checked, leaf, eps=1e-6, atol=1e-8, rtol=1e-5, fast_mode=not few)
+    gradient = torch.autograd.grad(weights @ run(leaf), leaf, torch.ones(4, dtype=torch.float64))[0]
+    # the tolerance above would let a detached path pass whose gradient is this small
+    assert float(gradient.abs().max()) > 1e-4, f"The gradient by {name} vanishes: {gradient}"
+    if name in ("position", "velocity"):
+        assert bool((gradient.abs().amax(-1) > 1e-6)[~HELD].all())
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("name", INPUTS)
+def test_gradient_of_five_substeps(name, setting, law):
+    """Wind on moving patches, gravity and a pin, by position, F and each input in turn."""
+    _check(name, LAWS[law](), **SETTINGS[setting])
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("name", ["position", "youngs_modulus", "poisson_ratio"])
+def test_gradient_with_damping_and_two_laws(name, setting):
+    """Through the viscous stress, the decay of velocities and the dispatch of particles to their laws."""
+    _check(name, [FixedCorotated(), NeoHookean()], damping=2.0, stiffness_damping=2e-3, **SETTINGS[setting])
+
+
+def _gradients(values, outputs):
+    """Of the summed squares of the outputs, by every input that wants one; a name for each."""
+    loss = sum(output.square().sum() for output in outputs)
+    wanted = {name: value for name, value in values.items() if value.requires_grad}
+    found = torch.autograd.grad(loss, list(wanted.values()))
+    return dict(zip(wanted, found, strict=True))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_gradients_are_finite_at_rest(setting, law):
+    """F = I exactly, no motion, no relative wind, no weight: the roots of zero and repeated stretches of a first step."""
+    values = {name: value.clone().requires_grad_() for name, value in _values().items()}
+    still = torch.zeros_like(VELOCITY)
+    values["velocity"], values["wind"] = still.clone().requires_grad_(), still[0].clone().requires_grad_()
+    solver, state, force = _start(values, LAWS[law](), gravity=(0.0, 0.0, 0.0), **SETTINGS[setting])
+    state = solver.rollout(state, DT, STEPS, force)
+    assert float((state.F_total - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-14
+    gradients = _gradients(values, (state.position, state.F_total))
+    for name, gradient in gradients.items():
+        assert bool(torch.isfinite(gradient).all()), name
+    # the state stays where it is whatever the material, and goes where it is put
+    assert float(gradients["position"].abs().min()) > 0
+    for name in ("youngs_modulus", "poisson_ratio", "density", "C_D", "C_F", "C_L"):
+        assert float(gradients[name].abs().max()) < 1e-12, name
+
+
+@pytest.mark.parametrize("shape", ["inverted", "crushed"])
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_gradients_are_finite_for_an_inverted_element(setting, law, shape):
+    """The whole patch turned inside out along x, or pressed nearly flat."""
+    values = {name: value.clone().requires_grad_() for name, value in _values().items()}
+    solver, state, force = _start(values, LAWS[law](), **SETTINGS[setting])
+    stretch = torch.diag(torch.tensor([-0.7 if shape == "inverted" else 1e-3, 1.1, 0.9], dtype=torch.float64))
+    if setting == "total":
+        nodes = state.grid.node_positions(REST)
+        moved = nodes @ stretch - nodes + state.node_displacement
+        state = solver._read_particles(state, moved, state.node_velocity)
+    else:
+        F = stretch @ state.F_elastic
+        state = state.replace(F_elastic=F, F_total=F)
+    det = torch.linalg.det(state.F_elastic)
+    assert bool((det < 0).all() if shape == "inverted" else (det < 2e-3).all())
+    state = solver.rollout(state, 1e-3, STEPS, force)
+    for name, gradient in _gradients(values, (state.position, state.F_total)).items():
+        assert bool(torch.isfinite(gradient).all()), name
+        assert float(gradient.abs().max()) > 0, name
+
+
+# ---- long rollouts
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_checkpoints_leave_gradients_as_they_are(setting):
+    """Bit for bit: the same operations run again on the same numbers; 20 substeps are no multiple of 7."""
+    found = []
+    for checkpoint in (0, 7):
+        values = {name: value.clone().requires_grad_() for name, value in _values().items()}
+        solver, state, force = _start(values, FixedCorotated(), **SETTINGS[setting])
+        state = solver.rollout(state, 2e-3, 20, force, checkpoint)
+        found.append(_gradients(values, (state.position, state.F_total)) | {"end": state.position.detach()})
+    plain, kept = found
+    for name, gradient in plain.items():
+        assert torch.equal(gradient, kept[name]), name
+        assert float(gradient.abs().max()) > 0, name
+
+
+class _Held(TorchDispatchMode):
+    """Counts the bytes of all storages made under it: those alive now and the most there ever were."""
+
+    def __init__(self):
+        super().__init__()
+        self.now = self.peak = 0
+        self._seen = weakref.WeakKeyDictionary()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for value in tree_iter(result):
+            if not isinstance(value, torch.Tensor):
+                continue
+            storage = value.untyped_storage()
+            if storage not in self._seen:
+                self._seen[storage] = True
+                weakref.finalize(storage, self._free, storage.nbytes())
+                self.now += storage.nbytes()
+                self.peak = max(self.peak, self.now)
+        return result
+
+    def _free(self, size):
+        self.now -= size
+
+
+def _memory(steps, checkpoint):
+    """Bytes alive after the forward pass, at the peak and after the backward pass, and of one state."""
+    values = _values()
+    values["youngs_modulus"] = values["youngs_modulus"].clone().requires_grad_()
+    solver, state, force = _start(values, NeoHookean())
+    with _Held() as held:
+        state = solver.rollout(state, 2e-3, steps, force, checkpoint)
+        forward = held.now
+        state.position.square().sum().backward()
+        size = {}
+        for name in type(state).__slots__:
+            value = getattr(state, name)
+            if isinstance(value, torch.Tensor):
+                size[value.untyped_storage()._cdata] = value.untyped_storage().nbytes()
+        del value
+        return forward, held.peak, held.now, sum(size.values())
+
+
+def test_checkpoints_keep_a_long_rollout_small():
+    """Everything of N substeps is N a bytes; with every k-th state s kept, N / k s + k a: least at the square root."""
+    short, short_peak, _, state = _memory(50, 0)
+    twice, _, _, _ = _memory(100, 0)
+    each = (twice - short) / 50
+    assert short == pytest.approx(50 * each, rel=0.1)
+    assert each > 2 * state
+    steps = 500
+    k = round(math.sqrt(steps))
+    forward, peak, left, _ = _memory(steps, k)
+    print(short, short_peak, each, state, forward, peak, left)
+    # what a segment keeps, its end included, and half as much again for the backward pass itself
+    expected = math.ceil(steps / k) * state + k * each
+    assert math.ceil(steps / k) * state * 0.9 < forward < 1.5 * math.ceil(steps / k) * state
+    assert 0.8 * expected < peak < 1.5 * expected
+    # 500 with checkpoints, against 50 without, and against 500 without
+    assert peak < short_peak
+    assert peak < steps * each / 10
+    assert left < 3 * (state + each)
