@@ -2,7 +2,9 @@
 
 ``python tools/bench.py substep``    one elastic substep; writes docs/results/substep_<device>.json
 ``python tools/bench.py sim``        the main job end to end; writes docs/results/sim_<device>.json
-``python tools/bench.py pages``      docs/benchmarks.md from all recorded JSON
+``python tools/bench.py accuracy``   errors against closed forms; writes docs/results/accuracy_<device>.json
+``python tools/bench.py pareto``     speed against error; writes docs/results/pareto_<device>.json
+``python tools/bench.py pages``      docs/benchmarks.md and docs/validation.md from all recorded JSON
 ``python tools/bench.py pictures``   the README's pictures from a finished run
 """
 
@@ -22,6 +24,8 @@ from typing import Any
 
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
 
+import accuracy as accuracy_cases
+import pareto as pareto_cases
 import torch
 
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -146,6 +150,48 @@ def sim(options: argparse.Namespace) -> None:
     _write(options, f"sim_{device.type}", result)
 
 
+def accuracy(options: argparse.Namespace) -> None:
+    """Measure errors against closed forms and experiments."""
+    device, result = _start(options)
+    result["rows"] = accuracy_cases.measure(device.type, options.thorough, options.only)
+    _write(options, f"accuracy_{device.type}", result)
+    validation_page(options)
+
+
+def pareto(options: argparse.Namespace) -> None:
+    """Measure speed against error over the settings of the solver."""
+    device, result = _start(options)
+    result["kind"], result["threads"] = device.type, torch.get_num_threads()
+    path = Path(options.results) / f"pareto_{device.type}.json"
+    kept = json.loads(path.read_text())["rows"] if options.only and path.exists() else []
+    wanted = options.only.split(",") if options.only else None
+    result["rows"] = [row for row in kept if row["problem"] not in wanted] if wanted else []
+    result["rows"] += pareto_cases.measure(device.type, wanted)
+    _write(options, f"pareto_{device.type}", result)
+    validation_page(options)
+
+
+def validation_page(options: argparse.Namespace) -> None:
+    """Write docs/validation.md and its plots from the recorded JSON."""
+    folder = Path(options.results)
+    docs = folder.parent
+    lines = [
+        "# Validation",
+        "",
+        "Made by `python tools/bench.py accuracy` and `pareto` from the JSON in `docs/results/`. What is demanded of",
+        "float64 is also a test in `tests/validation/`; what nature does is reported.",
+        "",
+    ]
+    recorded = [json.loads(p.read_text()) for p in sorted(folder.glob("accuracy_*.json"))]
+    if recorded:
+        lines += accuracy_cases.page(recorded, docs / "pictures")
+    swept = [json.loads(p.read_text()) for p in sorted(folder.glob("pareto_*.json"))]
+    if swept:
+        lines += ["## Speed against error", "", *pareto_cases.page(swept, docs / "pictures")]
+    (docs / "validation.md").write_text("\n".join(lines).rstrip() + "\n")
+    print(f"wrote {docs / 'validation.md'}")
+
+
 GOALS = {
     "flag_cpu": "flag end to end on 2 CPU cores: within 90 s and 2 GB",
     "substep_cpu": "one elastic substep of 20,000 particles on 2 CPU cores: within 60 ms",
@@ -175,6 +221,7 @@ def pages(options: argparse.Namespace) -> None:
     target = ROOT / "docs" / "benchmarks.md"
     target.write_text("\n".join(lines))
     print(f"wrote {target}")
+    validation_page(options)
 
 
 def _substep_table(result: dict[str, Any]) -> list[str]:
@@ -262,11 +309,15 @@ def main() -> None:
     """Parse and run one command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for function in (substep, sim, pages, pictures):
+    for function in (substep, sim, accuracy, pareto, pages, pictures):
         command = commands.add_parser(function.__name__, help=function.__doc__)
         command.set_defaults(run_command=function)
         command.add_argument("--results", default=str(RESULTS), help="folder of the recorded JSON")
-        if function in (substep, sim):
+        if function in (accuracy, pareto):
+            command.add_argument("--only", help="only the problems with this name (pareto: a list with commas)")
+        if function is accuracy:
+            command.add_argument("--thorough", action="store_true", help="finer grids and full 3D; for a GPU")
+        if function in (substep, sim, accuracy, pareto):
             command.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
         if function is sim:
             command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
