@@ -357,7 +357,8 @@ def _sand(rows: list[Row]) -> list[str]:
         r = row["result"]
         lines += [
             f"Friction angle of the return map at phi = 30 degrees: {r['shear_deg']:.1f} in simple shear (theory "
-            f"34.7), {r['triaxial_deg']:.1f} in triaxial compression, {r['plane_strain_deg']:.1f} in plane strain (43.9).",
+            f"34.7), {r['triaxial_deg']:.1f} in triaxial compression, {r['plane_strain_deg']:.1f} in plane strain "
+            "(43.9).",
             "",
         ]
     for row in select(rows, "sand slope"):

@@ -134,9 +134,9 @@ def page(results: list[dict[str, Any]], pictures: Path) -> list[str]:
     """Lines of the page from the recorded sweeps, one per device; draws a plot of each into a folder."""
     lines = [
         "Every point of the plots is one run. Solid points have a substep that is stable for any arrangement of",
-        f"particles (CFL up to {PROVEN_CFL}); hollow ones are longer and happened to be stable for the regular lattices",
-        "of these problems. The star is the default (`total`, float32, CFL 0.4, adaptive). The line is the Pareto front",
-        "of the solid points.",
+        f"particles (CFL up to {PROVEN_CFL}); hollow ones are longer and happened to be stable for the regular",
+        "lattices of these problems. The star is the default (`total`, float32, CFL 0.4, adaptive). The line is the",
+        "Pareto front of the solid points.",
         "",
     ]
     for result in results:
@@ -185,7 +185,8 @@ def _ratios(rows: list[Row]) -> list[str]:
             ratio = fixed["wall_per_simulated_s"] / row["wall_per_simulated_s"]
             lines.append(
                 f"| {row['size']} | {row['wall_per_simulated_s']:.3g} | {fixed['wall_per_simulated_s']:.3g} "
-                f"| {ratio:.1f} | {row['error']:.4f} | {fixed['error']:.4f} | {abs(row['error'] - fixed['error']):.5f} |"
+                f"| {ratio:.1f} | {row['error']:.4f} | {fixed['error']:.4f} "
+                f"| {abs(row['error'] - fixed['error']):.5f} |"
             )
     return [*lines, ""]
 

@@ -40,8 +40,12 @@ def polar_rotation(matrix: Tensor, iterations: int | None = None) -> Tensor:
     :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F / \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar
     decomposition - with applications"). It converges quadratically to the nearest orthogonal matrix. Where that is a
     reflection (an inverted element), its axis of smallest stretch is turned round, which gives the nearest rotation
-    (Irving, Teran & Fedkiw 2004); that axis counts as constant in the gradient. The gradient is finite at F = I, unlike
-    that of an SVD.
+    (Irving, Teran & Fedkiw 2004).
+
+    The first derivative is the exact one of the limit, :math:`dR = R \Omega` with
+    :math:`\Omega S + S \Omega = R^T dF - dF^T R`, not that of the iteration: it is finite for every F, while that of an
+    SVD is not at F = I. It is limited where two stretches are opposite, since R jumps there. Second derivatives are
+    not available.
 
     Args:
         matrix: Shape (..., 3, 3). A singular matrix gives a finite result that need not be orthogonal.
@@ -51,26 +55,47 @@ def polar_rotation(matrix: Tensor, iterations: int | None = None) -> Tensor:
     Returns:
         Shape (..., 3, 3).
     """
+    with torch.no_grad():
+        constant = matrix.detach()
+        rotation = _nearest_rotation(constant, iterations or (8 if matrix.dtype == torch.float64 else 5))
+    if not (torch.is_grad_enabled() and matrix.requires_grad):
+        return rotation
+    with torch.no_grad():
+        # for the axial vectors of Omega and of the right-hand side: (tr(S) I - S) omega = k
+        stretch = matmul3(rotation.mT, constant)
+        trace = stretch.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        system = trace * torch.eye(3, dtype=matrix.dtype, device=matrix.device) - 0.5 * (stretch + stretch.mT)
+        cof = cofactor(system)
+        finfo = torch.finfo(matrix.dtype)
+        least = finfo.eps**0.5 * system.abs().amax((-1, -2)).pow(3).clamp(min=finfo.tiny**0.5)
+        inverse = cof / torch.maximum(determinant(system, cof), least)[..., None, None]
+    change = matmul3(rotation.mT, matrix - constant)
+    skew = change - change.mT
+    axial = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+    spin = (inverse * axial[..., None, :]).sum(-1)
+    # rows of R times Omega
+    return rotation + torch.linalg.cross(rotation, spin[..., None, :].expand_as(rotation), dim=-1)
+
+
+def _nearest_rotation(matrix: Tensor, iterations: int) -> Tensor:
+    """Value of :func:`polar_rotation`."""
     tiny = torch.finfo(matrix.dtype).tiny ** 0.25
-    if iterations is None:
-        iterations = 8 if matrix.dtype == torch.float64 else 5
     x = matrix
     for _ in range(iterations):
         cof = cofactor(x)
         det = determinant(x, cof)
-        det = torch.where(det.abs() < tiny, torch.where(det < 0, -tiny, tiny), det)[..., None, None]
+        det = det.abs().clamp(min=tiny).copysign(det)[..., None, None]
         inverse_transpose = cof / det
         ratio = inverse_transpose.square().sum((-1, -2), keepdim=True) / x.square().sum((-1, -2), keepdim=True).clamp(
             min=tiny
         )
-        zeta = ratio.clamp(min=tiny).pow(0.25)
+        zeta = ratio.clamp(min=torch.finfo(x.dtype).tiny).pow(0.25)
         x = 0.5 * (zeta * x + inverse_transpose / zeta)
     reflected = (determinant(x) < 0)[..., None, None]
     if x.device.type == "cpu" and not bool(reflected.any()):  # asking a GPU would make the host wait
         return x
-    # the identity stands in for proper rotations, so that nothing odd happens to them
-    stretch = torch.where(reflected, matmul3(x.mT, matrix), torch.eye(3, dtype=x.dtype, device=x.device))
-    axis = _weakest_axis(0.5 * (stretch + stretch.mT)).detach()
+    stretch = matmul3(x.mT, matrix)
+    axis = _weakest_axis(0.5 * (stretch + stretch.mT))
     turned = x - 2 * (x * axis[..., None, :]).sum(-1, keepdim=True) * axis[..., None, :]
     return torch.where(reflected, turned, x)
 

@@ -77,8 +77,8 @@ class ConstitutiveLaw(nn.Module, ABC):
 
         Returns:
             ``wave``, not less than density times the square of any wave speed (against reference gradients), and
-            ``bound``, not less than any eigenvalue of :math:`\partial^2 \Psi / \partial F^2`; shape (...). Neither falls
-            below its value at rest, which is lambda + 2 mu and 3 lambda + 2 mu in a solid.
+            ``bound``, not less than any eigenvalue of :math:`\partial^2 \Psi / \partial F^2`; shape (...). Neither
+            falls below its value at rest: lambda + 2 mu and 3 lambda + 2 mu in a solid, K and 3 K in a fluid.
         """
 
 
@@ -279,7 +279,7 @@ class Snow(_Plastic):
         super().__init__()
         if not 0 <= critical_compression < 1:
             raise ValueError(
-                f"Expected `critical_compression` to lie in [0, 1), but got {critical_compression}; snow has about 0.025."
+                f"Expected `critical_compression` to lie in [0, 1), but got {critical_compression}; snow has 0.025."
             )
         check_positive("critical_stretch", critical_stretch, allow_zero=True)
         check_positive("hardening", hardening, allow_zero=True)

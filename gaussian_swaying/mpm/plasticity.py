@@ -1,9 +1,9 @@
 r"""Return maps: trial principal stretches brought back to the yield surface.
 
-All but snow and fluid work on the logarithmic stretches :math:`\varepsilon_i = \log a_i` of the Hencky energy, in which
-the principal Kirchhoff stresses are :math:`\tau_i = 2 \mu \varepsilon_i + \lambda \sum \varepsilon`. The logarithm is the
-continued one of the constitutive law, so crushed and inverted trial states are defined; where they yield, they come
-back with stretches of 0.05 or more.
+All but snow and fluid work on the logarithmic stretches :math:`\varepsilon_i = \log a_i` of the Hencky energy, where
+the principal Kirchhoff stresses are :math:`\tau_i = 2 \mu \varepsilon_i + \lambda \sum \varepsilon`. The logarithm is
+the continued one of the constitutive law, so crushed and inverted trial states are defined; where they yield, they
+come back with stretches of 0.05 or more.
 
 Every function takes trial stretches (..., 3), Lamé parameters [Pa] (...), the internal variable (...) or None, its own
 parameters and the substep [s], and returns the new stretches and the new internal variable.
@@ -31,11 +31,12 @@ def _split(strain: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _stretch(strain: Tensor) -> Tensor:
-    """Stretches from logarithmic ones, all enlarged by one factor where one would fall below 0.05.
+    """Stretches from logarithmic ones, at least 0.05.
 
-    Further below the Kirchhoff stress fades, and a particle would stay crushed.
+    Further below the Kirchhoff stress fades, and a particle would stay crushed. The limit draws strains together, so it
+    never leads out of a von Mises cylinder.
     """
-    return (strain + (math.log(LOG_LIMIT) - strain.amin(-1, keepdim=True)).clamp(min=0)).exp()
+    return strain.clamp(min=math.log(LOG_LIMIT)).exp()
 
 
 def cone_slope(friction_angle: float) -> float:
@@ -83,9 +84,10 @@ def drucker_prager(
     trace, _, norm, direction = _split(strain)
     excess = norm + cone_slope(friction_angle) * (3 * lam + 2 * mu) / (2 * mu) * trace
     kept = stretch if internal is None else stretch * (internal / 3).exp()[..., None]
-    flowed = _stretch(strain - excess[..., None] * direction)
+    flowed = _stretch(strain - excess.clamp(min=0)[..., None] * direction)
     new = torch.where((excess <= 0)[..., None], kept, flowed)
-    new = torch.where((trace >= 0)[..., None], torch.ones_like(new), new)
+    # at rest, the tip of the cone, "kept" lets gradients pass
+    new = torch.where((trace > 0)[..., None], torch.ones_like(new), new)
     if internal is None:
         return new, None
     return new, internal + logs.sum(-1) - continued_log(new).sum(-1)
@@ -104,9 +106,9 @@ def von_mises(
     r"""Metal: :math:`|\operatorname{dev} \tau| \le \sqrt{2/3} \max(\sigma_y + H \alpha, \sigma_r)`.
 
     Radial return with linear isotropic hardening (Simo & Hughes 1998, "Computational inelasticity", box 3.1). The
-    internal variable is the accumulated plastic strain, :math:`\alpha \mathrel{+}= \sqrt{2/3} \, \Delta\gamma`. The state ends
-    on the yield surface of the new alpha; with softening (H < 0) also where it reaches the residual stress on the way,
-    and where the material softens faster than it unloads, :math:`H \le -3 \mu`.
+    internal variable is the accumulated plastic strain alpha, which grows by :math:`\sqrt{2/3}` of the flow. The state
+    ends on the yield surface of the new alpha; with softening (H < 0) also where it reaches the residual stress on the
+    way, and where the material softens faster than it unloads, :math:`H \le -3 \mu`.
 
     Args:
         stretch: Trial principal stretches, shape (..., 3).
@@ -166,7 +168,7 @@ def viscoplastic(
     over = 2 * mu * norm - _ROOT * yield_stress
     # one minus the factor that is left, without loss of digits for a short substep
     relaxed = -torch.expm1(-2 * mu * dt / viscosity) if viscosity > 0 else torch.ones_like(mu)
-    flow = over * relaxed / (2 * mu)
+    flow = over.clamp(min=0) * relaxed / (2 * mu)
     strain = deviator - flow[..., None] * direction + trace[..., None] / 3
     return torch.where((over > 0)[..., None], _stretch(strain), stretch), internal
 
@@ -197,7 +199,8 @@ def snow_plasticity(
         Stretches (..., 3) and J_p.
     """
     new = stretch.clamp(1 - critical_compression, 1 + critical_stretch)
-    return new, (internal * (stretch / new).prod(-1)).clamp(*SNOW_RANGE)
+    lost = stretch / new
+    return new, (internal * lost[..., 0] * lost[..., 1] * lost[..., 2]).clamp(*SNOW_RANGE)
 
 
 def fluid(

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 
 import torch
-import torch.utils.checkpoint
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
@@ -14,6 +13,7 @@ from gaussian_swaying.mpm.boundary import Boundary, FrameLike, Nodes
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.linalg import matmul3
+from gaussian_swaying.mpm.recompute import detached, leaves_of, recompute
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather, scatter, scatter_momentum
@@ -255,7 +255,7 @@ class MPMSolver(nn.Module):
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
         F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
         limit = stable_limit(self.points, self.dx, F, internal, spatial=not self.total_lagrangian)
-        return damped_substep(float(limit.amin()), self.stiffness_damping)
+        return damped_substep(float(limit.detach().amin()), self.stiffness_damping)
 
     def substeps(self, state: MPMState, frame_dt: float) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
@@ -334,6 +334,7 @@ class MPMSolver(nn.Module):
             force_fn: Gives the force of each substep [N], shape (..., P, 3), from its state.
             checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
                 in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
+                ``force_fn`` must then give the same force each time it sees the same state.
 
         Returns:
             The state ``steps * dt`` later.
@@ -344,11 +345,13 @@ class MPMSolver(nn.Module):
                 state = self.step(state, dt, None if force_fn is None else force_fn(state))
             return state
 
-        if checkpoint <= 0:
+        if checkpoint <= 0 or not torch.is_grad_enabled():
             return advance(state, steps)
+        with torch.enable_grad():
+            leaves = leaves_of(advance(detached(state), 1))
         for first in range(0, steps, checkpoint):
             count = min(checkpoint, steps - first)
-            state = torch.utils.checkpoint.checkpoint(advance, state, count, use_reentrant=False)
+            state = recompute(lambda start, count=count: advance(start, count), state, leaves)
         return state
 
     def _step_total(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
@@ -509,6 +512,6 @@ def _conditions(modules: nn.ModuleList) -> list[Boundary]:
 
 
 def _safe_inverse(mass: Tensor) -> Tensor:
-    """1 / mass where there is any, else 0."""
-    floor = torch.finfo(mass.dtype).tiny * 1e6
+    """1 / mass where there is any, else 0; its derivative, 1 / mass², stays finite too."""
+    floor = torch.finfo(mass.dtype).tiny ** 0.5
     return torch.where(mass > floor, 1 / mass.clamp(min=floor), 0.0)

@@ -101,6 +101,7 @@ def block(
     youngs_modulus: float,
     poisson_ratio: float,
     per_cell: int = 2,
+    shift: float = 0.0,
 ) -> MaterialPoints:
     """A block of fixed corotated material in a box of whole cells; a single layer counts as ``dx`` thick.
 
@@ -113,13 +114,15 @@ def block(
         youngs_modulus: Young's modulus [Pa].
         poisson_ratio: Poisson's ratio.
         per_cell: Points to a cell and axis.
+        shift: How far the body is moved along x, off the planes of the nodes [cells].
 
     Returns:
         The material points.
     """
     volume = math.prod(dx / per_cell if b > a else dx for a, b in zip(low, high, strict=True))
+    position = lattice(dx, low, high, settings, per_cell)
     return MaterialPoints.create(
-        lattice(dx, low, high, settings, per_cell),
+        position + position.new_tensor([shift * dx, 0.0, 0.0]),
         volume=volume,
         density=density,
         youngs_modulus=youngs_modulus,

@@ -8,13 +8,14 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
-from gaussian_swaying.aero.force import AeroForce, aero_force
+from gaussian_swaying.aero.force import aero_force
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.gaussians.surface import deform_patch
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.materials import FixedCorotated, NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.transfer import bspline_stencil, scatter
 
 STEPS, DT, DX, COUNT = 5, 8e-3, 0.15, 15
 SETTINGS = {
@@ -73,7 +74,7 @@ def _start(values, law, **settings):
     )
     solver = MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None, None, 0.35], [None, None, None]))], **settings)
     state = solver.init_state(points, values["velocity"])
-    rest_normal, rest_area = _patches()
+    rest_normal, rest_area = (value.to(values["position"].dtype) for value in _patches())
 
     def force(state):
         normal, area = deform_patch(state.F_total, rest_normal, rest_area)
@@ -139,13 +140,13 @@ def _gradients(values, outputs):
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_gradients_are_finite_at_rest(setting, law):
-    """F = I exactly, no motion, no relative wind, no weight: the roots of zero and repeated stretches of a first step."""
+    """F = I exactly, no motion, no wind, no weight: roots of zero and repeated stretches."""
     values = {name: value.clone().requires_grad_() for name, value in _values().items()}
     still = torch.zeros_like(VELOCITY)
     values["velocity"], values["wind"] = still.clone().requires_grad_(), still[0].clone().requires_grad_()
     solver, state, force = _start(values, LAWS[law](), gravity=(0.0, 0.0, 0.0), **SETTINGS[setting])
     state = solver.rollout(state, DT, STEPS, force)
-    assert float((state.F_total - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-14
+    assert float((state.F_total.detach() - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-14
     gradients = _gradients(values, (state.position, state.F_total))
     for name, gradient in gradients.items():
         assert bool(torch.isfinite(gradient).all()), name
@@ -178,12 +179,30 @@ def test_gradients_are_finite_for_an_inverted_element(setting, law, shape):
         assert float(gradient.abs().max()) > 0, name
 
 
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_gradients_are_finite_beside_a_node_of_vanishing_mass(setting):
+    """In float32 the square of 1 / mass overflows below 5e-20 kg; a particle near a plane gives a node less."""
+    values = {name: value.float() for name, value in _values().items()}
+    position = values["position"].clone()
+    position[0] = torch.tensor([0.075, 0.075, 0.075]) - 1e-3 * DX  # its farthest node has half the cube of 1e-6
+    values["position"] = position
+    values = {name: value.requires_grad_() for name, value in values.items()}
+    solver, state, force = _start(values, FixedCorotated(), **SETTINGS[setting])
+    stencil = bspline_stencil(position.detach(), state.grid)
+    mass = scatter(stencil, solver.points.mass.detach()[:, None, None])[:, 0]
+    assert 1e-32 < float(mass[mass > 0].min()) < 5e-20
+    state = solver.rollout(state, DT, STEPS, force)
+    for name, gradient in _gradients(values, (state.position, state.F_total)).items():
+        assert bool(torch.isfinite(gradient).all()), name
+        assert float(gradient.abs().max()) > 0, name
+
+
 # ---- long rollouts
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_checkpoints_leave_gradients_as_they_are(setting):
-    """Bit for bit: the same operations run again on the same numbers; 20 substeps are no multiple of 7."""
+    """To round-off, as the segments' shares of a gradient are added in another order; 20 is no multiple of 7."""
     found = []
     for checkpoint in (0, 7):
         values = {name: value.clone().requires_grad_() for name, value in _values().items()}
@@ -192,7 +211,7 @@ def test_checkpoints_leave_gradients_as_they_are(setting):
         found.append(_gradients(values, (state.position, state.F_total)) | {"end": state.position.detach()})
     plain, kept = found
     for name, gradient in plain.items():
-        assert torch.equal(gradient, kept[name]), name
+        torch.testing.assert_close(kept[name], gradient, rtol=1e-9, atol=1e-12 * float(gradient.abs().max()))
         assert float(gradient.abs().max()) > 0, name
 
 
@@ -230,13 +249,10 @@ def _memory(steps, checkpoint):
         state = solver.rollout(state, 2e-3, steps, force, checkpoint)
         forward = held.now
         state.position.square().sum().backward()
-        size = {}
-        for name in type(state).__slots__:
-            value = getattr(state, name)
-            if isinstance(value, torch.Tensor):
-                size[value.untyped_storage()._cdata] = value.untyped_storage().nbytes()
-        del value
-        return forward, held.peak, held.now, sum(size.values())
+        left = held.now
+    tensors = [value for value in state.state_dict().values() if isinstance(value, torch.Tensor)]
+    storages = {value.untyped_storage() for value in tensors}  # several fields are views of one
+    return forward, held.peak, left, sum(storage.nbytes() for storage in storages)
 
 
 def test_checkpoints_keep_a_long_rollout_small():
@@ -249,10 +265,10 @@ def test_checkpoints_keep_a_long_rollout_small():
     steps = 500
     k = round(math.sqrt(steps))
     forward, peak, left, _ = _memory(steps, k)
-    print(short, short_peak, each, state, forward, peak, left)
-    # what a segment keeps, its end included, and half as much again for the backward pass itself
-    expected = math.ceil(steps / k) * state + k * each
-    assert math.ceil(steps / k) * state * 0.9 < forward < 1.5 * math.ceil(steps / k) * state
+    kept = math.ceil(steps / k) * state
+    assert 0.9 * kept < forward < 1.5 * kept
+    # and half as much again for the backward pass itself
+    expected = kept + k * each
     assert 0.8 * expected < peak < 1.5 * expected
     # 500 with checkpoints, against 50 without, and against 500 without
     assert peak < short_peak

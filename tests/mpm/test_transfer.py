@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from gaussian_swaying.mpm.state import GridSpec, bounding_grid
-from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, gather, p2g, scatter
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, bounding_grid
+from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, gather, p2g, scatter, scatter_momentum
 
 DX = 0.1
 GRID = GridSpec(DX, (0, 0, 0), (10, 10, 10))
@@ -145,3 +146,198 @@ def test_p2g_rejects_wrong_shape(name, shape):
     particles = {"mass": mass, "velocity": velocity, "affine": affine, name: torch.zeros(shape)}
     with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
         p2g(**particles, stencil=bspline_stencil(position, GRID))
+
+
+# ---- sums in a fixed order
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_deterministic_sums_equal_the_plain_ones(device, dtype, batch):
+    """Also with particles outside the grid and with nodes that none touches."""
+    position, mass, velocity, affine = _particles(device, dtype, *batch, count=200)
+    position[..., 0, :] = 5.0
+    position[..., 7, 2] = -1.0
+    position[..., -1, :] = -1e6
+    plain, fixed = (bspline_stencil(position, GRID, deterministic=d) for d in (False, True))
+    assert plain.order is None
+    assert torch.equal(plain.basis, fixed.basis)
+    assert torch.equal(plain.node, fixed.node)
+    assert plain.inside.sum() == plain.inside.numel() - 3 * (plain.inside.numel() // 200)
+    tol = 50 * torch.finfo(dtype).eps
+    for a, b in zip(p2g(mass, velocity, affine, plain), p2g(mass, velocity, affine, fixed), strict=True):
+        assert a.shape == b.shape
+        torch.testing.assert_close(b, a, rtol=tol, atol=tol)
+    empty = p2g(mass, velocity, affine, fixed)[0] == 0
+    assert bool(empty.any())
+    assert not bool(empty.all())
+    coefficients = torch.rand(*batch, 200, 4, 5, device=device, dtype=dtype)
+    torch.testing.assert_close(scatter(fixed, coefficients), scatter(plain, coefficients), rtol=tol, atol=100 * tol)
+
+
+def test_deterministic_sums_have_the_same_bits_every_time(device):
+    """Many particles at each node: sums by atomics would differ from run to run on a GPU."""
+    position, mass, velocity, affine = _particles(device, torch.float32, count=20000)
+
+    def run():
+        stencil = bspline_stencil(position, GRID, deterministic=True)
+        return torch.cat([t.reshape(-1) for t in p2g(mass, velocity, affine, stencil)])
+
+    first = run()
+    assert all(torch.equal(first, run()) for _ in range(5))
+
+
+def test_deterministic_sums_follow_the_order_of_the_particles(device):
+    """The sum at a node is that of its particles one after the other, not of the order in which threads arrive."""
+    position = torch.full((3, 3), 0.5, device=device)
+    stencil = bspline_stencil(position, GRID, deterministic=True)
+    node = stencil.node.reshape(3, 27)
+    ranked = stencil.node[stencil.order].reshape(27, 3)
+    assert torch.equal(ranked, node[0].sort().values[:, None].expand(27, 3))
+    assert torch.equal(stencil.order.reshape(27, 3) // 27, torch.arange(3, device=device).expand(27, 3))
+
+
+def test_deterministic_scatter_gradcheck(device):
+    """Of a sum with particles inside, at one place, and outside the grid, in a batch of two."""
+    position, mass, velocity, affine = _particles(device, torch.float64, 2, count=4)
+    position[:, 1] = position[:, 0]
+    position[:, 3] = 3.0
+    inputs = [t.requires_grad_() for t in (position, mass, velocity, affine)]
+
+    def run(x, m, v, c):
+        return p2g(m, v, c, bspline_stencil(x, GRID, deterministic=True))
+
+    assert torch.autograd.gradcheck(run, inputs, fast_mode=True)
+    plain = torch.autograd.grad(p2g(*inputs[1:], bspline_stencil(inputs[0], GRID))[1].square().sum(), inputs)
+    fixed = torch.autograd.grad(run(*inputs)[1].square().sum(), inputs)
+    for a, b in zip(plain, fixed, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_deterministic_runs_have_the_same_bits(formulation, device):
+    """Whole steps, and equal to those in any order to round-off."""
+    position, mass, velocity, _ = _particles(device, torch.float32, count=4000)
+    points = MaterialPoints.create(position, volume=5e-5, density=50 * mass, youngs_modulus=1e4, poisson_ratio=0.3)
+    ends = []
+    for fixed in (True, True, False):
+        solver = MPMSolver(dx=0.1, formulation=formulation, deterministic=fixed)
+        ends.append(solver.rollout(solver.init_state(points, velocity), 5e-4, 20))
+    for name in ("position", "velocity", "F_total", "affine"):
+        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))
+    torch.testing.assert_close(ends[0].position, ends[2].position, rtol=0, atol=1e-5)
+
+
+# ---- MLS-MPM
+
+
+def test_stencil_without_gradients_keeps_value_and_moments(device, dtype):
+    position = _particles(device, dtype)[0]
+    whole, small = bspline_stencil(position, GRID), bspline_stencil(position, GRID, gradients=False)
+    assert small.basis.shape == (64, 4, 27)
+    assert torch.equal(small.basis, whole.basis[:, [0, 4, 5, 6]])
+    assert torch.equal(small.node, whole.node)
+    assert bspline_stencil(position, GRID, moments=False, gradients=False).basis.shape == (64, 1, 27)
+    field = torch.rand(GRID.node_count, 3, device=device, dtype=dtype)
+    v, c, gradient = g2p(field, small, DX)
+    reference = g2p(field, whole, DX)
+    tol = 100 * torch.finfo(dtype).eps
+    torch.testing.assert_close(v, reference[0], rtol=tol, atol=tol)
+    torch.testing.assert_close(c, reference[1], rtol=tol, atol=tol / DX)
+    assert torch.equal(gradient, c)
+
+
+@pytest.mark.parametrize("mls", [False, True])
+def test_scatter_momentum_is_the_sum_that_it_says(mls):
+    """Written out with loops: sum over p of w (m (v + C d) + j) - S grad(w), in MLS-MPM with w d 4/dx² for grad(w)."""
+    position, mass, velocity, affine = _particles("cpu", torch.float64, count=6)
+    impulse, stress = torch.randn(6, 3).double(), torch.randn(6, 3, 3).double()  # not symmetric: a transpose shows
+    stencil = bspline_stencil(position, GRID, gradients=not mls)
+    found = scatter_momentum(mass, velocity, affine, impulse, stress, stencil, 4 / DX**2 if mls else None)
+
+    def weight(x):
+        x = x.abs()
+        return torch.where(x < 0.5, 0.75 - x**2, torch.where(x < 1.5, 0.5 * (1.5 - x) ** 2, torch.zeros_like(x)))
+
+    expected = torch.zeros(GRID.node_count, 4, dtype=torch.float64)
+    for i, node in enumerate(GRID.node_positions(position)):
+        for p in range(6):
+            d = node - position[p]
+            if float(d.abs().max()) > 1.5 * DX:
+                continue
+            place = position[p].clone().requires_grad_()
+            w = weight((node - place) / DX).prod()
+            (gradient,) = torch.autograd.grad(w, place)
+            w = w.detach()
+            slope = w * d * 4 / DX**2 if mls else gradient
+            expected[i, :3] += w * (mass[p] * (velocity[p] + affine[p] @ d) + impulse[p]) - stress[p] @ slope
+            expected[i, 3] += w * mass[p]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+def _body(count=150):
+    position = 0.4 * torch.rand(count, 3, dtype=torch.float64)
+    return MaterialPoints.create(position, volume=0.4**3 / count, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+
+
+@pytest.mark.parametrize("beta", [0.0, 2e-3])
+def test_mls_steps_conserve_both_momenta(beta):
+    """A body that deforms, spins and is stressed, with and without stiffness damping."""
+    points = _body()
+    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=True, stiffness_damping=beta)
+    a = torch.tensor([[0.5, -0.8, 0.3], [0.8, 0.5, -0.1], [-0.5, 0.2, -0.4]], dtype=torch.float64)
+    state = solver.init_state(points, (points.position - 0.2) @ a.T + 0.3)
+    state = state.replace(affine=a.expand_as(state.affine))
+    before = solver.momenta(state)
+    end = solver.rollout(state, 5e-4, 50)
+    assert float((end.F_elastic - state.F_elastic).abs().max()) > 1e-3
+    scale = float(before["linear"].norm() + before["angular"].norm())
+    after = solver.momenta(end)
+    for name in before:
+        torch.testing.assert_close(after[name], before[name], rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("mls", [False, True])
+def test_stress_changes_the_moment_of_momentum_by_the_virial(mls):
+    """In one step from rest, sum of m v x^T = -dt sum of V tau, for any stress: the scale of the stress term."""
+    points, dt = _body(), 1e-3
+    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=mls)
+    F = torch.eye(3).double() + 0.1 * torch.randn(150, 3, 3).double()
+    state = solver.init_state(points).replace(F_elastic=F, F_total=F)
+    end = solver.step(state, dt)
+    mass = points.mass[:, None, None]
+    moment = (mass * (end.velocity[:, :, None] * points.position[:, None, :] + 0.1**2 / 4 * end.affine)).sum(0)
+    virial = (points.volume[:, None, None] * solver.laws.kirchhoff(F, None)).sum(0)
+    torch.testing.assert_close(moment, -dt * virial, rtol=0, atol=1e-12 * float(virial.abs().max()))
+
+
+def test_mls_free_fall_and_affine_motion_are_exact():
+    points, dt = _body(), 1e-3
+    solver = MPMSolver(dx=0.1, formulation="updated", mls=True)
+    end = solver.rollout(solver.init_state(points), dt, 50)
+    fall = torch.tensor([0.0, 0.0, -9.8 * dt * dt * 50 * 51 / 2], dtype=torch.float64)
+    torch.testing.assert_close(end.position, points.position + fall, rtol=0, atol=1e-12)
+    torch.testing.assert_close(end.F_elastic, torch.eye(3).double().expand_as(end.F_elastic), rtol=0, atol=1e-12)
+    a = torch.tensor([[0.1, 0.4, 0.0], [-0.3, 0.2, 0.1], [0.0, 0.2, -0.1]], dtype=torch.float64)
+    solver = MPMSolver(dx=0.1, formulation="updated", mls=True, gravity=(0, 0, 0))
+    state = solver.init_state(points, points.position @ a.T)
+    end = solver.step(state.replace(affine=a.expand_as(state.affine)), dt)
+    expected = torch.eye(3, dtype=torch.float64) + dt * a
+    torch.testing.assert_close(end.F_elastic, expected.expand_as(end.F_elastic), rtol=0, atol=1e-12)
+
+
+def test_mls_is_another_discretisation_of_the_same_body():
+    """Near the plain one where the motion is smooth, and not the same."""
+    points = _body(400)
+    velocity = torch.zeros_like(points.position)
+    velocity[:, 0] = -torch.cos(torch.pi * points.position[:, 0] / 0.4)
+    ends = []
+    for mls in (False, True):
+        solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0), mls=mls)
+        ends.append(solver.rollout(solver.init_state(points, velocity), 5e-4, 40).position)
+    moved = float((ends[0] - points.position).norm(dim=-1).max())
+    assert 0 < float((ends[0] - ends[1]).norm(dim=-1).max()) < 0.3 * moved
+
+
+def test_mls_in_the_total_formulation_is_refused():
+    with pytest.raises(ValueError, match=r"`mls` is a variant of the updated formulation: set `formulation`"):
+        MPMSolver(formulation="total", mls=True)

@@ -1,0 +1,109 @@
+"""Gradients through long rollouts in the memory of a short one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.state import MPMState
+
+Advance = Callable[[MPMState], MPMState]
+Layout = dict[str, tuple[int | None, Any]]
+
+
+def leaves_of(state: MPMState) -> list[Tensor]:
+    """The tensors with ``requires_grad`` that a state was computed from."""
+    pending: list[Any] = [t.grad_fn for t in _flatten(state)[1] if t.grad_fn is not None]
+    seen, found = set(pending), []
+    while pending:
+        node = pending.pop()
+        if hasattr(node, "variable"):
+            found.append(node.variable)
+        for following, _ in node.next_functions:
+            if following is not None and following not in seen:
+                seen.add(following)
+                pending.append(following)
+    return found
+
+
+def detached(state: MPMState) -> MPMState:
+    """The state without its history."""
+    layout, tensors = _flatten(state)
+    return _unflatten(layout, [t.detach() for t in tensors])
+
+
+def recompute(advance: Advance, state: MPMState, leaves: Sequence[Tensor]) -> MPMState:
+    """Advance a state without keeping what the gradient needs: the backward pass computes it again.
+
+    ``torch.utils.checkpoint`` keeps the graph and forgets only its tensors, and the graph of thousands of substeps is
+    large. Here nothing is left but the state and one node.
+
+    Args:
+        advance: Computes the later state; must give the same result each time.
+        state: Where to start.
+        leaves: Tensors beside the state that ``advance`` depends on and that need a gradient (see :func:`leaves_of`).
+
+    Returns:
+        ``advance(state)``.
+    """
+    before, start = _flatten(state)
+    after: list[Layout] = []
+
+    def run(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        layout, out = _flatten(advance(_unflatten(before, tensors)))
+        after[:] = [layout]
+        return tuple(out)
+
+    out = _Recompute.apply(run, len(start), *start, *leaves)
+    return _unflatten(after[0], out)
+
+
+def _flatten(state: MPMState) -> tuple[Layout, list[Tensor]]:
+    """The different tensors of a state (F_total may be F_elastic), and where each field finds its own or its value."""
+    values = {f.name: getattr(state, f.name) for f in dataclasses.fields(MPMState)}
+    unique = {id(v): v for v in values.values() if isinstance(v, Tensor)}
+    place = {key: k for k, key in enumerate(unique)}
+    layout = {n: (place[id(v)], None) if isinstance(v, Tensor) else (None, v) for n, v in values.items()}
+    return layout, list(unique.values())
+
+
+def _unflatten(layout: Layout, tensors: Sequence[Tensor]) -> MPMState:
+    return MPMState(**{n: value if k is None else tensors[k] for n, (k, value) in layout.items()})
+
+
+class _Recompute(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, run: Callable[..., tuple[Tensor, ...]], count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.run, ctx.count, ctx.leaves = run, count, tensors[count:]
+        ctx.save_for_backward(*tensors[:count])
+        out = run([t.detach() for t in tensors[:count]])
+        ctx.mark_non_differentiable(*(t for t in out if not t.is_floating_point()))
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[2 : 2 + ctx.count]
+        start = [t.detach().requires_grad_(n) for t, n in zip(ctx.saved_tensors, needed, strict=True)]
+        with torch.enable_grad():
+            out = ctx.run(start)
+        pairs = [(o, g) for o, g in zip(out, grads, strict=True) if g is not None and o.requires_grad]
+        inputs = [*start, *ctx.leaves]
+        wanted = [k for k, t in enumerate(inputs) if t.requires_grad]
+        found: list[Tensor | None] = [None] * len(inputs)
+        if pairs and wanted:
+            # retained: what lies between the leaves and the material is shared by all segments
+            gradients = torch.autograd.grad(
+                [o for o, _ in pairs],
+                [inputs[k] for k in wanted],
+                [g for _, g in pairs],
+                retain_graph=True,
+                allow_unused=True,
+            )
+            for k, gradient in zip(wanted, gradients, strict=True):
+                found[k] = gradient
+        return None, None, *found

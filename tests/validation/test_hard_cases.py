@@ -1,0 +1,812 @@
+"""Hard cases: each ends healthy, within a bound from physics, or in an error that says what, where, why and the remedy.
+
+With the environment variable GAUSSIAN_SWAYING_RECORD naming a folder, the long run (``-m slow``) writes
+``long_flag.json`` there.
+"""
+
+import dataclasses
+import itertools
+import json
+import math
+import os
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
+from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.gaussians.ply import GaussianCloud
+from gaussian_swaying.gaussians.selection import Box, Everything
+from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, VelocityBox
+from gaussian_swaying.mpm.linalg import determinant, singular_values
+from gaussian_swaying.mpm.materials import (
+    FixedCorotated,
+    Fluid,
+    Foam,
+    Metal,
+    NeoHookean,
+    Plasticine,
+    Sand,
+    Snow,
+    StVKHencky,
+)
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
+from gaussian_swaying.simulation.pipeline import SimulationPipeline, describe_device, versions
+from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+
+FORMULATIONS = ["total", "updated"]
+UP = (0.0, 0.0, -9.8)
+CFL = 0.2
+
+# Symplectic Euler keeps a shadow energy, which differs from the true one by at most a share omega dt / 2 of it; with
+# omega dt = 2 at cfl = 0.47 that share is cfl / 0.47. The energy of a free body stays within the ratio of the two ends.
+SHARE = CFL / 0.47
+SHADOW = (1 + SHARE) / (1 - SHARE)
+
+
+class _Cloud(ProceduralScene):
+    """Round Gaussians at given places."""
+
+    def __init__(self, position, scales=(0.02, 0.02, 0.02)):
+        count = len(position)
+        self.cloud = GaussianCloud(
+            position.float(),
+            torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+            torch.tensor(scales).log().repeat(count, 1),
+            torch.full((count,), 4.0),
+            torch.zeros(count, 1, 3),
+        )
+
+    def generate(self):
+        return self.cloud
+
+
+class _Broken(Modulation):
+    """A wind that multiplies itself by something impossible."""
+
+    def __init__(self, factor):
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, velocity, time, seed, stream):
+        return velocity * self.factor
+
+
+def _lattice(*counts, spacing=0.05, low=(0.0, 0.0, 0.0), dtype=torch.float32):
+    axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * spacing for n in counts]
+    position = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    return (position + torch.tensor(low, dtype=torch.float64)).to(dtype)
+
+
+def _points(position, spacing=0.05, **material):
+    given = {"volume": spacing**3, "density": 1000.0, "youngs_modulus": 1e5, "poisson_ratio": 0.3}
+    return MaterialPoints.create(position, **(given | material))
+
+
+def _pipeline(points, boundaries=(), wind=None, aero=None, dx=0.1, frame_dt=0.01, gravity=(0, 0, 0), **solver):
+    """A pipeline around given material; it recentres, so that places are those of the scene."""
+    scene = SimulatedScene(Scene(generator=_Cloud(points.position)), Material(), dx, points.position.dtype)
+    scene.points = dataclasses.replace(points, position=scene.frame.point_to_sim(points.position))
+    solver = MPMSolver(dx=dx, gravity=gravity, boundaries=boundaries, **({"cfl": CFL} | solver))
+    still = aero or AeroForce(C_D=0.0, C_F=0.0, C_L=0.0)
+    camera = OrbitCamera(width=8, height=8)
+    return SimulationPipeline(scene, solver, wind or WindField(), still, None, camera, frame_dt=frame_dt)
+
+
+def _flag(wind, formulation, material=None, aero=None, width=0.8, spacing=0.1, dx=0.2, frame_dt=0.04, **solver):
+    """A flag on its pole, without gravity unless given."""
+    source = FlagScene(width=width, height=0.4, spacing=spacing)
+    scene = SimulatedScene(Scene(generator=source), material or Material(E=1e4, density=40.0), dx)
+    pole = PinnedRegion(Box([None, None, None], [1.1 * spacing, None, None]))
+    solver = {"gravity": (0.0, 0.0, 0.0), "boundaries": [pole], "cfl": CFL, **solver}
+    solver = MPMSolver(dx=dx, formulation=formulation, **solver)
+    camera = OrbitCamera(width=8, height=8)
+    return SimulationPipeline(scene, solver, wind, aero or AeroForce(), None, camera, frame_dt=frame_dt)
+
+
+def _throw(pipeline, velocity):
+    """The state at rest with a velocity."""
+    pipeline.start()
+    scene = pipeline.scene
+    velocity = torch.as_tensor(velocity, dtype=scene.points.position.dtype).expand_as(scene.points.position)
+    return pipeline.solver.init_state(scene.points, velocity, frame=scene.frame)
+
+
+def _shear(position, rate=5.0):
+    """A velocity field that strains and turns [m/s]."""
+    x = position - position.mean(0)
+    return torch.stack([rate * x[:, 2], torch.zeros_like(x[:, 0]), -0.5 * rate * x[:, 0]], -1)
+
+
+def _advance(pipeline, frames, state=None):
+    """The state after some frames and the health of all, the first one included; whatever diverges is raised."""
+    state = pipeline.start() if state is None else state
+    log = [diagnose(pipeline.solver, state, 0, 0.0)]
+    for _ in range(frames):
+        state, health = pipeline.advance(state)
+        log.append(health)
+        assert all(math.isfinite(value) for value in health.as_dict().values())
+        assert health.lost == 0
+    return state, log
+
+
+def _energy(health):
+    return health.kinetic + health.elastic + health.potential
+
+
+def _gain(log):
+    """The most that the mechanical energy ever lay above that of the start and the work of the wind since [J]."""
+    work = list(itertools.accumulate(health.wind_work for health in log))
+    return max(_energy(health) - _energy(log[0]) - done for health, done in zip(log, work, strict=True))
+
+
+def _assert_conserved(pipeline, log, reference=None):
+    """No more energy than at the start but for the shadow, and the momentum of the start to round-off of float32."""
+    start = _energy(log[0])
+    assert max(_energy(health) for health in log) <= SHADOW * start
+    mass = float(pipeline.solver.points.mass.sum())
+    for name in ("momentum_x", "momentum_y", "momentum_z"):
+        # each of a few thousand substeps rounds a momentum of that of the whole body by eps at most
+        bound = sum(health.substeps for health in log) * 2**-23 * math.sqrt(2 * mass * start)
+        assert abs(getattr(log[-1], name) - getattr(log[0], name)) < bound
+
+
+# ---- contrasts of material
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize(
+    "case", ["E from 1e2 to 1e9", "density 1 to 1000", "nu 0.499", "nu -0.5", "one particle a million times lighter"]
+)
+def test_contrasts_within_one_body(case, formulation):
+    """A free block in shear: energy and momentum stay, and no volume changes by more than the energy could pay."""
+    position = _lattice(3, 3, 4)
+    fields, frame_dt, frames = {}, 0.01, 6
+    if case.startswith("E"):
+        stiffness = 10 ** (2 + 7 * torch.rand(36, generator=torch.Generator().manual_seed(0)))
+        stiffness[0], stiffness[-1] = 1e2, 1e9
+        fields, frame_dt, frames = {"youngs_modulus": stiffness}, 2e-3, 4
+    elif case.startswith("density"):
+        fields, frame_dt = {"density": torch.where(position[:, 2] > 0.1, 1000.0, 1.0)}, 2e-3
+    elif case.startswith("nu"):
+        fields = {"poisson_ratio": float(case.split()[1])}
+    else:
+        light = torch.arange(36) == 17
+        # of the same wave speed, so that the substep is not a thousand times shorter
+        fields = {"density": torch.where(light, 1e-3, 1e3), "youngs_modulus": torch.where(light, 0.1, 1e5)}
+    pipeline = _pipeline(_points(position, **fields), formulation=formulation, frame_dt=frame_dt)
+    state, log = _advance(pipeline, frames, _throw(pipeline, _shear(position)))
+    _assert_conserved(pipeline, log)
+    points, laws = pipeline.solver.points, pipeline.solver.laws
+    # energy density >= K / 2 (J - 1)² for a solid with lambda > 0, and mu (a - 1)² for any
+    paid = SHADOW * _energy(log[0]) / points.volume
+    stretch = singular_values(state.F_elastic)
+    assert bool(((stretch - 1).abs().amax(-1) <= (paid / laws.mu).sqrt()).all())
+    if case == "nu 0.499":
+        assert bool(((determinant(state.F_elastic) - 1).abs() <= (2 * paid / laws.lam).sqrt()).all())
+    # as a whole it goes on as it was thrown: no particle outruns the fastest one by an elastic stretch of its size
+    assert log[-1].displacement_max < 2 * float(_shear(position).norm(dim=-1).max()) * frame_dt * frames
+
+
+# ---- inverted elements
+
+
+@pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
+def test_an_inverted_body_turns_back(law):
+    """`total`, a block mirrored onto itself and shaken: all det F are positive in the end, the energy never grows."""
+    position = _lattice(3, 3, 3)
+    pipeline = _pipeline(_points(position, law=law()), formulation="total", damping=20.0, frame_dt=2e-3)
+    state = pipeline.start()
+    nodes = state.grid.node_positions(position)
+    noise = 5e-3 * torch.randn(nodes.shape, generator=torch.Generator().manual_seed(0))
+    mirror = torch.diag(torch.tensor([-0.1, 1.1, 0.9]))
+    moved = nodes @ (mirror - torch.eye(3)).T + noise
+    state = pipeline.solver.step(state.replace(node_displacement=moved), 1e-9)
+    assert bool((determinant(state.F_elastic) < 0).all())
+    state, log = _advance(pipeline, 25, state)
+    assert bool((determinant(state.F_elastic) > 0).all())
+    assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
+
+
+@pytest.mark.xfail(strict=True, reason="the stiffness that a body passes through within a frame is never seen")
+def test_a_deeply_inverted_body_does_not_gain_energy():
+    """`total`, neo-Hookean, det F = -0.6: the substep is that of the frame's start and is checked at its end only."""
+    position = _lattice(3, 3, 3)
+    pipeline = _pipeline(_points(position, law=NeoHookean()), formulation="total", damping=20.0, frame_dt=1e-3, cfl=0.1)
+    state = pipeline.start()
+    nodes = state.grid.node_positions(position)
+    noise = 5e-3 * torch.randn(nodes.shape, generator=torch.Generator().manual_seed(0))
+    moved = nodes @ torch.diag(torch.tensor([-1.6, 0.1, -0.1])) + noise
+    state = pipeline.solver.step(state.replace(node_displacement=moved), 1e-7)
+    _, log = _advance(pipeline, 30, state)
+    assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
+
+
+@pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
+def test_inverted_particles_of_updated_flatten(law):
+    """`updated` moves F by (I + dt grad v) F, so det F goes to zero and never through it: no worse, and no energy.
+
+    Lone particles, so that each goes its own way.
+    """
+    position = _lattice(3, 2, 2, spacing=0.5)
+    points = _points(position, law=law(), volume=1e-3)
+    pipeline = _pipeline(points, formulation="updated", damping=20.0, frame_dt=5e-3)
+    F = torch.eye(3) + 0.4 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(1))
+    F[::4] = F[::4] @ torch.diag(torch.tensor([-0.5, 1.0, 1.0]))
+    before = determinant(F)
+    inverted = before < 0
+    assert 3 <= int(inverted.sum()) < 12
+    state, log = _advance(pipeline, 8, pipeline.start().replace(F_elastic=F, F_total=F))
+    after = determinant(state.F_elastic)
+    assert bool((after[inverted].abs() < before[inverted].abs()).all())
+    assert bool((after[~inverted] > 0).all())
+    assert _energy(log[-1]) < _energy(log[0])
+    assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
+
+
+# ---- impacts
+
+
+LAWS = {
+    "elastic": (FixedCorotated, 1e7),
+    "soft elastic": (FixedCorotated, 1e5),
+    "neo-Hookean": (NeoHookean, 1e7),
+    "sand": (Sand, 1e7),
+    "metal": (lambda: Metal(1e5), 1e7),
+    "snow": (Snow, 1e6),
+    "foam": (lambda: Foam(1e3, 10.0), 1e6),
+    "plasticine": (lambda: Plasticine(1e4, 1e4, 1e3), 1e6),
+    "fluid": (Fluid, 1e6),
+}
+
+
+@pytest.mark.parametrize(
+    ("law", "formulation"),
+    [(name, f) for name in LAWS for f in FORMULATIONS if f == "updated" or "elastic" in name or "Hookean" in name],
+)
+def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
+    """It stays above the plane (in `total` a node's width above), and neither gains energy nor bounces any faster."""
+    make, stiffness = LAWS[law]
+    position = _lattice(3, 3, 3, low=(0, 0, 0.05))
+    points = _points(position, law=make(), youngs_modulus=stiffness)
+    plane = Plane([0, 0, 0], [0, 0, 1])
+    pipeline = _pipeline(points, [plane], formulation=formulation, frame_dt=2e-3, gravity=UP)
+    state, log = _advance(pipeline, 6, _throw(pipeline, [0.0, 0.0, -50.0]))
+    assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
+    mass = float(points.mass.sum())
+    assert abs(log[-1].momentum_z) <= 50.0 * mass
+    assert log[-1].momentum_z > -0.1 * 50.0 * mass  # it has been stopped
+    height = pipeline.scene.frame.point_to_scene(state.position)[:, 2]
+    # `updated` stops lattice nodes below the plane; in `total` a node acts at the centre of its mass, and particles
+    # hang around it within a cell
+    assert float(height.min()) > (0.0 if formulation == "updated" else -0.1)
+
+
+@pytest.mark.parametrize("kind", ["sticky", "separate"])
+def test_a_snowball_on_a_wall(kind):
+    """At 20 m/s: packed, not inverted, less energy than before, and nothing behind the wall."""
+    x = _lattice(4, 4, 4)
+    x = x[(x - x.mean(0)).norm(dim=-1) < 0.1]
+    wall = Plane([0.25, 0, 0], [-1, 0, 0], kind)
+    pipeline = _pipeline(_points(x, density=400.0, law=Snow()), [wall], formulation="updated", frame_dt=4e-3)
+    state, log = _advance(pipeline, 6, _throw(pipeline, [20.0, 0.0, 0.0]))
+    assert _energy(log[-1]) < 0.9 * _energy(log[0])
+    assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
+    assert min(health.J_min for health in log) > 0
+    assert float(pipeline.scene.frame.point_to_scene(state.position)[:, 0].max()) < 0.25
+
+
+# ---- thin, small, few
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("cells", [0.25, 0.5, 1.0, 2.0, 4.0])
+def test_a_sheet_of_one_layer_and_some_cells_thick(cells, formulation):
+    """Thickness changes mass and stiffness alike: the flag gains what the wind works, in `updated` at most that."""
+    material = Material(E=1e4, density=40.0, thickness=0.2 * cells)
+    pipeline = _flag(WindField([6.0, 3.0, 0.0]), formulation, material)
+    _, log = _advance(pipeline, 5)
+    work = sum(health.wind_work for health in log)
+    assert work > 0
+    assert _gain(log) <= SHARE * work
+    if formulation == "total":
+        assert _energy(log[-1]) >= (1 - SHARE) * work
+    assert log[-1].torn == 0
+
+
+@pytest.mark.xfail(strict=True, reason="a sheet whose particles share no node falls apart without a word")
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_sheet_coarser_than_its_grid_is_reported(formulation):
+    """Particles four cells apart share no node: the flag cannot hang on its pole, which has to be said somewhere."""
+    with pytest.raises((ValueError, SimulationDiverged)):
+        _advance(_flag(WindField(), formulation, dx=0.025, width=0.4, gravity=UP), 3)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize(
+    ("places", "name"),
+    [([[0.3, 0.2, 0.1]], "one"), ([[0.3, 0.2, 0.1]] * 2, "two at one place")],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_particles_without_neighbours_fall(places, name, formulation, request):
+    """Two at the same place stay together; either way z = -g t (t + dt) / 2, exactly what symplectic Euler gives."""
+    if name == "one" and formulation == "updated":
+        reason = "the gauge of torn particles asks for the neighbours of a single one: IndexError"
+        request.applymarker(pytest.mark.xfail(strict=True, raises=IndexError, reason=reason))
+    pipeline = _pipeline(_points(torch.tensor(places)), formulation=formulation, gravity=UP)
+    state, log = _advance(pipeline, 10)
+    dt = 0.01 / log[-1].substeps
+    fallen = (state.position - pipeline.solver.points.position)[:, 2].double()
+    expected = -0.5 * 9.8 * 0.1 * (0.1 + dt)
+    # position and velocity are rounded in each of the substeps
+    steps = sum(health.substeps for health in log)
+    assert len({health.substeps for health in log[1:]}) == 1
+    torch.testing.assert_close(fallen, torch.full_like(fallen, expected), rtol=steps * 2**-23, atol=steps * 2**-26)
+    assert torch.equal(state.position[0], state.position[-1])
+    assert log[-1].stretch_max == pytest.approx(1.0, abs=steps * 2**-20)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("side", [0.08, 1e-3, 1e-6])
+def test_a_body_within_one_cell(side, formulation):
+    """Thinner than a cell every way: it flies and turns as any body does, and conserves its momentum."""
+    position = _lattice(2, 2, 2, spacing=side / 2, low=(0.21, 0.21, 0.21))
+    points = _points(position, volume=1e-6)
+    pipeline = _pipeline(points, formulation=formulation)
+    velocity = _shear(position, 5.0) + torch.tensor([1.0, 0.0, 0.0])
+    _, log = _advance(pipeline, 10, _throw(pipeline, velocity))
+    _assert_conserved(pipeline, log)
+    assert log[-1].displacement_mean == pytest.approx(0.1, rel=0.05)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_chain_of_stiff_and_soft_links_hangs(formulation):
+    """Let go at once it stretches twice the static sum of weight / (E A), at most: one particle carries one link."""
+    links, h = 6, 0.05
+    position = _lattice(1, 1, links, spacing=h)
+    stiffness = torch.tensor([1e6, 5e4] * (links // 2))
+    points = _points(position, youngs_modulus=stiffness, poisson_ratio=0.0)
+    pin = PinnedRegion(Box([None, None, 0.26], [None, None, None]), held_share=0.2)
+    # dx = h: neighbours share nodes, and a link is as long as a cell
+    pipeline = _pipeline(points, [pin], formulation=formulation, dx=h, gravity=UP)
+    state, log = _advance(pipeline, 30)
+    weight = 9.8 * points.mass.cumsum(0)  # what hangs at each link, itself included
+    static = float((weight * h / (stiffness * h**2)).sum())
+    longest = max(health.displacement_max for health in log)
+    assert longest <= 2 * static
+    assert longest > 0.2 * static
+    assert bool(torch.isfinite(state.position).all())
+    assert _gain(log) <= SHARE * 9.8 * float(points.mass.sum()) * 2 * static
+
+
+# ---- storms
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("drag_step", ["semi_implicit", "explicit"])
+def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
+    """100 m/s, 0.02 kg/m²: the energy is the work of the wind, and explicit drag takes the substeps that it needs."""
+    material = Material(E=2e4, density=2.0)
+    aero = AeroForce(C_D=1.2, C_F=0.1, C_L=0.0, law="projected", drag_step=drag_step)
+    pipeline = _flag(WindField([30.0, 95.0, 0.0]), formulation, material, aero, width=0.4, frame_dt=0.01)
+    if drag_step == "explicit":
+        rate = 1.225 * 1.3 * 99.6 / 0.02
+        assert pipeline._substeps(pipeline.start()) >= 0.01 * rate / 2
+    try:
+        _, log = _advance(pipeline, 4)
+    except SimulationDiverged as error:
+        assert formulation == "updated", error  # a storm may take a soft sheet apart, but says so
+        assert error.particle is not None
+        assert "Remedy" in str(error)
+        return
+    work = sum(health.wind_work for health in log)
+    assert work > 0
+    assert _gain(log) <= SHARE * work
+    # drag ends where the sheet moves with the air: kinetic energy at twice the wind would need a slingshot
+    assert max(health.kinetic for health in log) <= 0.5 * float(pipeline.solver.points.mass.sum()) * 200.0**2
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_gusts_that_turn_round_every_frame(formulation):
+    """+-12 m/s, 25 reversals: the energy is the work of the wind, which no net flow adds up."""
+    keys = [FlowKey(0.04 * k, [0.0, 12.0 * (-1) ** k, 0.0]) for k in range(25)]
+    pipeline = _flag(WindField(schedule=keys), formulation, width=0.4)
+    state, log = _advance(pipeline, 25)
+    paid = sum(abs(health.wind_work) for health in log)
+    assert paid > 0
+    assert _gain(log) <= SHARE * paid
+    # quasi-steady drag can take a free patch no farther than the wind goes in a frame
+    assert max(health.displacement_max for health in log) < 12.0 * 0.04
+    assert log[-1].torn == 0
+
+
+@pytest.mark.parametrize("flow", [[math.inf, 0.0, 0.0], [0.0, math.nan, 0.0]])
+def test_a_wind_that_is_no_number_is_refused(flow):
+    with pytest.raises(ValueError, match="`flow` to be finite"):
+        WindField(flow)
+    with pytest.raises(ValueError, match=r"`schedule.flow` to be finite"):
+        WindField(schedule=[FlowKey(0.0, [1.0, 0.0, 0.0]), FlowKey(1.0, flow)])
+
+
+BROKEN = [
+    ("total", "semi_implicit", math.nan, None),
+    ("updated", "semi_implicit", math.nan, "NaN grows the grid up to `max_nodes`, which is then blamed"),
+    ("total", "explicit", math.nan, "ValueError: cannot convert float NaN to integer"),
+    ("updated", "explicit", math.nan, "ValueError: cannot convert float NaN to integer"),
+    ("total", "semi_implicit", 1e30, None),
+    ("total", "explicit", 1e30, "OverflowError of the number of substeps"),
+]
+
+
+@pytest.mark.parametrize(
+    ("formulation", "drag_step", "factor"),
+    [
+        pytest.param(*case[:3], marks=[pytest.mark.xfail(strict=True, reason=case[3])] if case[3] else [])
+        for case in BROKEN
+    ],
+)
+def test_a_modulation_that_breaks_the_wind_is_a_divergence(formulation, drag_step, factor):
+    """The message says that something is NaN or infinite, or that the substeps are too many, and sends to the wind."""
+    wind = WindField([1.0, 0.0, 0.0], modulations=[_Broken(factor)])
+    points = _points(_lattice(3, 3, 1))
+    pipeline = _pipeline(points, [], wind, AeroForce(drag_step=drag_step), formulation=formulation, max_nodes=100_000)
+    with pytest.raises(SimulationDiverged, match=r"(NaN or infinite|substeps).*Remedy: .*wind") as info:
+        _advance(pipeline, 1)
+    assert info.value.particle is not None
+
+
+# ---- handles and pins
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_sheet_twisted_by_720_degrees(formulation):
+    """Two turns of one end: it is back where it began, and the strip between is a helicoid or shorter.
+
+    A fibre at radius r of a strip of length L that turns by an angle a is sqrt(1 + (a r / L)²) long.
+    """
+    width, length, h = 0.1, 0.8, 0.05
+    position = _lattice(round(length / h), 1, round(width / h), spacing=h)
+    middle = [0.0, 0.025, width / 2]
+    ends = [
+        PinnedRegion(Box([None, None, None], [0.11, None, None])),
+        Handle(Box([0.69, None, None], [None, None, None]), angular_velocity=[4 * math.pi, 0, 0], pivot=middle),
+    ]
+    points = _points(position, density=100.0, youngs_modulus=1e5)
+    pipeline = _pipeline(points, ends, formulation=formulation, frame_dt=0.04, damping=10.0, dx=0.1)
+    state, log = _advance(pipeline, 25)
+    held = points.position[:, 0] > 0.69
+    moved = (state.position - pipeline.solver.points.position)[held]
+    # the chord closes on itself; float32 rounds a place of 0.5 m in each substep
+    steps = sum(health.substeps for health in log)
+    tolerance = steps * 2**-24 * 0.5 if formulation == "total" else h
+    assert float(moved.norm(dim=-1).max()) < tolerance
+    free = length - 0.2
+    helix = math.sqrt(1 + (4 * math.pi * (width / 2) / (free - 2 * 0.1)) ** 2)  # the held nodes reach a cell further
+    assert log[-1].stretch_max < 1.5 * helix
+    assert log[-1].stretch_max > 1.02  # it is twisted
+    assert log[-1].J_min > 0
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
+def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
+    """Between two handles: upright in the end, and after the release its energy only falls."""
+    position = _lattice(3, 3, 6)
+    fast = 0.9 * 0.3 / 2 / 0.1
+    grips = [
+        Handle(Box([None, None, None], [None, None, 0.06]), velocity=[0, 0, fast], end=0.1),
+        Handle(Box([None, None, 0.24], [None, None, None]), velocity=[0, 0, -fast], end=0.1),
+    ]
+    points = _points(position, law=law())
+    pipeline = _pipeline(points, grips, formulation=formulation, frame_dt=5e-3, damping=5.0)
+    state, log = _advance(pipeline, 20)
+    pressed = pipeline.scene.frame.point_to_scene(state.position)[:, 2]
+    assert float(pressed.max() - pressed.min()) < 0.15
+    state, after = _advance(pipeline, 10, state)
+    assert max(_energy(health) for health in after) <= SHADOW * _energy(after[0])
+    assert after[-1].J_min > 0
+    assert _energy(after[-1]) < _energy(after[0])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_pin_that_holds_everything(formulation):
+    """Nothing moves, and the wind does no work, for half a second in a gale."""
+    pin = PinnedRegion(Everything())
+    wind = WindField([20.0, 5.0, 0.0])
+    pipeline = _pipeline(
+        _points(_lattice(3, 3, 2)), [pin], wind, AeroForce(), formulation=formulation, gravity=UP, frame_dt=0.05
+    )
+    state, log = _advance(pipeline, 10)
+    assert torch.equal(state.position, pipeline.solver.points.position)
+    assert float(state.velocity.abs().max()) == 0
+    assert sum(health.wind_work for health in log) == 0
+    assert log[-1].elastic == 0
+
+
+@pytest.mark.parametrize("law", [Fluid, Sand, FixedCorotated])
+def test_material_flows_through_a_moving_velocity_box(law):
+    """Only the box drives: nothing becomes faster than it, for APIC's velocities are means of those of nodes.
+
+    Elastic material may recoil, with no more than it got: the energy of the mass at the speed of the box.
+    """
+    position = _lattice(6, 3, 3)
+    box = VelocityBox(Box([0.1, None, None], [0.25, None, None]), velocity=[0.0, 0.0, 2.0], end=0.05)
+    pipeline = _pipeline(_points(position, law=law()), [box], formulation="updated", frame_dt=0.01)
+    state, log = _advance(pipeline, 8, _throw(pipeline, [2.0, 0.0, 0.0]))
+    mass = float(pipeline.solver.points.mass.sum())
+    # the box takes speed along x and gives speed along z: each within 2 m/s, and what it holds it has to push
+    assert log[-1].kinetic + log[-1].elastic <= SHADOW * 0.5 * mass * (2.0**2 + 2.0**2)
+    after = [_energy(health) for health in log[6:]]
+    assert max(after) <= SHADOW * after[0]
+    assert 0 < log[-1].momentum_z <= 2.0 * mass
+
+
+# ---- open and closed domains
+
+
+def test_a_body_in_free_flight_takes_its_grid_along():
+    """300 m/s for 0.4 s: 1200 cells from home, exactly where its velocity has taken it, on a grid as small as ever."""
+    pipeline = _pipeline(_points(_lattice(3, 3, 3)), formulation="updated", frame_dt=0.01)
+    start = _throw(pipeline, [300.0, 0.0, 0.0])
+    state, log = _advance(pipeline, 10, start)
+    steps = sum(health.substeps for health in log)
+    moved = (state.position - pipeline.solver.points.position).double()
+    # float32 rounds a place of up to 32 m in each substep
+    torch.testing.assert_close(moved.mean(0)[0], torch.tensor(30.0).double(), rtol=0, atol=steps * 2**-20)
+    assert log[-1].stretch_max == pytest.approx(1.0, abs=0.05)
+    assert state.grid.node_count < 100_000
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_body_absurdly_far_away_is_reported(formulation):
+    """Free, at 5 km/s and 0.15 m long: beyond 1000 times its size within a frame of 0.04 s."""
+    pipeline = _pipeline(_points(_lattice(3, 3, 3)), formulation=formulation, frame_dt=0.04, dx=0.5, cfl=0.4)
+    with pytest.raises(
+        SimulationDiverged, match=r"t = 0\.\d+ s, particle \d+: it is more than 1000 object sizes.*pin or enclose"
+    ) as info:
+        _advance(pipeline, 4, _throw(pipeline, [5000.0, 0.0, 0.0]))
+    assert info.value.time <= 0.16 + 1e-6
+
+
+def test_a_body_that_spreads_beyond_the_largest_grid_is_reported():
+    """Two particles that part at 20 m/s: the span, the nodes and the limit are named."""
+    points = _points(torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]))
+    pipeline = _pipeline(points, formulation="updated", max_nodes=20_000)
+    with pytest.raises(SimulationDiverged, match=r"span \[\d.*grid nodes at dx = 0.1 m, more than `max_nodes`") as info:
+        _advance(pipeline, 100, _throw(pipeline, torch.tensor([[-10.0] * 3, [10.0] * 3])))
+    assert 0 < info.value.time < 0.1
+
+
+@pytest.mark.xfail(strict=True, reason="the grid's margin for the speed is reported as the span of the particles")
+def test_a_grid_too_large_for_the_speed_names_the_speed():
+    """A small body at 10 km/s needs a grid for where it may go: its own span is not to blame."""
+    pipeline = _pipeline(_points(_lattice(2, 2, 2)), formulation="updated", frame_dt=0.04)
+    with pytest.raises(SimulationDiverged) as info:
+        _advance(pipeline, 1, _throw(pipeline, [1e4, 0.0, 0.0]))
+    assert "span [0.05, 0.05, 0.05] m" not in str(info.value)
+
+
+@pytest.mark.parametrize(
+    ("law", "formulation"),
+    [(FixedCorotated, "total"), (FixedCorotated, "updated"), (NeoHookean, "updated"), (Fluid, "updated")],
+)
+def test_an_energetic_body_in_a_closed_box(law, formulation):
+    """5 m/s into a corner, half a second: it stays inside, and never has more energy than it came with."""
+    box = EnclosingBox([0, 0, 0], [0.6, 0.6, 0.6])
+    position = _lattice(3, 3, 3, low=(0.2, 0.2, 0.2))
+    pipeline = _pipeline(_points(position, law=law()), [box], formulation=formulation, frame_dt=0.02)
+    state, log = _advance(pipeline, 15, _throw(pipeline, [5.0, 4.0, 3.0]))
+    place = pipeline.scene.frame.point_to_scene(state.position)
+    slack = 0.0 if formulation == "updated" else 0.1  # as on the plane
+    assert float(place.min()) > -slack
+    assert float(place.max()) < 0.6 + slack
+    assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
+
+
+def test_sand_and_rubber_in_one_run():
+    """Sand thrown on a block of rubber on a sticky floor: no energy from nowhere, and nothing through the floor."""
+    rubber = _points(_lattice(4, 4, 2), youngs_modulus=1e5)
+    sand = _points(_lattice(3, 3, 2, low=(0, 0, 0.15)), youngs_modulus=1e6, law=Sand(), density=1600.0)
+    plane = Plane([0, 0, 0], [0, 0, 1], "sticky")
+    both = MaterialPoints.join([rubber, sand])
+    pipeline = _pipeline(both, [plane], formulation="updated", gravity=UP)
+    velocity = torch.zeros(50, 3)
+    velocity[32:, 2] = -3.0
+    state, log = _advance(pipeline, 10, _throw(pipeline, velocity))
+    assert max(_energy(health) for health in log) <= _energy(log[0]) + (SHADOW - 1) * log[0].kinetic
+    assert _energy(log[-1]) < _energy(log[0])
+    assert float(pipeline.scene.frame.point_to_scene(state.position)[:, 2].min()) > 0
+    assert log[-1].torn == 0
+
+
+# ---- rest
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@torch.inference_mode()
+def test_ten_thousand_steps_of_nothing(formulation):
+    """No gravity, no wind, float32: a body at rest has drifted by less than a micrometre."""
+    points = _points(_lattice(3, 3, 2, low=(0.3, -0.2, 0.1)))
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    state = solver.init_state(points)
+    dt = 0.5 * solver.stable_substep()
+    state = solver.rollout(state, dt, 10_000)
+    check_state(solver, state)
+    assert float((state.position - points.position).abs().max()) < 1e-6
+    assert float(solver.energies(state)["kinetic"]) < 1e-12
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_restart_from_rest_stays_at_rest(formulation, tmp_path):
+    """Saved in the middle of its motion, its velocity and strain set to zero: not a bit moves any more."""
+    position = _lattice(3, 3, 3)
+    pipeline = _pipeline(_points(position), formulation=formulation)
+    state, _ = _advance(pipeline, 2, _throw(pipeline, [1.0, 2.0, 0.5]))
+    torch.save(state.state_dict(), tmp_path / "state.pt")
+    state = MPMState.from_state_dict(torch.load(tmp_path / "state.pt"))
+    eye = torch.eye(3).expand_as(state.F_elastic)
+    state = state.replace(velocity=torch.zeros_like(state.velocity), affine=torch.zeros_like(state.affine))
+    state = state.replace(F_elastic=eye, F_total=eye)
+    if formulation == "total":
+        # a rigid displacement is what strains nothing there
+        shift = state.node_displacement.new_tensor([0.5, 0.25, 0.125]).expand_as(state.node_displacement)
+        state = state.replace(node_velocity=torch.zeros_like(state.node_velocity), node_displacement=shift)
+        state = state.replace(position=pipeline.solver.points.position + shift[0])
+    end, log = _advance(pipeline, 3, state)
+    # weights add up to one within a rounding of each of the 27 nodes
+    assert float((end.position - state.position).abs().max()) <= 27 * 2**-24
+    assert log[-1].kinetic == 0
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_huge_fixed_substep_is_refused(formulation):
+    """At the start with a ValueError, and when the material stiffens on the way with a divergence that names it."""
+    points = _points(_lattice(3, 3, 3), law=NeoHookean())
+    with pytest.raises(ValueError, match=r"`substep` of 10 s is longer than the stable one of 0.00\d+ s"):
+        _pipeline(points, formulation=formulation, substep=10.0).start()
+    pipeline = _pipeline(points, formulation=formulation, substep=2.5e-3)
+    state = pipeline.start()
+    F = state.F_elastic.clone()
+    F[5] *= 0.5
+    with pytest.raises(SimulationDiverged, match=r"t = 0 s.*`substep` of 0.0025 s is longer.*Remedy: .*`solver.sub"):
+        pipeline.advance(state.replace(F_elastic=F))
+
+
+# ---- Gaussians and coordinates
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1e-3, 1e-3), (1.0, 1.0, 1e-3), (1e-8, 1e-8, 1e-8), (0.05, 0.05, 1e-8)])
+def test_gaussians_of_extreme_shape(scales):
+    """1000:1 and 1e-8: positive finite mass, a finite picture, and needles as long after a free flight as before."""
+    source = _Cloud(_lattice(4, 1, 4, spacing=0.1), scales)
+    scene = SimulatedScene(Scene(generator=source), Material(E=1e4, density=50.0), 0.2)
+    assert bool((scene.points.mass > 0).all())
+    assert float(scene.patch_area.sum()) < 10.0
+    solver = MPMSolver(dx=0.2, formulation="total", gravity=UP, cfl=CFL)
+    camera = OrbitCamera(width=32, height=18, azimuth=-70.0, radius=2.0)
+    pipeline = SimulationPipeline(scene, solver, WindField([2.0, 1.0, 0.0]), AeroForce(), None, camera)
+    state, log = _advance(pipeline, 3)
+    picture = pipeline.render(state, 3)
+    for image in (picture.color, picture.alpha, picture.depth):
+        assert bool(torch.isfinite(image).all())
+    assert 0 <= float(picture.alpha.min()) <= float(picture.alpha.max()) <= 1
+    if scales[0] == 1.0:
+        assert float(picture.alpha.max()) > 0.5
+    gaussians = scene.deformed(state)
+    size = torch.linalg.matrix_norm(gaussians.covariances, 2).sqrt()
+    longest = max(scales)
+    assert float(size.max()) <= 1.01 * longest * log[-1].stretch_max
+    assert float(size.min()) >= 0.99 * longest * log[-1].stretch_min
+
+
+def test_a_scene_ten_kilometres_away_moves_the_same():
+    """Places that float32 holds exactly near 1e4: the same motion, and the Gaussians within its rounding there."""
+    ends = []
+    for offset in (0.0, 1e4):
+        # multiples of 1/8 are exact at 1e4, where the float32 lattice is 2^-10
+        position = _lattice(5, 1, 4, spacing=0.125) + offset
+        points = _points(position, volume=1e-3, density=40.0, youngs_modulus=1e4)
+        pin = PinnedRegion(Box([None, None, None], [offset + 0.1, None, None]))
+        pipeline = _pipeline(points, [pin], WindField([6.0, 3.0, 0.0]), AeroForce(), dx=0.25, frame_dt=0.04, gravity=UP)
+        state, _ = _advance(pipeline, 5)
+        ends.append((pipeline.solver.points.position, state.position, pipeline.scene.deformed(state).means - offset))
+    torch.testing.assert_close(ends[1][0], ends[0][0], rtol=0, atol=0)
+    # patch areas are measured in scene coordinates, so their last bits may differ
+    assert float((ends[0][1] - ends[0][0]).norm(dim=-1).max()) > 0.05
+    torch.testing.assert_close(ends[1][1], ends[0][1], rtol=0, atol=1e-4)
+    torch.testing.assert_close(ends[1][2], ends[0][2], rtol=0, atol=2 * 2**-11)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+def test_the_solver_alone_ten_kilometres_away(formulation, dtype, request):
+    """1 m/s for 0.1 s: a tenth of a metre to the rounding of the coordinates, 2^-10 m in float32."""
+    if formulation == "updated" and dtype == torch.float32:
+        reason = "the way of a substep is below the rounding of the position: the body has a velocity and stands still"
+        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+    points = _points(_lattice(3, 3, 3, low=(1e4, 1e4, 1e4), dtype=dtype))
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    velocity = torch.tensor([1.0, 0.0, 0.0], dtype=dtype).expand(27, 3)
+    state = solver.init_state(points, velocity)
+    state = solver.rollout(solver.fit_grid(state, 0.1), 2e-4, 500)
+    check_state(solver, state)
+    moved = (state.position - points.position).double().mean(0)
+    rounding = 2**-10 if dtype == torch.float32 else 1e-9
+    torch.testing.assert_close(moved, torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=rounding)
+
+
+# ---- ten minutes
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@torch.inference_mode()
+def test_ten_minutes_of_a_gusty_flag(formulation):
+    """Stationary gusts, no damping but the air's: the mean energy of the tenth minute is that of the second.
+
+    Within 4 standard errors, taken from the 5 s blocks of either minute; the largest stretch stays below 2.
+    """
+    minutes, frame_dt = 10, 0.04
+    scene = SimulatedScene(
+        Scene(generator=FlagScene(width=0.8, height=0.6, spacing=0.1)), Material(E=1e4, density=40.0), 0.2
+    )
+    pole = PinnedRegion(Box([None, None, None], [0.11, None, None]))
+    solver = MPMSolver(dx=0.2, formulation=formulation, boundaries=[pole])
+    wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(), UniformGust(0.3), GaussianGust(0.3)], seed=3)
+    pipeline = SimulationPipeline(
+        scene, solver, wind, AeroForce(), None, OrbitCamera(width=8, height=8), frame_dt=frame_dt
+    )
+    state, log, began = pipeline.start(), [], time.perf_counter()
+    for _ in range(round(minutes * 60 / frame_dt)):
+        state, health = pipeline.advance(state)
+        log.append(health)
+    wall = time.perf_counter() - began
+    names = ("kinetic", "elastic", "potential")
+    energy = torch.tensor([[getattr(health, name) for name in names] for health in log], dtype=torch.float64)
+    per_minute = energy.reshape(minutes, -1, 3).mean(1)
+    blocks = energy.sum(-1).reshape(minutes, 12, -1).mean(-1)
+    error = blocks.std(-1) / math.sqrt(12)
+    mean = blocks.mean(-1)
+    _record(
+        "long_flag.json",
+        formulation,
+        {
+            "particles": scene.points.count,
+            "dx_m": solver.dx,
+            "simulated_minutes": float(state.time) / 60,
+            "frames": len(log),
+            "substeps": sum(health.substeps for health in log),
+            "wall_s": wall,
+            "energy_per_minute_J": {name: per_minute[:, k].tolist() for k, name in enumerate(names)},
+            "mechanical_energy_per_minute_J": mean.tolist(),
+            "standard_error_per_minute_J": error.tolist(),
+            "wind_work_J": sum(health.wind_work for health in log),
+            "largest_stretch": max(health.stretch_max for health in log),
+            "smallest_J": min(health.J_min for health in log),
+            "largest_displacement_m": max(health.displacement_max for health in log),
+            "torn": max(health.torn for health in log),
+            "lost": max(health.lost for health in log),
+            "device": describe_device(pipeline.device),
+            "versions": versions(),
+        },
+    )
+    assert bool(torch.isfinite(energy).all())
+    assert float(state.time) == pytest.approx(60 * minutes, rel=1e-9)
+    assert max(health.torn for health in log) == max(health.lost for health in log) == 0
+    assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
+    assert max(health.stretch_max for health in log) < 2.0
+
+
+def _record(name, key, values):
+    folder = os.environ.get("GAUSSIAN_SWAYING_RECORD")
+    if folder:
+        path = Path(folder) / name
+        known = json.loads(path.read_text()) if path.exists() else {}
+        path.write_text(json.dumps(known | {key: values}, indent=2) + "\n")
