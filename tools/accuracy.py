@@ -62,15 +62,16 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
             poisson_ratio=0.0,
         )
     for variant in everyone:
-        for cells in (8, 16, 32):
-            yield case("hanging bar", bars.hanging_bar, variant, cells=cells)
+        for clamp in ("mirror", "pin"):
+            for cells in (8, 16, 32):
+                yield case("hanging bar", bars.hanging_bar, variant, cells=cells, clamp=clamp)
     for variant in VARIANTS:
         for cells in (1, 2, 3, 4) if thorough else (1, 2):
             yield case("cantilever", beams.cantilever, variant, cells=cells, b=1.0)
     for b in (0.5, 2.0, 4.0, 8.0):
         yield case("cantilever", beams.cantilever, "total", cells=2, b=b)
     for variant in everyone:
-        for cells in (8, 16, 32, 64) if thorough else (8, 16, 32):
+        for cells in (16, 24, 32, 48) if thorough and variant == "total" else (16, 24, 32):
             yield case("vortex", vortex.vortex, variant, cells=cells)
     for variant in VARIANTS:
         yield case("free block", bars.free_block, variant, periods=100 if variant == "total" else 20)
@@ -87,7 +88,7 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
     for aspect in (0.5, 1.0, 2.0, 3.0):
         yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=8, volume_correction=False)
     if thorough:
-        for aspect in (0.5, 1.0, 2.0, 3.0):
+        for aspect in (0.5, 1.0, 2.0):
             yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=8, planar=False)
         for dx in (0.08, 0.04, 0.02, 0.01):
             for density in (20.0, 50.0):
@@ -208,7 +209,7 @@ gate("large-rotation vortex, observed order in dx, `total`", "at least 1.8")(_or
 
 @gate("bar hanging under its own weight, tip at 32 cells, `total`", "within 1 %")
 def _(rows: list[Row]) -> tuple[str, bool] | None:
-    found = select(rows, "hanging bar", variant="total", cells=32)
+    found = select(rows, "hanging bar", variant="total", cells=32, clamp="mirror")
     return (f"{100 * found[0]['result']['error']:.3f} %", found[0]["result"]["error"] <= 0.01) if found else None
 
 
@@ -239,11 +240,13 @@ def _(rows: list[Row]) -> tuple[str, bool] | None:
 
 
 def page(results: list[dict[str, Any]], pictures: Path) -> list[str]:
-    """Lines of the page, from the recorded results, the most thorough last; draws its plots into a folder."""
-    result = results[-1]
-    rows: list[Row] = result["rows"]
-    lines = [f"Recorded on {result['device']}; " + ", ".join(f"{k} {v}" for k, v in result["versions"].items()) + "."]
-    lines += ["float64 unless a variant says float32.", "", "## Goals", ""]
+    """Lines of the page, from the recorded results of all devices; draws its plots into a folder."""
+    rows: list[Row] = [row for result in results for row in result["rows"]]
+    lines = []
+    for result in results:
+        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
+        lines.append(f"- {', '.join(sorted({row['problem'] for row in result['rows']}))}: {result['device']}; {stack}.")
+    lines += ["", "float64 unless a variant says float32.", "", "## Goals", ""]
     goals = [(name, wanted, judge(rows)) for name, wanted, judge in GATES]
     lines += _table(
         ["goal", "wanted", "measured", "reached"],
@@ -271,7 +274,10 @@ def page(results: list[dict[str, Any]], pictures: Path) -> list[str]:
         "Exact at finite strain for fixed corotated elasticity.",
         "",
     ]
-    lines += _convergence(rows, "hanging bar", {})
+    lines += ["Half of a bar of twice the length, whose middle stands still:", ""]
+    lines += _convergence(rows, "hanging bar", {}, clamp="mirror")
+    lines += ["Held by a `PinnedRegion`:", ""]
+    lines += _convergence(rows, "hanging bar", {"end_shift": "the pin seems further out by [cells]"}, clamp="pin")
     lines += ["### A generalised vortex: turns of up to one radian with shear, manufactured", ""]
     lines += _convergence(rows, "vortex", {})
     lines += ["### A self-weight cantilever against the elastica", ""]
@@ -399,7 +405,7 @@ def _plot(rows: list[Row], path: Path) -> None:
     panels = {
         "confined bar (frequency)": ("vibrating bar", {"ends": "free"}),
         "pinned bar (frequency)": ("vibrating bar", {"ends": "fixed-free"}),
-        "hanging bar (tip)": ("hanging bar", {}),
+        "hanging bar (tip)": ("hanging bar", {"clamp": "mirror"}),
         "vortex (displacement)": ("vortex", {}),
     }
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")

@@ -68,17 +68,20 @@ def sheet(particles: int, device: torch.device) -> MaterialPoints:
     return MaterialPoints.create(position, volume=area * 0.01, density=50.0, youngs_modulus=5e3, poisson_ratio=0.3)
 
 
-def bench_substep(device: torch.device, particles: int, formulation: str) -> dict[str, Any]:
+def bench_substep(
+    device: torch.device, particles: int, formulation: str, deterministic: bool = False, mls: bool = False
+) -> dict[str, Any]:
     """One elastic substep, without wind; the grid of ``updated`` is the whole cube of 100³ nodes."""
     points = sheet(particles, device)
-    solver = MPMSolver(dx=0.01, formulation=formulation)
+    solver = MPMSolver(dx=0.01, formulation=formulation, deterministic=deterministic, mls=mls)
     state = solver.init_state(points)
     if formulation == "updated":
         state = state.replace(grid=GridSpec(0.01, (0, 0, 0), (100, 100, 100)))
     with torch.inference_mode():
         result = timed(lambda: solver.step(state, 1e-4), device, 30)
     nodes = state.grid.node_count
-    return {"particles": points.count, "formulation": formulation, "nodes": nodes} | result
+    name = formulation + (", MLS" if mls else "") + (", deterministic" if deterministic else "")
+    return {"particles": points.count, "formulation": name, "nodes": nodes} | result
 
 
 def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, Any]:
@@ -129,7 +132,11 @@ def substep(options: argparse.Namespace) -> None:
     """Measure one elastic substep."""
     device, result = _start(options)
     counts = [20_000, 100_000] if device.type == "cpu" else [20_000, 100_000, 1_000_000]
-    result["substep"] = [bench_substep(device, n, formulation) for n in counts for formulation in ("total", "updated")]
+    variants: list[dict[str, Any]] = [{"formulation": "total"}, {"formulation": "updated"}]
+    variants += [{"formulation": "updated", "mls": True}]
+    if device.type == "cuda":
+        variants += [{"formulation": name, "deterministic": True} for name in ("total", "updated")]
+    result["substep"] = [bench_substep(device, n, **variant) for n in counts for variant in variants]
     _write(options, f"substep_{device.type}", result)
 
 

@@ -67,12 +67,13 @@ def _flatten(state: MPMState) -> tuple[Layout, list[Tensor]]:
     values = {f.name: getattr(state, f.name) for f in dataclasses.fields(MPMState)}
     unique = {id(v): v for v in values.values() if isinstance(v, Tensor)}
     place = {key: k for k, key in enumerate(unique)}
-    layout = {n: (place[id(v)], None) if isinstance(v, Tensor) else (None, v) for n, v in values.items()}
+    layout: Layout = {n: (place[id(v)], None) if isinstance(v, Tensor) else (None, v) for n, v in values.items()}
     return layout, list(unique.values())
 
 
 def _unflatten(layout: Layout, tensors: Sequence[Tensor]) -> MPMState:
-    return MPMState(**{n: value if k is None else tensors[k] for n, (k, value) in layout.items()})
+    fields: dict[str, Any] = {n: value if k is None else tensors[k] for n, (k, value) in layout.items()}
+    return MPMState(**fields)
 
 
 class _Recompute(torch.autograd.Function):

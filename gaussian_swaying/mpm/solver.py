@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
-from gaussian_swaying.mpm.boundary import Boundary, FrameLike, Nodes
+from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Nodes
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
-from gaussian_swaying.mpm.linalg import matmul3
+from gaussian_swaying.mpm.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.mpm.recompute import detached, leaves_of, recompute
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
@@ -93,7 +94,8 @@ class MPMSolver(nn.Module):
         self.register_buffer("_gravity", torch.tensor(self.gravity, dtype=torch.float64), persistent=False)
         self._gravity: Tensor
         self.boundaries = nn.ModuleList(boundaries)
-        self._acting = self.boundaries  # the same, in metres
+        # the same in metres; in a tuple, as these copies are no part of the module's state
+        self._framed: tuple[Boundary, ...] | None = None
         self._points: MaterialPoints | None = None
         self._laws: LawDispatch | None = None
         self._static: dict[str, Tensor] = {}
@@ -117,12 +119,19 @@ class MPMSolver(nn.Module):
         return self._laws
 
     @property
+    def _acting(self) -> Sequence[Boundary]:
+        """The boundary conditions, in metres."""
+        return _conditions(self.boundaries) if self._framed is None else self._framed
+
+    @property
     def total_lagrangian(self) -> bool:
         """Whether stencils stay at the rest positions."""
         return self.formulation == "total"
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MPMSolver:
         super()._apply(fn, recurse)
+        for boundary in self._framed or ():
+            boundary._apply(fn)
         if self._points is not None:
             self._bind(self._points.map(fn))
         return self
@@ -135,7 +144,7 @@ class MPMSolver(nn.Module):
                 f"The law {self._laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
                 "`solver.formulation` to updated, or choose an elastic law."
             )
-        static, position, conditions = self._static, points.position, _conditions(self._acting)
+        static, position, conditions = self._static, points.position, self._acting
         for k, boundary in enumerate(conditions):
             mask = boundary.particle_mask(position.detach())
             if mask is None:
@@ -177,7 +186,7 @@ class MPMSolver(nn.Module):
         """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
         mass = self._static[f"pinned_mass_{k}"]
         if time is not None and f"release_{k}" in self._static:
-            mass = torch.where(self._static[f"release_{k}"] > time, mass, 0.0)
+            mass = torch.where(self._static[f"release_{k}"] > time + CLOCK, mass, 0.0)
         return scatter(stencil, mass[..., None, None])[..., 0] * inverse_mass
 
     def _bounding_grid(self, position: Tensor, margin: int) -> GridSpec:
@@ -219,9 +228,9 @@ class MPMSolver(nn.Module):
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
-        self._acting = self.boundaries
+        self._framed = None
         if frame is not None:
-            self._acting = nn.ModuleList([b.in_frame(frame) for b in _conditions(self.boundaries)])
+            self._framed = tuple(b.in_frame(frame) for b in _conditions(self.boundaries))
         self._points = None
         self.to(points.position.device)  # the solver goes where its material is
         self._bind(points)
@@ -255,7 +264,7 @@ class MPMSolver(nn.Module):
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
         F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
         limit = stable_limit(self.points, self.dx, F, internal, spatial=not self.total_lagrangian)
-        return damped_substep(float(limit.detach().amin()), self.stiffness_damping)
+        return damped_substep(float(limit.detach().amin()), self._viscous_time(state))
 
     def substeps(self, state: MPMState, frame_dt: float) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
@@ -273,14 +282,22 @@ class MPMSolver(nn.Module):
             steps = substeps_per_frame(frame_dt, self.substep, exact=True)
             return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
         longest = self.cfl / max(float(self._cells_per_second(state)), 1e-30)
-        return substeps_per_frame(frame_dt, damped_substep(longest, self.stiffness_damping), exact=False)
+        return substeps_per_frame(frame_dt, damped_substep(longest, self._viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
         """Largest Courant number ``dt (c + |v|) / dx`` of a substep; in ``total`` without v, as stencils rest.
 
         With stiffness damping it is that of the undamped substep which is as stable.
         """
-        return math.sqrt(dt * dt + 2 * self.stiffness_damping * dt) * self._cells_per_second(state)
+        return math.sqrt(dt * dt + 2 * self._viscous_time(state) * dt) * self._cells_per_second(state)
+
+    def _viscous_time(self, state: MPMState | None) -> float:
+        """The stiffness damping [s], grown by as much as the viscous stress of a stretched material is stiffer."""
+        if self.stiffness_damping == 0 or state is None:
+            return self.stiffness_damping
+        F = state.F_elastic.detach()
+        squared = float(symmetric_eigenvalues(F.mT @ F)[..., 0].amax().clamp(min=1.0))
+        return self.stiffness_damping * squared ** (1 if self.total_lagrangian else 2)
 
     def _cells_per_second(self, state: MPMState) -> Tensor:
         """How many cells the fastest wave crosses in a second."""
@@ -308,6 +325,9 @@ class MPMSolver(nn.Module):
 
     def step(self, state: MPMState, dt: float, force: Tensor | None = None) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.
+
+        Where the substep changes, forces act for the mean of the old and the new one: the velocities stand half a
+        substep beside the positions, and the full new one would jolt them (an error of first order, and energy).
 
         Args:
             state: The state now.
@@ -351,8 +371,13 @@ class MPMSolver(nn.Module):
             leaves = leaves_of(advance(detached(state), 1))
         for first in range(0, steps, checkpoint):
             count = min(checkpoint, steps - first)
-            state = recompute(lambda start, count=count: advance(start, count), state, leaves)
+            state = recompute(partial(advance, count=count), state, leaves)
         return state
+
+    @staticmethod
+    def kick(state: MPMState, dt: float) -> float:
+        """How long forces act in a substep of ``dt`` [s] (see :meth:`step`)."""
+        return 0.5 * (state.substep + dt) if state.substep > 0 else dt
 
     def _step_total(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
         assert self._stencil is not None
@@ -368,16 +393,16 @@ class MPMSolver(nn.Module):
         value = torch.zeros_like(state.position) if force is None else force
         node_force = scatter(self._stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
         inverse_mass = static["node_inverse_mass"][..., None]
-        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, dt)
+        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, self.kick(state, dt))
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = lattice = None
         if "node_rest" in static:
             shift = (state.position - points.position) * points.mass[..., None]
             position = static["node_rest"] + scatter(self._stencil, shift[..., None, :]) * inverse_mass
-        if any(b.needs_lattice for b in _conditions(self._acting)):
+        if any(b.needs_lattice for b in self._acting):
             lattice = state.grid.node_positions(velocity) + displacement
         velocity = self._constrain(velocity, self._stencil, inverse_mass[..., 0], position, lattice, state.time, dt)
-        state = state.replace(time=state.time + dt)
+        state = state.replace(time=state.time + dt, substep=dt)
         return self._read_particles(state, displacement + dt * velocity, velocity)
 
     def _read_particles(self, state: MPMState, displacement: Tensor, velocity: Tensor) -> MPMState:
@@ -404,20 +429,21 @@ class MPMSolver(nn.Module):
             rate = matmul3(state.affine, F)
             viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, self.stiffness_damping)
             stress = stress + matmul3(viscous, F.mT)
+        kick = self.kick(state, dt)
         nodes = scatter_momentum(
             points.mass,
             state.velocity,
             state.affine,
-            None if force is None else dt * force,
-            dt * points.volume[..., None, None] * stress,
+            None if force is None else kick * force,
+            kick * points.volume[..., None, None] * stress,
             stencil,
             4.0 / self.dx**2 if self.mls else None,
         )
         inverse_mass = _safe_inverse(nodes[..., 3])[..., None]
-        velocity = self._accelerate(nodes[..., :3] * inverse_mass, None, dt)
+        velocity = self._accelerate(nodes[..., :3] * inverse_mass, None, kick)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = None
-        if any(b.needs_position or b.needs_lattice for b in _conditions(self._acting)):
+        if any(b.needs_position or b.needs_lattice for b in self._acting):
             position = state.grid.node_positions(velocity).expand_as(velocity)
         velocity = self._constrain(velocity, stencil, inverse_mass[..., 0], position, position, state.time, dt)
         new_velocity, affine, gradient = g2p(velocity, stencil, self.dx)
@@ -437,6 +463,7 @@ class MPMSolver(nn.Module):
             lost=state.lost | ~stencil.inside,
             time=state.time + dt,
             internal=internal,
+            substep=dt,
         )
 
     def _accelerate(self, velocity: Tensor, acceleration: Tensor | None, dt: float) -> Tensor:
@@ -461,7 +488,7 @@ class MPMSolver(nn.Module):
     ) -> Tensor:
         """Apply the boundary conditions to node velocities, in order."""
         static = self._static
-        for k, boundary in enumerate(_conditions(self._acting)):
+        for k, boundary in enumerate(self._acting):
             share = None
             if f"pinned_mass_{k}" in static:
                 share = static.get(f"share_{k}")

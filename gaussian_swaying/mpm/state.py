@@ -209,6 +209,7 @@ class MPMState:
         node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
         internal: The internal variable of each particle's plastic law (see its class), shape (..., P), or None if no
             law has one.
+        substep: Length of the substep that led here [s]; 0 at the start.
     """
 
     position: Tensor
@@ -222,6 +223,7 @@ class MPMState:
     node_displacement: Tensor | None = None
     node_velocity: Tensor | None = None
     internal: Tensor | None = None
+    substep: float = 0.0
 
     def replace(self, **changes: Any) -> MPMState:
         """A copy with some fields changed."""

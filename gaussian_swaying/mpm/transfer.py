@@ -226,6 +226,10 @@ def scatter_momentum(
         Momentum [kg m/s] in columns 0 to 2 and mass [kg] in column 3, shape (..., G, 4).
     """
     count = mass.shape[-1]
+    if (stencil.basis.shape[1] == 4) != (mls_scale is not None):
+        raise ValueError(
+            "Expected a `stencil` without gradients for `mls_scale`, and with gradients and moments otherwise."
+        )
     check_shape("velocity", velocity, count, 3)
     check_shape("affine", affine, count, 3, 3)
     momentum = mass[..., None] * velocity

@@ -164,8 +164,8 @@ def diagnose(
     names = ("time", "cfl", "kinetic", "elastic", "potential", "wind_work", *axes, "lost", "torn", "J_min", "J_max")
     names += ("stretch_min", "stretch_max")
     found = dict(zip((*names, "displacement_mean", "displacement_max"), values, strict=True))
-    lost, torn = int(found.pop("lost")), int(found.pop("torn"))
-    return FrameDiagnostics(substeps=substeps, lost=lost, torn=torn, **found)
+    counts = {name: int(found.pop(name)) for name in ("lost", "torn")}
+    return FrameDiagnostics(substeps=substeps, **counts, **found)
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

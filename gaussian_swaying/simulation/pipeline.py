@@ -170,7 +170,11 @@ class SimulationPipeline(nn.Module):
             force = self.force(state, winds[k], dt)
             after = self.solver.step(state, dt, force)
             # at the mean velocity: exactly what the step adds to the kinetic energy
-            work = work + (0.5 * dt) * torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
+            work = (
+                work
+                + (0.5 * self.solver.kick(state, dt))
+                * torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
+            )
             state = after
         return state, work
 

@@ -21,8 +21,8 @@ from gaussian_swaying._checks import check_positive
 
 MARKER = "run.json"
 # what a run writes, and so must not find in a folder that no run made
-_OURS = ("frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "diagnostics.csv")
-_OURS += ("config.yaml", "video.mp4")
+_OURS = ["frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "diagnostics.csv"]
+_OURS += ["config.yaml", "video.mp4"]
 
 
 @contextmanager

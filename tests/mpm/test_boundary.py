@@ -191,8 +191,8 @@ def test_pin_holds_only_its_end(formulation):
     held = points.position[:, 2] > 0.34
     moved = (state.position - points.position).norm(dim=-1)
     assert float(moved[held].max()) < 0.01
-    # the static sag of a rod this long is 2 mm; `updated` holds all nodes that the pinned layer touches
-    assert float(moved[~held].max()) > 0.002
+    # the static sag of a rod this long is 2 to 4 mm; `updated` holds all nodes that the pinned layer touches
+    assert float(moved[~held].max()) > 0.001
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
