@@ -189,7 +189,7 @@ class MPMSolver(nn.Module):
             mass = torch.where(self._static[f"release_{k}"] > time + CLOCK, mass, 0.0)
         return scatter(stencil, mass[..., None, None])[..., 0] * inverse_mass
 
-    def _bounding_grid(self, position: Tensor, margin: int) -> GridSpec:
+    def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
         flat = position.detach().reshape(-1, 3)
         low, high = flat.amin(0), flat.amax(0)
         if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
@@ -197,8 +197,11 @@ class MPMSolver(nn.Module):
         grid = bounding_grid(low, high, self.dx, margin)
         if grid.node_count > self.max_nodes:
             size = [round(v, 3) for v in (high - low).tolist()]
+            what = f"The particles span {size} m"
+            if 2 * margin * self.dx > max(size):
+                what = f"The particles may fly {margin * self.dx:.3g} m to any side within a frame, at {speed:.3g} m/s"
             raise ValueError(
-                f"The particles span {size} m, which takes {grid.node_count:,} grid nodes at dx = {self.dx:g} m, more "
+                f"{what}, which takes {grid.node_count:,} grid nodes at dx = {self.dx:g} m, more "
                 f"than `max_nodes` = {self.max_nodes:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
             )
         return grid
@@ -235,6 +238,7 @@ class MPMSolver(nn.Module):
         self.to(points.position.device)  # the solver goes where its material is
         self._bind(points)
         position = points.position
+        self._check_rounding(position)
         if velocity is None:
             velocity = torch.zeros_like(position)
         check_shape("velocity", velocity, points.count, 3)
@@ -258,12 +262,23 @@ class MPMSolver(nn.Module):
         node_velocity = momentum * self._static["node_inverse_mass"][..., None]
         return self._read_particles(state, torch.zeros_like(node_velocity), node_velocity)
 
+    def _check_rounding(self, position: Tensor) -> None:
+        """Refuse positions in ``updated`` whose rounding would swallow the way of a substep."""
+        farthest = float(position.detach().abs().amax()) if position.numel() else 0.0
+        limit = 1e-3 * self.dx / torch.finfo(position.dtype).eps
+        if not self.total_lagrangian and farthest > limit:
+            raise ValueError(
+                f"Expected `position` within {limit:.3g} m of the origin, but got {farthest:.3g} m, where "
+                f"{position.dtype} rounds by more than a thousandth of a cell: shift the scene to the origin (SimFrame "
+                "does so), or use float64."
+            )
+
     # ---- time
 
     def stable_substep(self, state: MPMState | None = None) -> float:
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
         F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
-        limit = stable_limit(self.points, self.dx, F, internal, spatial=not self.total_lagrangian)
+        limit = stable_limit(self.points, self.dx, F, internal, spatial=not self.total_lagrangian, laws=self._laws)
         return damped_substep(float(limit.detach().amin()), self._viscous_time(state))
 
     def substeps(self, state: MPMState, frame_dt: float) -> int:
@@ -302,7 +317,7 @@ class MPMSolver(nn.Module):
     def _cells_per_second(self, state: MPMState) -> Tensor:
         """How many cells the fastest wave crosses in a second."""
         F = state.F_elastic.detach()
-        speed = wave_speed(self.points, F, state.internal, spatial=not self.total_lagrangian)
+        speed = wave_speed(self.points, F, state.internal, spatial=not self.total_lagrangian, laws=self._laws)
         return cfl_number(1.0, self.dx, speed, None if self.total_lagrangian else state.velocity).detach()
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
@@ -320,7 +335,7 @@ class MPMSolver(nn.Module):
             return state
         speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
         reach = (2 * speed + 0.5 * sum(g * g for g in self.gravity) ** 0.5 * horizon) * horizon
-        grid = self._bounding_grid(state.position, margin=3 + margin + min(int(reach / self.dx), 1000))
+        grid = self._bounding_grid(state.position, 3 + margin + min(int(reach / self.dx), 1000), speed)
         return state.replace(grid=grid)
 
     def step(self, state: MPMState, dt: float, force: Tensor | None = None) -> MPMState:

@@ -18,7 +18,12 @@ from gaussian_swaying.mpm.state import MaterialPoints
 
 
 def wave_speed(
-    points: MaterialPoints, F: Tensor | None = None, internal: Tensor | None = None, *, spatial: bool = False
+    points: MaterialPoints,
+    F: Tensor | None = None,
+    internal: Tensor | None = None,
+    *,
+    spatial: bool = False,
+    laws: LawDispatch | None = None,
 ) -> Tensor:
     r"""Speed of the fastest elastic wave [m/s]: :math:`\sqrt{(\lambda + 2 \mu) / \rho}` at rest.
 
@@ -29,6 +34,7 @@ def wave_speed(
         F: Elastic deformation gradient, shape (..., P, 3, 3); None for the rest state.
         internal: Internal variable of the law, shape (..., P), if any has one.
         spatial: Also account for the stretch of space (``updated`` formulation: waves cross a stretched cell sooner).
+        laws: The laws of ``points``, if they are at hand.
 
     Returns:
         Shape (..., P).
@@ -37,14 +43,20 @@ def wave_speed(
     if F is None:
         mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
         return ((lam + 2 * mu) / density).sqrt()
-    squared = LawDispatch(points).moduli(F, internal)[0] / density
+    squared = (laws or LawDispatch(points)).moduli(F, internal)[0] / density
     if spatial:
         squared = squared * symmetric_eigenvalues(F.mT @ F)[..., 0].clamp(min=1.0)
     return squared.sqrt()
 
 
 def stable_limit(
-    points: MaterialPoints, dx: float, F: Tensor | None = None, internal: Tensor | None = None, *, spatial: bool = False
+    points: MaterialPoints,
+    dx: float,
+    F: Tensor | None = None,
+    internal: Tensor | None = None,
+    *,
+    spatial: bool = False,
+    laws: LawDispatch | None = None,
 ) -> Tensor:
     r"""Longest substep [s] that is stable for every arrangement of particles (see the head of this file).
 
@@ -55,6 +67,7 @@ def stable_limit(
             :math:`K = 2 \mu + 3 \lambda`.
         internal: Internal variable of the law, shape (..., P), if any has one.
         spatial: As in :func:`wave_speed`.
+        laws: The laws of ``points``, if they are at hand.
 
     Returns:
         Shape (..., P).
@@ -64,7 +77,7 @@ def stable_limit(
         mu, lam = lame_parameters(points.youngs_modulus, points.poisson_ratio)
         stiffness = 2 * mu + 3 * lam.clamp(min=0)
     else:
-        stiffness = LawDispatch(points).moduli(F, internal)[1]
+        stiffness = (laws or LawDispatch(points)).moduli(F, internal)[1]
         if spatial:
             stiffness = stiffness * (F.square().sum((-1, -2)) / 3).clamp(min=1.0)
     return dx * (density / stiffness).sqrt() * (2 / math.sqrt(6))

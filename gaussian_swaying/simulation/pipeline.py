@@ -30,6 +30,7 @@ from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     SimulationDiverged,
     TearingGauge,
+    check_spacing,
     check_state,
     diagnose,
 )
@@ -37,7 +38,8 @@ from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_RETRIES = 4
-CFL_LIMIT = 0.5  # an adaptive frame that ends above it is done again with shorter substeps
+CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
+CFL_SAMPLES = 8  # how often a frame is looked at, as material may stiffen and slacken again within it
 MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
 
@@ -96,7 +98,8 @@ class SimulationPipeline(nn.Module):
             ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long.
         """
         state = self.solver.init_state(self.scene.points, frame=self.scene.frame)
-        self._most_substeps = MAX_GROWTH * self._substeps(state)
+        check_spacing(self.solver)
+        self._most_substeps = MAX_GROWTH * self.solver.substeps(state, self.frame_dt)
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
 
@@ -126,9 +129,7 @@ class SimulationPipeline(nn.Module):
             for retry in range(MAX_RETRIES + 1):
                 if steps > self._most_substeps:
                     self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
-                end, work = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
-                dt = self.frame_dt / steps
-                cfl = float(self.solver.cfl_number(end, dt))
+                end, work, cfl = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 outrun = bool((end.lost & ~state.lost).any())
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
                 if retry == MAX_RETRIES or not (outrun or too_long):
@@ -146,7 +147,7 @@ class SimulationPipeline(nn.Module):
             self._give_up(
                 end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
             )
-        return end, diagnose(self.solver, end, steps, dt, work, self._tearing)
+        return end, diagnose(self.solver, end, steps, cfl, work, self._tearing)
 
     def _give_up(self, state: MPMState, cause: str) -> NoReturn:
         """Raise SimulationDiverged, blaming the particle with the largest deformation."""
@@ -158,35 +159,40 @@ class SimulationPipeline(nn.Module):
     def _substeps(self, state: MPMState) -> int:
         return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
 
-    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
-        """The state some substeps later, and the work of the wind on the way [J]."""
+    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor, float]:
+        """The state some substeps later, the work of the wind on the way [J], and the largest Courant number."""
         dt = self.frame_dt / steps
         work = torch.zeros((), dtype=torch.float64, device=self.device)
-        if self.aero.idle:
-            return self.solver.rollout(state, dt, steps), work
-        offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
-        winds = self.wind(state.time + offsets)
+        if not self.aero.idle:
+            offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
+            winds = self.wind(state.time + offsets)
+        looks = {math.ceil((k + 1) * steps / CFL_SAMPLES) for k in range(CFL_SAMPLES)}
+        cfls = []
         for k in range(steps):
-            force = self.force(state, winds[k], dt)
-            after = self.solver.step(state, dt, force)
-            # at the mean velocity: exactly what the step adds to the kinetic energy
-            work = (
-                work
-                + (0.5 * self.solver.kick(state, dt))
-                * torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
-            )
-            state = after
-        return state, work
+            if self.aero.idle:
+                state = self.solver.step(state, dt)
+            else:
+                force = self.force(state, winds[k], dt)
+                after = self.solver.step(state, dt, force)
+                # at the mean velocity: exactly what the step adds to the kinetic energy
+                power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
+                work = work + (0.5 * self.solver.kick(state, dt)) * power
+                state = after
+            if k + 1 in looks:
+                cfls.append(self.solver.cfl_number(state, dt))
+        return state, work, float(torch.stack(cfls).amax())
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
-        if self.aero.idle or self.aero.drag_step == "semi_implicit":
+        if self.aero.idle:
             return 1
         times = state.time + torch.linspace(0, self.frame_dt, 5, dtype=torch.float64, device=self.device)
         wind = torch.linalg.vector_norm(self.wind(times), dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
-        rate = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
-        return int(float(rate) * self.frame_dt) + 1
+        rate = float(self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax())
+        if not math.isfinite(rate):
+            self._give_up(state, "the wind, or the drag that it causes, is NaN or infinite")
+        return 1 if self.aero.drag_step == "semi_implicit" else int(rate * self.frame_dt) + 1
 
     # ---- picture
 

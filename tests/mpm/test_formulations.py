@@ -48,18 +48,18 @@ def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
 
 def _bar():
     """Hung by its top, let go: stretches by a few per cent."""
-    return _points((0.05, 0.05, 0.6), 0.025, e=3e4), Box([None, None, 0.55], [None, None, None]), (0, 0, -9.8)
+    return _points((0.05, 0.05, 0.7), 0.025, e=3e4), Box([None, None, 0.6], [None, None, None]), (0, 0, -9.8)
 
 
 def _cantilever():
     """Held at one end and bent by its weight, three to six cells thick."""
-    return _points((0.5, 0.05, 0.1), 0.025, e=1e5), Box([None] * 3, [0.05, None, None]), (0, 0, -9.8)
+    return _points((0.6, 0.05, 0.1), 0.025, e=1e5), Box([None] * 3, [0.1, None, None]), (0, 0, -9.8)
 
 
 def _sheet():
     """A pinned sheet under a gentle load across it."""
     points = _points((0.6, 0, 0.4), 0.025, e=1e4, density=30.0, thickness=0.01)
-    return points, Box([None] * 3, [0.05, None, None]), (0, 0.3, 0)
+    return points, Box([None] * 3, [0.1, None, None]), (0, 0.3, 0)
 
 
 def _move(points, region, gravity, formulation, dx, seconds):
@@ -73,7 +73,11 @@ def _move(points, region, gravity, formulation, dx, seconds):
 
 @pytest.mark.parametrize(("make", "dxs"), [(_bar, (0.1, 0.05)), (_cantilever, (0.1, 0.05)), (_sheet, (0.1, 0.05))])
 def test_formulations_agree_within_their_discretisation_error(make, dxs):
-    """While neither tears. A pin is of first order, so the error at dx is about twice the change from dx to dx / 2."""
+    """While neither tears. Each error is taken as the grid convergence index of two grids at order one (a pin's), which
+    is three times the change from dx to dx / 2 (Roache 1994).
+
+    The border of each pin lies on a plane of nodes of both grids: the error depends on where it lies in its cell.
+    """
     points, region, gravity = make()
 
     def size(move):  # root mean square: the layer of cells next to the pin differs however fine the grid
@@ -82,8 +86,8 @@ def test_formulations_agree_within_their_discretisation_error(make, dxs):
     move = {(f, dx): _move(points, region, gravity, f, dx, 0.16) for f in FORMULATIONS for dx in dxs}
     assert size(move["total", dxs[1]]) > 0.001
     apart = [size(move["total", dx] - move["updated", dx]) for dx in dxs]
-    assert apart[0] < sum(2 * size(move[f, dxs[0]] - move[f, dxs[1]]) for f in FORMULATIONS)
-    assert apart[1] < 0.75 * apart[0]
+    assert apart[0] < sum(3 * size(move[f, dxs[0]] - move[f, dxs[1]]) for f in FORMULATIONS)
+    assert apart[1] < 0.9 * apart[0]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

@@ -8,7 +8,7 @@ import torch
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 FORMULATIONS = ["total", "updated"]
 

@@ -35,7 +35,7 @@ def test_numbers_of_a_known_state():
         lost=lost,
         time=torch.tensor(0.6, dtype=torch.float64),
     )
-    health = diagnose(solver, state, 12, 1e-3, wind_work=torch.tensor(3.5))
+    health = diagnose(solver, state, 12, solver.cfl_number(state, 1e-3), wind_work=torch.tensor(3.5))
     assert health.time == pytest.approx(0.6)
     assert health.wind_work == 3.5
     assert (health.momentum_x, health.momentum_y, health.momentum_z) == (0.0, 0.0, pytest.approx(30 * 2.0 * 2.0))

@@ -226,10 +226,10 @@ def test_a_particle_that_becomes_nan_is_a_divergence(make_pipeline, monkeypatch)
     state, roll = pipeline.start(), pipeline._roll
 
     def poison(start, steps):
-        end, work = roll(start, steps)
+        end, *more = roll(start, steps)
         velocity = end.velocity.clone()
         velocity[7] = math.nan
-        return end.replace(velocity=velocity), work
+        return end.replace(velocity=velocity), *more
 
     monkeypatch.setattr(pipeline, "_roll", poison)
     with pytest.raises(SimulationDiverged, match=r"particle 7: .*NaN"):
