@@ -4,6 +4,7 @@
 ``python tools/bench.py sim``        the main job end to end; writes docs/results/sim_<device>.json
 ``python tools/bench.py accuracy``   errors against closed forms; writes docs/results/accuracy_<device>.json
 ``python tools/bench.py pareto``     speed against error; writes docs/results/pareto_<device>.json
+``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
 ``python tools/bench.py pages``      docs/benchmarks.md and docs/validation.md from all recorded JSON
 ``python tools/bench.py pictures``   the README's pictures from a finished run
 """
@@ -178,6 +179,39 @@ def pareto(options: argparse.Namespace) -> None:
     validation_page(options)
 
 
+def gradients(options: argparse.Namespace) -> None:
+    """Measure the memory of gradients through long rollouts, and fit a flag."""
+    _, result = _start(argparse.Namespace(device="cpu"))
+    result["memory"] = []
+    for formulation in ("total", "updated"):
+        for steps, checkpoint in ((50, 0), (500, 0), (500, 22), (2000, 45)):
+            command = [sys.executable, str(ROOT / "tools" / "gradient_memory.py"), formulation]
+            done = subprocess.run([*command, str(steps), str(checkpoint)], check=True, capture_output=True, text=True)
+            result["memory"].append(json.loads(done.stdout))
+            print(result["memory"][-1], flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "fit.json"
+        subprocess.run([sys.executable, str(ROOT / "tools" / "fit_flag.py"), "--json", str(path)], check=False)
+        result["fit"] = json.loads(path.read_text())
+    _write(options, "gradients_cpu", result)
+    validation_page(options)
+
+
+def _gradient_lines(result: dict[str, Any]) -> list[str]:
+    lines = ["## Gradients", "", f"{result['device']}; {', '.join(f'{k} {v}' for k, v in result['versions'].items())}."]
+    lines += ["", "Forward and backward through a rollout of a flag, memory beyond that of the imports:", ""]
+    lines += ["| formulation | substeps | `checkpoint` | memory [MiB] | seconds | dL/dE |", "|---|---|---|---|---|---|"]
+    for row in result["memory"]:
+        lines.append(
+            f"| `{row['formulation']}` | {row['substeps']} | {row['checkpoint'] or 'none'} | {row['memory_MiB']:.0f} | "
+            f"{row['seconds']:.1f} | {row['gradient_E']:.6g} |"
+        )
+    shown = {k: v for k, v in result["fit"].items() if isinstance(v, (int, float, bool))}
+    lines += ["", "`tools/fit_flag.py`, a flag's wind and stiffness from its own trajectory: "]
+    lines += [", ".join(f"{name} {value:.6g}" for name, value in shown.items()) + ".", ""]
+    return lines
+
+
 def validation_page(options: argparse.Namespace) -> None:
     """Write docs/validation.md and its plots from the recorded JSON."""
     folder = Path(options.results)
@@ -195,6 +229,12 @@ def validation_page(options: argparse.Namespace) -> None:
     swept = [json.loads(p.read_text()) for p in sorted(folder.glob("pareto_*.json"))]
     if swept:
         lines += ["## Speed against error", "", *pareto_cases.page(swept, docs / "pictures")]
+    for path in sorted(folder.glob("gradients_*.json")):
+        lines += _gradient_lines(json.loads(path.read_text()))
+    long_run = folder / "long_flag.json"
+    if long_run.exists():
+        found = json.loads(long_run.read_text())
+        lines += ["## Ten simulated minutes of a gusty flag", "", "```json", json.dumps(found, indent=1), "```"]
     (docs / "validation.md").write_text("\n".join(lines).rstrip() + "\n")
     print(f"wrote {docs / 'validation.md'}")
 
@@ -316,7 +356,7 @@ def main() -> None:
     """Parse and run one command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for function in (substep, sim, accuracy, pareto, pages, pictures):
+    for function in (substep, sim, accuracy, pareto, gradients, pages, pictures):
         command = commands.add_parser(function.__name__, help=function.__doc__)
         command.set_defaults(run_command=function)
         command.add_argument("--results", default=str(RESULTS), help="folder of the recorded JSON")

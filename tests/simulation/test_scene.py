@@ -9,6 +9,7 @@ import torch
 from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.materials import NeoHookean, Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, cell_volume
 
@@ -156,6 +157,21 @@ def test_faint_gaussians_take_no_area(make_cloud, make_scene):
     names = ("means", "quats", "scales", "opacities", "sh")
     both = GaussianCloud(*(torch.cat([getattr(flag, name), getattr(haze, name)]) for name in names))
     torch.testing.assert_close(make_scene(both).patch_area, make_scene(flag).patch_area)
+
+
+def test_each_part_has_the_law_it_was_given(make_cloud, make_scene):
+    cloud = make_cloud()
+    material = Material(law=NeoHookean(), regions=[MaterialRegion(LEFT, law=Sand(35.0)), MaterialRegion(LEFT, E=7.0)])
+    points = make_scene(cloud, material).points
+    inside = cloud.means[:, 0] <= 0.5
+    assert [type(law).__name__ for law in points.laws] == ["NeoHookean", "Sand"]
+    assert torch.equal(points.law_index, inside.long())
+    assert points.laws[1].friction_angle == 35.0
+    plain = make_scene(cloud, Material()).points
+    assert plain.law_index is None
+    assert [type(law).__name__ for law in plain.laws] == ["FixedCorotated"]
+    # moving the scene to another type keeps the integers
+    assert make_scene(cloud, material).to(torch.float64).points.law_index.dtype == torch.long
 
 
 def test_areas_as_in_the_paper(make_cloud, make_scene):

@@ -69,6 +69,27 @@ def test_a_run(tmp_path, capsys):
     assert summary["frames"] == 2
 
 
+def test_a_material_that_flows(tmp_path, capsys):
+    """A law with its own arguments on the command line; `total` refuses it in one sentence."""
+    law = ["--material.law", "Sand", "--material.law.init_args.friction_angle", "35"]
+    check_refused([*SMALL, *law], tmp_path / "out", capsys, "Sand", "solver.formulation", "updated")
+    assert _code([*SMALL, *law, "--solver.formulation", "updated", "--output", str(tmp_path / "out")]) == 0
+    stored = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())
+    assert stored["material"]["law"]["init_args"]["friction_angle"] == 35.0
+    assert _code([*SMALL, "--material.law", "Chewing", "--output", str(tmp_path / "no")]) == 2
+
+
+def test_torn_particles_are_warned_of(tmp_path, capsys):
+    """`updated` on a grid finer than the flag's particles."""
+    arguments = [*SMALL, "--frames", "6", "--solver.formulation", "updated", "--solver.dx", "0.08"]
+    assert _code([*arguments, "--output", str(tmp_path / "out")]) == 0
+    assert "particles are farther than two cells from a neighbour" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["torn_particles"] > 0
+    assert _code([*SMALL, "--output", str(tmp_path / "whole")]) == 0
+    assert "warning" not in capsys.readouterr().err
+
+
 def test_the_tool_as_a_program(tmp_path):
     """Exit code and streams of the process itself, from another folder."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
