@@ -41,7 +41,7 @@ def settings_of(problem: str, device: str) -> Iterator[tuple[Row, Settings]]:
             base = Settings(formulation=formulation, mls=mls, dtype=torch.float32, device=device)
             coarse = size in sizes[:2]
             for cfl in CFLS:
-                if problem in ("cantilever", "hinged plate") and cfl < 0.4 and not coarse:
+                if problem in ("cantilever", "hinged plate") and cfl < 0.4 and not (coarse and device == "cpu"):
                     continue  # tens of thousands of substeps, for an error that the substep does not rule
                 yield (
                     {"size": size, "variant": variant, "dtype": "float32", "cfl": cfl, "substep": None},
@@ -52,7 +52,7 @@ def settings_of(problem: str, device: str) -> Iterator[tuple[Row, Settings]]:
                     {"size": size, "variant": variant, "dtype": "float64", "cfl": 0.4, "substep": None},
                     replace(base, dtype=torch.float64),
                 )
-            if fixed and (variant == "total" or (variant == "updated" and device == "cpu")):
+            if fixed and variant == "total":
                 yield (
                     {"size": size, "variant": variant, "dtype": "float32", "cfl": None, "substep": fixed},
                     replace(base, substep=fixed),
@@ -66,7 +66,7 @@ def run(problem: str, size: float, settings: Settings, reference: Tensor | None)
     if problem == "cantilever":
         return beams.cantilever(int(size), settings, slenderness=6)
     if problem == "hinged plate":
-        return plates.hinged_plate(0.5, "projected", settings, cells=int(size), seconds=2.4)
+        return plates.hinged_plate(0.5, "projected", settings, cells=int(size), seconds=2.4, per_cell=3)
     result, series = flags.flag(size, settings, **FLAG)  # type: ignore[arg-type]
     assert reference is not None
     return result | {"error": flags.distance(series, reference)}
@@ -198,6 +198,7 @@ def _plot(rows: list[Row], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
     colors = {"total": "tab:blue", "updated": "tab:orange", "MLS": "tab:green"}
@@ -220,8 +221,12 @@ def _plot(rows: list[Row], path: Path) -> None:
         best = front([row for row in own if proven(row)])
         axis.loglog([r["wall_per_simulated_s"] for r in best], [r["error"] for r in best], "k-", linewidth=0.8)
         shown = ", ".join(str(size) for size in sizes)
-        axis.set_title(f"{problem} ({unit}: {shown}; larger markers are finer)", fontsize=9)
-        axis.set_xlabel("seconds per simulated second")
+        axis.set_title(f"{problem} ({unit}: {shown})", fontsize=9)
+        axis.set_xlabel("seconds per simulated second (larger markers: finer grids)")
+        for scale in (axis.xaxis, axis.yaxis):
+            scale.set_minor_formatter(NullFormatter())
+            scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            scale.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
         axis.set_ylabel("error [degrees]" if problem == "hinged plate" else "relative error")
     for variant, color in colors.items():
         axes.flat[0].plot([], [], "o", color=color, label=f"{variant}, float32 (float64: square)")
