@@ -46,7 +46,7 @@ class MPMSolver(nn.Module):
         max_nodes: Largest grid [nodes]; an object that spreads beyond it is reported instead of eating the memory.
         mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
         deterministic: On a GPU, sum in a fixed order, so that the same run gives the same bits; slower. On a CPU it is
-            so anyway.
+            so anyway. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order.
 
     Example:
