@@ -41,6 +41,7 @@ MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
 CFL_SAMPLES = 8  # how often a frame is looked at, as material may stiffen and slacken again within it
 MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
+MAX_WIND = 1e6  # m/s; any more is a mistake, and would overflow positions
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
 
 
@@ -130,7 +131,7 @@ class SimulationPipeline(nn.Module):
                 if steps > self._most_substeps:
                     self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
                 end, work, cfl = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
-                outrun = bool((end.lost & ~state.lost).any())
+                outrun = bool((end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any())
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
                 if retry == MAX_RETRIES or not (outrun or too_long):
                     break
@@ -190,8 +191,9 @@ class SimulationPipeline(nn.Module):
         wind = torch.linalg.vector_norm(self.wind(times), dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
         rate = float(self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax())
-        if not math.isfinite(rate):
-            self._give_up(state, "the wind, or the drag that it causes, is NaN or infinite")
+        if not (math.isfinite(rate) and float(wind) < MAX_WIND):
+            cause = f"the wind of {float(wind):.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
+            self._give_up(state, cause)
         return 1 if self.aero.drag_step == "semi_implicit" else int(rate * self.frame_dt) + 1
 
     # ---- picture

@@ -225,9 +225,8 @@ def test_an_inverted_body_turns_back(law):
     assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
 
 
-@pytest.mark.xfail(strict=True, reason="the stiffness that a body passes through within a frame is never seen")
 def test_a_deeply_inverted_body_does_not_gain_energy():
-    """`total`, neo-Hookean, det F = -0.6: the substep is that of the frame's start and is checked at its end only."""
+    """`total`, neo-Hookean, det F = -0.6: what it passes within a frame is far stiffer than either end of it."""
     position = _lattice(3, 3, 3)
     pipeline = _pipeline(_points(position, law=NeoHookean()), formulation="total", damping=20.0, frame_dt=1e-3, cfl=0.1)
     state = pipeline.start()
@@ -330,25 +329,17 @@ def test_a_sheet_of_one_layer_and_some_cells_thick(cells, formulation):
     assert log[-1].torn == 0
 
 
-@pytest.mark.xfail(strict=True, reason="a sheet whose particles share no node falls apart without a word")
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_sheet_coarser_than_its_grid_is_reported(formulation):
-    """Particles four cells apart share no node: the flag cannot hang on its pole, which has to be said somewhere."""
-    with pytest.raises((ValueError, SimulationDiverged)):
+    """Particles four cells apart share no node and could not hang on the pole: refused, with a grid that would do."""
+    with pytest.raises(ValueError, match=r"nearest neighbour, more than two cells.*raise `solver.dx` to about 0\.1 m"):
         _advance(_flag(WindField(), formulation, dx=0.025, width=0.4, gravity=UP), 3)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize(
-    ("places", "name"),
-    [([[0.3, 0.2, 0.1]], "one"), ([[0.3, 0.2, 0.1]] * 2, "two at one place")],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_particles_without_neighbours_fall(places, name, formulation, request):
+@pytest.mark.parametrize("places", [[[0.3, 0.2, 0.1]], [[0.3, 0.2, 0.1]] * 2], ids=["one", "two at one place"])
+def test_particles_without_neighbours_fall(places, formulation):
     """Two at the same place stay together; either way they fall exactly as symplectic Euler sums it up."""
-    if name == "one" and formulation == "updated":
-        reason = "the gauge of torn particles asks for the neighbours of a single one: IndexError"
-        request.applymarker(pytest.mark.xfail(strict=True, raises=IndexError, reason=reason))
     pipeline = _pipeline(_points(torch.tensor(places)), formulation=formulation, gravity=UP)
     state, log = _advance(pipeline, 10)
     expected = speed = before = 0.0
@@ -446,25 +437,11 @@ def test_a_wind_that_is_no_number_is_refused(flow):
         WindField(schedule=[FlowKey(0.0, [1.0, 0.0, 0.0]), FlowKey(1.0, flow)])
 
 
-BROKEN = [
-    ("total", "semi_implicit", math.nan, None),
-    ("updated", "semi_implicit", math.nan, "NaN grows the grid up to `max_nodes`, which is then blamed"),
-    ("total", "explicit", math.nan, "ValueError: cannot convert float NaN to integer"),
-    ("updated", "explicit", math.nan, "ValueError: cannot convert float NaN to integer"),
-    ("total", "semi_implicit", 1e30, None),
-    ("total", "explicit", 1e30, "OverflowError of the number of substeps"),
-]
-
-
-@pytest.mark.parametrize(
-    ("formulation", "drag_step", "factor"),
-    [
-        pytest.param(*case[:3], marks=[pytest.mark.xfail(strict=True, reason=case[3])] if case[3] else [])
-        for case in BROKEN
-    ],
-)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("drag_step", ["semi_implicit", "explicit"])
+@pytest.mark.parametrize("factor", [math.nan, math.inf, 1e30])
 def test_a_modulation_that_breaks_the_wind_is_a_divergence(formulation, drag_step, factor):
-    """The message says that something is NaN or infinite, or that the substeps are too many, and sends to the wind."""
+    """The message says that something is NaN or infinite or takes too many substeps, and sends to the wind."""
     wind = WindField([1.0, 0.0, 0.0], modulations=[_Broken(factor)])
     points = _points(_lattice(3, 3, 1))
     settings = {"formulation": formulation, "max_nodes": 100_000, "frame_dt": 1e-3}
@@ -508,11 +485,8 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
-def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation, request):
+def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
     """Between two handles: upright in the end, and after the release its energy only falls."""
-    if law is NeoHookean and formulation == "total":
-        reason = "9 kJ become 18 MJ: what stiffens and slackens again within a frame is never seen"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
     position = _lattice(3, 3, 6)
     fast = 0.9 * 0.3 / 2 / 0.1
     grips = [
@@ -604,13 +578,13 @@ def test_a_body_that_spreads_beyond_the_largest_grid_is_reported():
     assert 0 < info.value.time < 0.1
 
 
-@pytest.mark.xfail(strict=True, reason="the grid's margin for the speed is reported as the span of the particles")
 def test_a_grid_too_large_for_the_speed_names_the_speed():
     """A small body at 10 km/s needs a grid for where it may go: its own span is not to blame."""
     pipeline = _pipeline(_points(_lattice(2, 2, 2)), formulation="updated", frame_dt=0.04)
-    with pytest.raises(SimulationDiverged) as info:
+    with pytest.raises(
+        SimulationDiverged, match=r"may fly .* m to any side within a frame, at 1e\+04 m/s.*`max_nodes`"
+    ):
         _advance(pipeline, 1, _throw(pipeline, [1e4, 0.0, 0.0]))
-    assert "span [0.05, 0.05, 0.05] m" not in str(info.value)
 
 
 @pytest.mark.parametrize(
@@ -747,14 +721,18 @@ def test_a_scene_ten_kilometres_away_moves_the_same(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-def test_the_solver_alone_ten_kilometres_away(formulation, dtype, request):
-    """1 m/s for 0.1 s: a tenth of a metre to the rounding of the coordinates, 2^-10 m in float32."""
-    if formulation == "updated" and dtype == torch.float32:
-        reason = "the way of a substep is below the rounding of the position: the body has a velocity and stands still"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
+def test_the_solver_alone_ten_kilometres_away(formulation, dtype):
+    """1 m/s for 0.1 s: a tenth of a metre to the rounding of the coordinates, 2^-10 m in float32.
+
+    In `updated` that rounding would swallow the way of a substep, and the body would stand still: refused.
+    """
     points = _points(_lattice(3, 3, 3, low=(1e4, 1e4, 1e4), dtype=dtype))
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
     velocity = torch.tensor([1.0, 0.0, 0.0], dtype=dtype).expand(27, 3)
+    if formulation == "updated" and dtype == torch.float32:
+        with pytest.raises(ValueError, match=r"`position` within \d+ m of the origin.*SimFrame.*or use float64"):
+            solver.init_state(points, velocity)
+        return
     state = solver.init_state(points, velocity)
     state = solver.rollout(solver.fit_grid(state, 0.1), 2e-4, 500)
     check_state(solver, state)
@@ -765,17 +743,22 @@ def test_the_solver_alone_ten_kilometres_away(formulation, dtype, request):
 
 # ---- ten minutes
 
+DAMPINGS = [0.0, 0.1]
+
 
 @functools.cache
 @torch.inference_mode()
-def _long_flag(formulation):
-    """Ten minutes of a small flag in stationary gusts, without damping but the air's: energies, health, seconds."""
+def _long_flag(damping):
+    """Ten minutes of a small flag in stationary gusts, in `total`: energies, health, seconds.
+
+    `updated` takes more than twice as long for the same, and loses energy in its transfers anyway.
+    """
     minutes, frame_dt = 10, 0.04
     scene = SimulatedScene(
         Scene(generator=FlagScene(width=0.8, height=0.6, spacing=0.1)), Material(E=1e4, density=40.0), 0.2
     )
     pole = PinnedRegion(Box([None, None, None], [0.11, None, None]))
-    solver = MPMSolver(dx=0.2, formulation=formulation, boundaries=[pole])
+    solver = MPMSolver(dx=0.2, formulation="total", boundaries=[pole], damping=damping)
     wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(), UniformGust(0.3), GaussianGust(0.3)], seed=3)
     camera = OrbitCamera(width=8, height=8)
     pipeline = SimulationPipeline(scene, solver, wind, AeroForce(), None, camera, frame_dt=frame_dt)
@@ -794,6 +777,7 @@ def _long_flag(formulation):
     values = {
         "particles": scene.points.count,
         "dx_m": solver.dx,
+        "damping_per_s": damping,
         "simulated_minutes": float(state.time) / 60,
         "frames": len(log) - 1,
         "substeps": sum(health.substeps for health in log),
@@ -812,7 +796,7 @@ def _long_flag(formulation):
         "device": describe_device(pipeline.device),
         "versions": versions(),
     }
-    _record("long_flag.json", formulation, values)
+    _record("long_flag.json", "damped" if damping else "undamped", values)
     return energy, values
 
 
@@ -824,37 +808,36 @@ def _minutes(series, blocks=12):
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_ten_minutes_of_a_gusty_flag(formulation):
+@pytest.mark.parametrize("damping", DAMPINGS)
+def test_ten_minutes_of_a_gusty_flag(damping):
     """Nothing torn, lost or NaN, and every joule that the flag gained came from the wind.
 
     That within 2 % of all that wind and flag gave each other, for symplectic Euler is of first order. What is seen to
     move, the particles, moves in the tenth minute no more than in the second, within 4 standard errors.
     """
-    energy, found = _long_flag(formulation)
+    energy, found = _long_flag(damping)
     assert all(bool(torch.isfinite(series).all()) for series in energy.values())
     assert found["simulated_minutes"] == pytest.approx(10.0, rel=1e-9)
     assert found["torn"] == found["lost"] == 0
     assert found["largest_stretch"] < 2.0  # two cells apart would be torn: the particles rest half a cell apart
     gained = found["energy_end_J"] - found["energy_start_J"]
     assert gained <= found["wind_work_J"] + 0.02 * found["wind_work_exchanged_J"]
-    if formulation == "total":  # the transfers of `updated` dissipate
+    if damping == 0:
         assert gained >= found["wind_work_J"] - 0.02 * found["wind_work_exchanged_J"]
     mean, error = _minutes(energy["kinetic_of_particles"])
     assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
 
 
-GHOSTS = "nodal motion that no particle sees holds 9/10 of the kinetic energy and grows by some 3 % a minute"
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize(
-    "formulation", [pytest.param("total", marks=pytest.mark.xfail(strict=True, reason=GHOSTS)), "updated"]
-)
-def test_ten_minutes_do_not_heat_a_flag(formulation):
-    """The mean mechanical energy of the tenth minute is that of the second, within 4 standard errors."""
-    energy, _ = _long_flag(formulation)
+def test_ten_minutes_do_not_heat_a_damped_flag():
+    """The mean mechanical energy of the tenth minute is that of the second, within 4 standard errors.
+
+    Nothing in `total` dissipates but the air, which does not see the motion inside a cell (nine tenths of the kinetic
+    energy here). The wind heats that by some 3 % a minute, as it would heat cloth without any loss; a damping of 0.1 1/s
+    takes it away.
+    """
+    energy, _ = _long_flag(0.1)
     mean, error = _minutes(energy["mechanical"])
     assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
 
