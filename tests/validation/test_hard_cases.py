@@ -834,8 +834,8 @@ def test_ten_minutes_do_not_heat_a_damped_flag():
     """The mean mechanical energy of the tenth minute is that of the second, within 4 standard errors.
 
     Nothing in `total` dissipates but the air, which does not see the motion inside a cell (nine tenths of the kinetic
-    energy here). The wind heats that by some 3 % a minute, as it would heat cloth without any loss; a damping of 0.1 1/s
-    takes it away.
+    energy here). The wind heats that by some 3 % a minute, as it would heat cloth without any loss; damping by a tenth
+    in a second takes it away.
     """
     energy, _ = _long_flag(0.1)
     mean, error = _minutes(energy["mechanical"])
