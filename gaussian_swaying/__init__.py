@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
     from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
     from gaussian_swaying.mpm.boundary import (
+        Boundary,
         EnclosingBox,
         Handle,
         Impulse,
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
     from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
-    from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+    from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
     from gaussian_swaying.simulation.frame import SimFrame
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
     from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
@@ -56,6 +57,7 @@ _HOMES = {
     "gaussians.selection": ("Box", "Cylinder", "Sphere"),
     "gaussians.surface": ("GaussianSurfaceModel",),
     "mpm.boundary": (
+        "Boundary",
         "EnclosingBox",
         "Handle",
         "Impulse",
@@ -82,7 +84,7 @@ _HOMES = {
     "rendering.gsplat_renderer": ("GsplatRenderer",),
     "rendering.shading": ("DiffuseShader", "PhongShader"),
     "rendering.torch_renderer": ("TorchRenderer",),
-    "simulation.diagnostics": ("SimulationDiverged",),
+    "simulation.diagnostics": ("SimulationDiverged", "TearingGauge"),
     "simulation.frame": ("SimFrame",),
     "simulation.pipeline": ("SimulationPipeline",),
     "simulation.recorder": ("Recorder", "load_trajectory"),
@@ -92,6 +94,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "AeroForce",
+    "Boundary",
     "Box",
     "Camera",
     "ConstitutiveLaw",
@@ -133,6 +136,7 @@ __all__ = [
     "Snow",
     "Sphere",
     "StVKHencky",
+    "TearingGauge",
     "TorchRenderer",
     "TransformsCamera",
     "UniformGust",

@@ -188,7 +188,9 @@ def _bar_gate(ends: str) -> Callable[[list[Row]], tuple[str, bool] | None]:
     return judge
 
 
-gate("confined bar, frequency at 64 cells, `total`", "within 0.5 %")(_bar_gate("free"))
+gate("confined bar (free; either half is a fixed-free bar), frequency at 64 cells, `total`", "within 0.5 %")(
+    _bar_gate("free")
+)
 gate("fixed-free bar, held by a PinnedRegion, frequency at 64 cells, `total`", "within 0.5 %")(_bar_gate("fixed-free"))
 
 
@@ -204,12 +206,21 @@ def _order_gate(problem: str, **parameters: Any) -> Callable[[list[Row]], tuple[
 
 
 gate("confined bar, observed order in dx, `total`", "at least 1.8")(_order_gate("vibrating bar", ends="free"))
+gate("fixed-free bar, held by a PinnedRegion, observed order in dx, `total`", "at least 1.8")(
+    _order_gate("vibrating bar", ends="fixed-free")
+)
 gate("large-rotation vortex, observed order in dx, `total`", "at least 1.8")(_order_gate("vortex"))
 
 
 @gate("bar hanging under its own weight, tip at 32 cells, `total`", "within 1 %")
 def _(rows: list[Row]) -> tuple[str, bool] | None:
     found = select(rows, "hanging bar", variant="total", cells=32, clamp="mirror")
+    return (f"{100 * found[0]['result']['error']:.3f} %", found[0]["result"]["error"] <= 0.01) if found else None
+
+
+@gate("bar hanging from a PinnedRegion, tip at 32 cells, `total`", "within 1 %")
+def _(rows: list[Row]) -> tuple[str, bool] | None:
+    found = select(rows, "hanging bar", variant="total", cells=32, clamp="pin")
     return (f"{100 * found[0]['result']['error']:.3f} %", found[0]["result"]["error"] <= 0.01) if found else None
 
 
@@ -314,6 +325,14 @@ def page(results: list[dict[str, Any]], pictures: Path) -> list[str]:
         "",
     ]
     lines += _sand(rows)
+    lines += _exponents(rows)
+    lines += [
+        "The band of the experiments is wide: between Lube's and Lajeunesse's fits of a round column lies up to a",
+        "factor of two. The run-outs here lie below it. Two causes were found, and nothing was tuned: the cone of 30",
+        "degrees mobilises 44 in plane strain, and APIC loses a little motion in every substep, so that finer grids",
+        "run further.",
+        "",
+    ]
     soft = select(rows, "soft flag")
     if soft:
         lines += ["## A soft flag stays whole in `total`", ""]
@@ -393,6 +412,24 @@ def _sand(rows: list[Row]) -> list[str]:
         ],
     )
     return lines
+
+
+def _exponents(rows: list[Row]) -> list[str]:
+    """The exponent of the run-out in the aspect ratio, from the finest grid that has all aspects."""
+    lines = []
+    for planar in (True, False):
+        own = [row for row in select(rows, "sand column") if row["parameters"].get("planar", True) == planar]
+        own = [row for row in own if row["parameters"].get("volume_correction", True)]
+        for low, high in ((0.5, 1.0), (1.0, 2.0), (1.0, 3.0)):
+            finest: dict[float, Row] = {}
+            for row in sorted(own, key=lambda r: r["parameters"]["cells"]):
+                finest[row["parameters"]["aspect"]] = row
+            if low in finest and high in finest:
+                values = [finest[a]["result"] for a in (low, high)]
+                found, lube = (math.log(values[1][n] / values[0][n]) / math.log(high / low) for n in ("runout", "lube"))
+                kind = "planar" if planar else "round"
+                lines.append(f"- {kind}, a from {low} to {high}: run-out as a^{found:.2f}; Lube's fit a^{lube:.2f}.")
+    return [*lines, ""]
 
 
 def _plot(rows: list[Row], path: Path) -> None:

@@ -99,24 +99,6 @@ def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | f
     return air_density * coefficient * area * speed / mass
 
 
-def semi_implicit(force: Tensor, rate: Tensor, dt: float) -> Tensor:
-    r"""A drag force as it acts over a substep that it slows the patch down in: stable however light the patch.
-
-    Drag taken at the end of the step, :math:`v^+ = (v + k u) / (1 + k)` with :math:`k = \Delta t\, \rho A C v_r / 2m`,
-    is the explicit step with the force divided by :math:`1 + k`. It differs from the explicit one by
-    O(:math:`\Delta t`).
-
-    Args:
-        force: Force [N], shape (..., P, 3).
-        rate: From :func:`drag_rate` [1/s], shape (..., P).
-        dt: Substep [s].
-
-    Returns:
-        Force [N], shape (..., P, 3).
-    """
-    return force / (1 + 0.5 * dt * rate)[..., None]
-
-
 class AeroForce(nn.Module):
     """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
 
@@ -131,8 +113,8 @@ class AeroForce(nn.Module):
         law: ``paper`` or ``projected``.
         lift_direction: ``side`` or ``lift``.
         unit_tangent: Normalise the tangential flow direction.
-        drag_step: ``explicit``, or ``semi_implicit`` (see :func:`semi_implicit`), which needs no shorter substep for
-            very light things in strong wind.
+        drag_step: ``explicit``, or ``semi_implicit``: the solver takes the drag at the velocity that it leads to (see
+            :meth:`resistance`), which needs no shorter substep for very light things in strong wind.
 
     Example:
         >>> aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=2.0)
@@ -179,15 +161,26 @@ class AeroForce(nn.Module):
         coefficient = (self.C_D + self.C_F + self.C_L.abs()).to(speed.dtype)
         return drag_rate(speed, area, mass, coefficient, self.air_density)
 
-    def forward(
-        self,
-        wind: Tensor,
-        velocity: Tensor,
-        normal: Tensor,
-        area: Tensor,
-        mass: Tensor | None = None,
-        dt: float | None = None,
-    ) -> Tensor:
+    def resistance(self, wind: Tensor, velocity: Tensor, area: Tensor) -> Tensor | None:
+        r"""By how much the force falls as a patch follows it [kg/s], for ``MPMSolver.step(drag=...)``.
+
+        :math:`D = \tfrac12 \rho A C v_r`, so that the force at the end of the step is about
+        :math:`f - D (v^+ - v)`: where nothing moves it is the explicit one, and a free patch never overtakes the wind.
+
+        Args:
+            wind: Air velocity [m/s], broadcastable to (..., P, 3).
+            velocity: Patch velocity [m/s], shape (..., P, 3).
+            area: Patch area [m²], shape (..., P).
+
+        Returns:
+            Shape (..., P), or None with ``drag_step="explicit"``.
+        """
+        if self.drag_step == "explicit":
+            return None
+        speed = torch.linalg.vector_norm(wind.to(velocity.dtype) - velocity, dim=-1)
+        return 0.5 * self.rate(speed, area, torch.ones_like(area))
+
+    def forward(self, wind: Tensor, velocity: Tensor, normal: Tensor, area: Tensor) -> Tensor:
         """Force on each patch [N].
 
         Args:
@@ -195,16 +188,11 @@ class AeroForce(nn.Module):
             velocity: Patch velocity [m/s], shape (..., P, 3).
             normal: Unit normal of either sign, shape (..., P, 3).
             area: Patch area [m²], shape (..., P).
-            mass: Mass of the patch [kg], shape (..., P), for ``drag_step="semi_implicit"``.
-            dt: Substep [s], for the same.
 
         Returns:
             Shape (..., P, 3).
-
-        Raises:
-            ValueError: If ``drag_step`` is ``semi_implicit`` and ``mass`` or ``dt`` is missing.
         """
-        force = aero_force(
+        return aero_force(
             wind,
             velocity,
             normal,
@@ -217,14 +205,6 @@ class AeroForce(nn.Module):
             lift_direction=self.lift_direction,
             unit_tangent=self.unit_tangent,
         )
-        if self.drag_step == "explicit":
-            return force
-        if mass is None or dt is None:
-            raise ValueError(
-                'Expected `mass` and `dt` with `drag_step` "semi_implicit": give both, or set it to explicit.'
-            )
-        speed = torch.linalg.vector_norm(wind.to(velocity.dtype) - velocity, dim=-1)
-        return semi_implicit(force, self.rate(speed, area, mass), dt)
 
     def extra_repr(self) -> str:
         """Settings, for printing."""

@@ -30,36 +30,34 @@ def leaves_of(state: MPMState) -> list[Tensor]:
     return found
 
 
-def detached(state: MPMState) -> MPMState:
-    """The state without its history."""
-    layout, tensors = _flatten(state)
-    return _unflatten(layout, [t.detach() for t in tensors])
-
-
-def recompute(advance: Advance, state: MPMState, leaves: Sequence[Tensor]) -> MPMState:
+def recompute(advance: Advance, state: MPMState) -> MPMState:
     """Advance a state without keeping what the gradient needs: the backward pass computes it again.
 
     ``torch.utils.checkpoint`` keeps the graph and forgets only its tensors, and the graph of thousands of substeps is
-    large. Here nothing is left but the state and one node.
+    large. Here nothing is left but the state and one node. The tensors beside the state that ``advance`` depends on are
+    found by walking the graph of its first run, which is dropped.
 
     Args:
         advance: Computes the later state; must give the same result each time.
         state: Where to start.
-        leaves: Tensors beside the state that ``advance`` depends on and that need a gradient (see :func:`leaves_of`).
 
     Returns:
         ``advance(state)``.
     """
     before, start = _flatten(state)
-    after: list[Layout] = []
+    own = [t.detach().requires_grad_(t.requires_grad) for t in start]
+    with torch.enable_grad():
+        end = advance(_unflatten(before, own))
+    after, out = _flatten(end)
+    leaves = [leaf for leaf in leaves_of(end) if not any(leaf is t for t in own)]
 
-    def run(tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        layout, out = _flatten(advance(_unflatten(before, tensors)))
-        after[:] = [layout]
-        return tuple(out)
+    def run(tensors: Sequence[Tensor]) -> list[Tensor]:
+        return _flatten(advance(_unflatten(before, tensors)))[1]
 
-    out = _Recompute.apply(run, len(start), *start, *leaves)
-    return _unflatten(after[0], out)
+    values = [t.detach() for t in out]
+    fixed = [not t.requires_grad for t in out]
+    del end, out, own
+    return _unflatten(after, _Recompute.apply(run, values, fixed, len(start), *start, *leaves))
 
 
 def _flatten(state: MPMState) -> tuple[Layout, list[Tensor]]:
@@ -78,17 +76,23 @@ def _unflatten(layout: Layout, tensors: Sequence[Tensor]) -> MPMState:
 
 class _Recompute(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, run: Callable[..., tuple[Tensor, ...]], count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any,
+        run: Callable[[Sequence[Tensor]], list[Tensor]],
+        values: list[Tensor],
+        fixed: list[bool],
+        count: int,
+        *tensors: Tensor,
+    ) -> tuple[Tensor, ...]:
         ctx.run, ctx.count, ctx.leaves = run, count, tensors[count:]
         ctx.save_for_backward(*tensors[:count])
-        out = run([t.detach() for t in tensors[:count]])
-        ctx.mark_non_differentiable(*(t for t in out if not t.is_floating_point()))
-        return out
+        ctx.mark_non_differentiable(*(t for t, f in zip(values, fixed, strict=True) if f))
+        return tuple(values)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[2 : 2 + ctx.count]
+        needed = ctx.needs_input_grad[4 : 4 + ctx.count]
         start = [t.detach().requires_grad_(n) for t, n in zip(ctx.saved_tensors, needed, strict=True)]
         with torch.enable_grad():
             out = ctx.run(start)
@@ -107,4 +111,4 @@ class _Recompute(torch.autograd.Function):
             )
             for k, gradient in zip(wanted, gradients, strict=True):
                 found[k] = gradient
-        return None, None, *found
+        return None, None, None, None, *found

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
-from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Nodes
+from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Impulse, Nodes
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.linalg import matmul3, symmetric_eigenvalues
-from gaussian_swaying.mpm.recompute import detached, leaves_of, recompute
+from gaussian_swaying.mpm.recompute import recompute
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather, scatter, scatter_momentum
@@ -47,7 +47,7 @@ class MPMSolver(nn.Module):
         mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
         deterministic: On a GPU, sum in a fixed order, so that the same run gives the same bits; slower. On a CPU it is
             so anyway. Gradients on a GPU are not covered.
-        boundaries: Boundary conditions, applied in order.
+        boundaries: Boundary conditions, applied in order, impulses first.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -138,12 +138,13 @@ class MPMSolver(nn.Module):
 
     def _bind(self, points: MaterialPoints) -> None:
         """Take the material and compute what never changes: its laws and, in ``total``, stencil and mass."""
-        self._points, self._laws, self._static = points, LawDispatch(points), {}
-        if self.total_lagrangian and self._laws.plastic:
+        laws = LawDispatch(points)
+        if self.total_lagrangian and laws.plastic:
             raise ValueError(
-                f"The law {self._laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
+                f"The law {laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
                 "`solver.formulation` to updated, or choose an elastic law."
             )
+        self._points, self._laws, self._static = points, laws, {}
         static, position, conditions = self._static, points.position, self._acting
         for k, boundary in enumerate(conditions):
             mask = boundary.particle_mask(position.detach())
@@ -338,24 +339,29 @@ class MPMSolver(nn.Module):
         grid = self._bounding_grid(state.position, 3 + margin + min(int(reach / self.dx), 1000), speed)
         return state.replace(grid=grid)
 
-    def step(self, state: MPMState, dt: float, force: Tensor | None = None) -> MPMState:
+    def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.
 
         Where the substep changes, forces act for the mean of the old and the new one: the velocities stand half a
-        substep beside the positions, and the full new one would jolt them (an error of first order, and energy).
+        substep beside the positions, and the full new one would jolt them (an error of first order, and energy). A
+        substep that shrinks to less than a third is the exception: forces then act for twice the new one.
 
         Args:
             state: The state now.
             dt: Substep [s].
             force: External force on each particle [N], shape (..., P, 3).
+            drag: By how much that force falls per velocity gained in the substep [kg/s], shape (..., P); a drag that is
+                taken so is stable however light the particle (see ``AeroForce.resistance``).
 
         Returns:
             The state ``dt`` later.
         """
         if force is not None:
             check_shape("force", force, self.points.count, 3)
+        if drag is not None:
+            check_shape("drag", drag, self.points.count)
         advance = self._step_total if self.total_lagrangian else self._step_updated
-        return advance(state, dt, force)
+        return advance(state, dt, force, drag)
 
     def rollout(
         self, state: MPMState, dt: float, steps: int, force_fn: ForceFunction | None = None, checkpoint: int = 0
@@ -382,19 +388,17 @@ class MPMSolver(nn.Module):
 
         if checkpoint <= 0 or not torch.is_grad_enabled():
             return advance(state, steps)
-        with torch.enable_grad():
-            leaves = leaves_of(advance(detached(state), 1))
         for first in range(0, steps, checkpoint):
             count = min(checkpoint, steps - first)
-            state = recompute(partial(advance, count=count), state, leaves)
+            state = recompute(partial(advance, count=count), state)
         return state
 
     @staticmethod
     def kick(state: MPMState, dt: float) -> float:
         """How long forces act in a substep of ``dt`` [s] (see :meth:`step`)."""
-        return 0.5 * (state.substep + dt) if state.substep > 0 else dt
+        return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
-    def _step_total(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
+    def _step_total(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
         assert self._stencil is not None
         assert state.node_velocity is not None
         displacement = state.node_displacement
@@ -408,7 +412,11 @@ class MPMSolver(nn.Module):
         value = torch.zeros_like(state.position) if force is None else force
         node_force = scatter(self._stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
         inverse_mass = static["node_inverse_mass"][..., None]
-        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, self.kick(state, dt))
+        kick, yielding = self.kick(state, dt), None
+        if drag is not None:
+            resistance = scatter(self._stencil, drag[..., None, None])
+            yielding = 1 / (1 + kick * resistance * inverse_mass)
+        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, kick, yielding)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = lattice = None
         if "node_rest" in static:
@@ -435,7 +443,7 @@ class MPMSolver(nn.Module):
             node_velocity=velocity,
         )
 
-    def _step_updated(self, state: MPMState, dt: float, force: Tensor | None) -> MPMState:
+    def _step_updated(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
         points, laws = self.points, self.laws
         stencil = bspline_stencil(state.position, state.grid, gradients=not self.mls, deterministic=self.deterministic)
         F = state.F_elastic
@@ -445,17 +453,25 @@ class MPMSolver(nn.Module):
             viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, self.stiffness_damping)
             stress = stress + matmul3(viscous, F.mT)
         kick = self.kick(state, dt)
+        impulse = None if force is None else kick * force
+        if drag is not None:
+            held = (kick * drag)[..., None] * state.velocity
+            impulse = held if impulse is None else impulse + held
         nodes = scatter_momentum(
             points.mass,
             state.velocity,
             state.affine,
-            None if force is None else kick * force,
+            impulse,
             kick * points.volume[..., None, None] * stress,
             stencil,
             4.0 / self.dx**2 if self.mls else None,
         )
         inverse_mass = _safe_inverse(nodes[..., 3])[..., None]
-        velocity = self._accelerate(nodes[..., :3] * inverse_mass, None, kick)
+        velocity, yielding = nodes[..., :3] * inverse_mass, None
+        if drag is not None:
+            yielding = 1 / (1 + kick * scatter(stencil, drag[..., None, None]) * inverse_mass)
+            velocity = velocity * yielding
+        velocity = self._accelerate(velocity, None, kick, yielding)
         velocity = torch.where(inverse_mass > 0, velocity, 0.0)
         position = None
         if any(b.needs_position or b.needs_lattice for b in self._acting):
@@ -481,12 +497,18 @@ class MPMSolver(nn.Module):
             substep=dt,
         )
 
-    def _accelerate(self, velocity: Tensor, acceleration: Tensor | None, dt: float) -> Tensor:
-        """Apply the given acceleration, gravity and damping to node velocities."""
+    def _accelerate(
+        self, velocity: Tensor, acceleration: Tensor | None, dt: float, yielding: Tensor | None = None
+    ) -> Tensor:
+        """Apply the given acceleration, gravity and damping to node velocities.
+
+        ``yielding`` is mass over mass plus implicit drag times ``dt``, shape (..., G, 1).
+        """
         if acceleration is not None:
-            velocity = velocity + dt * acceleration
+            velocity = velocity + dt * (acceleration if yielding is None else yielding * acceleration)
         if any(self.gravity):
-            velocity = velocity + dt * self._gravity.to(velocity)
+            gravity = self._gravity.to(velocity)
+            velocity = velocity + dt * (gravity if yielding is None else yielding * gravity)
         if self.damping > 0:
             velocity = velocity * math.exp(-self.damping * dt)
         return velocity
@@ -503,7 +525,8 @@ class MPMSolver(nn.Module):
     ) -> Tensor:
         """Apply the boundary conditions to node velocities, in order."""
         static = self._static
-        for k, boundary in enumerate(self._acting):
+        # what pushes comes before what holds, in whatever order they were given
+        for k, boundary in sorted(enumerate(self._acting), key=lambda pair: not isinstance(pair[1], Impulse)):
             share = None
             if f"pinned_mass_{k}" in static:
                 share = static.get(f"share_{k}")

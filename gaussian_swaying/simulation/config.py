@@ -177,7 +177,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, TypeError, OSError, SimulationDiverged) as error:
         if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
             raise
-        print(f"error: {error}", file=sys.stderr)
+        message = str(error)
+        if "Does not validate" in message:  # a class within a class, whose own message the parser wraps
+            message = _one_sentence(message, arguments)
+        print(f"error: {message}", file=sys.stderr)
         return 2
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")

@@ -104,10 +104,13 @@ class SimulationPipeline(nn.Module):
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
 
-    def force(self, state: MPMState, wind: Tensor, dt: float) -> Tensor:
-        """Wind force on every particle [N] over a substep, shape (..., P, 3), at an air velocity [m/s], shape (3,)."""
+    def force(self, state: MPMState, wind: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Wind force on every particle [N], shape (..., P, 3), at an air velocity [m/s] of shape (3,).
+
+        With it the resistance of a semi-implicit drag [kg/s], shape (..., P), or None.
+        """
         normal, area = deform_patch(state.F_total, self.scene.patch_normal, self.scene.patch_area)
-        return self.aero(wind, state.velocity, normal, area, self.scene.points.mass, dt)
+        return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
 
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
         """Advance by one frame.
@@ -129,7 +132,8 @@ class SimulationPipeline(nn.Module):
             steps = self._substeps(state)
             for retry in range(MAX_RETRIES + 1):
                 if steps > self._most_substeps:
-                    self._give_up(state, f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest")
+                    cause = f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest"
+                    self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
                 end, work, cfl = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 outrun = bool((end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any())
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
@@ -150,11 +154,12 @@ class SimulationPipeline(nn.Module):
             )
         return end, diagnose(self.solver, end, steps, cfl, work, self._tearing)
 
-    def _give_up(self, state: MPMState, cause: str) -> NoReturn:
+    def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, blaming the particle with the largest deformation."""
         particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
-        field = "solver.cfl" if self.solver.substep is None else "solver.substep"
-        remedy = f"lower `{field}`, or weaken the wind or the boundary that drives it"
+        if remedy is None:
+            field = "solver.cfl" if self.solver.substep is None else "solver.substep"
+            remedy = f"lower `{field}`, or weaken the wind or the boundary that drives it"
         raise SimulationDiverged(float(state.time), particle, cause, remedy)
 
     def _substeps(self, state: MPMState) -> int:
@@ -164,17 +169,20 @@ class SimulationPipeline(nn.Module):
         """The state some substeps later, the work of the wind on the way [J], and the largest Courant number."""
         dt = self.frame_dt / steps
         work = torch.zeros((), dtype=torch.float64, device=self.device)
-        if not self.aero.idle:
+        idle = self.aero.idle
+        if not idle:
             offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
             winds = self.wind(state.time + offsets)
         looks = {math.ceil((k + 1) * steps / CFL_SAMPLES) for k in range(CFL_SAMPLES)}
         cfls = []
         for k in range(steps):
-            if self.aero.idle:
+            if idle:
                 state = self.solver.step(state, dt)
             else:
-                force = self.force(state, winds[k], dt)
-                after = self.solver.step(state, dt, force)
+                force, drag = self.force(state, winds[k])
+                after = self.solver.step(state, dt, force, drag)
+                if drag is not None:
+                    force = force - drag[..., None] * (after.velocity - state.velocity)
                 # at the mean velocity: exactly what the step adds to the kinetic energy
                 power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
                 work = work + (0.5 * self.solver.kick(state, dt)) * power
@@ -193,7 +201,7 @@ class SimulationPipeline(nn.Module):
         rate = float(self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax())
         if not (math.isfinite(rate) and float(wind) < MAX_WIND):
             cause = f"the wind of {float(wind):.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
-            self._give_up(state, cause)
+            self._give_up(state, cause, "check the flow and the modulations of the wind")
         return 1 if self.aero.drag_step == "semi_implicit" else int(rate * self.frame_dt) + 1
 
     # ---- picture
@@ -416,9 +424,9 @@ class SimulationPipeline(nn.Module):
             "energy_start_J": energy[0] if energy else None,
             "energy_end_J": energy[-1] if energy else None,
             "largest_cfl": max((entry["cfl"] for entry in log), default=None),
-            "wind_work_J": sum(entry["wind_work"] for entry in log),
+            "wind_work_J": sum(entry.get("wind_work", 0.0) for entry in log),
             "lost_particles": int(log[-1]["lost"]) if log else 0,
-            "torn_particles": int(log[-1]["torn"]) if log else 0,
+            "torn_particles": int(log[-1].get("torn", 0)) if log else 0,
             "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),

@@ -43,9 +43,10 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write dicts of the same keys as CSV with a header, whole or not at all."""
+    """Write dicts as CSV with a header, whole or not at all; what a row lacks stays empty."""
+    names = list({name: None for row in rows for name in row})
     with atomic(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else [])
+        writer = csv.DictWriter(file, fieldnames=names)
         writer.writeheader()
         writer.writerows(rows)
 

@@ -33,20 +33,14 @@ def _vector(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_semi_implicit_drag_is_the_implicit_step():
-    """v+ = (v + k u) / (1 + k), k = dt rho A C v_r / 2m; never beyond the wind, and the explicit force for small dt."""
-    mass, area, dt = torch.tensor([0.01], dtype=torch.float64), torch.tensor([2.0], dtype=torch.float64), 0.1
+def test_resistance_is_half_the_slope_of_the_drag():
+    """D = rho A C v_r / 2, so that f - D (v+ - v) is the drag c |v_r| (u - v+) of the new velocity."""
+    area = torch.tensor([2.0], dtype=torch.float64)
     wind, velocity = _vector(0, 0, 30.0), torch.tensor([[0.0, 0.0, -10.0]], dtype=torch.float64)
-    normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    aero = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, air_density=RHO, drag_step="semi_implicit")
-    force = aero(wind, velocity, normal, area, mass, dt)
-    k = dt * RHO * 2.0 * 1.2 * 40.0 / (2 * 0.01)
-    assert k > 100
-    torch.testing.assert_close(velocity + dt * force / mass, (velocity + k * wind) / (1 + k))
-    explicit = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, air_density=RHO)(wind, velocity, normal, area)
-    torch.testing.assert_close(aero(wind, velocity, normal, area, mass, 1e-9), explicit, rtol=1e-5, atol=0)
-    with pytest.raises(ValueError, match=r"`mass` and `dt`"):
-        aero(wind, velocity, normal, area)
+    aero = AeroForce(C_D=1.2, C_F=0.3, C_L=-0.1, air_density=RHO, drag_step="semi_implicit")
+    expected = torch.tensor([0.5 * RHO * 2.0 * (1.2 + 0.3 + 0.1) * 40.0], dtype=torch.float64)
+    torch.testing.assert_close(aero.resistance(wind, velocity, area), expected)
+    assert AeroForce().resistance(wind, velocity, area) is None
     with pytest.raises(ValueError, match=r"`drag_step` to be one of explicit, semi_implicit"):
         AeroForce(drag_step="implicit")
 

@@ -184,6 +184,18 @@ def test_time_windows(formulation, make):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_an_impulse_does_not_move_what_is_pinned(formulation):
+    """Whichever of the two was given first."""
+    points, ends = _block(), []
+    pin = PinnedRegion(Box([None, None, 0.34], [None, None, None]))
+    knock = Impulse(Box([None] * 3, [None] * 3), [0.5, 0.0, 0.0], end=0.02)
+    for boundaries in ([pin, knock], [knock, pin]):
+        ends.append(_run(formulation, boundaries, points, 0.04, gravity=(0, 0, 0)).position)
+    torch.testing.assert_close(ends[0], ends[1], rtol=0, atol=0)
+    assert float((ends[0] - points.position).abs().max()) > 1e-4
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_pin_holds_only_its_end(formulation):
     points = _block()
     pin = PinnedRegion(Box([None, None, 0.34], [None, None, None]))

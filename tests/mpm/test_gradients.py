@@ -200,6 +200,29 @@ def test_gradients_are_finite_beside_a_node_of_vanishing_mass(setting):
 # ---- long rollouts
 
 
+@pytest.mark.parametrize("checkpoint", [0, 4, 30])
+def test_checkpoints_find_what_is_used_late(checkpoint):
+    """A force of two parts, the second of which acts only after the first substeps."""
+    points = MaterialPoints.create(
+        torch.rand(8, 3, dtype=torch.float64), volume=0.1, density=10.0, youngs_modulus=1e3, poisson_ratio=0.3
+    )
+    first, second = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    solver = MPMSolver(dx=0.5, gravity=(0, 0, 0))
+    state = solver.rollout(
+        solver.init_state(points),
+        1e-3,
+        20,
+        lambda s: (first if float(s.time) < 5.5e-3 else 2 * second).expand(8, 3),
+        checkpoint,
+    )
+    state.position.sum().backward()
+    assert not state.time.requires_grad
+    # a uniform force on particles of 1 kg that are at rest: each moves by dt² for every substep that is left
+    ways = [1e-6 * sum(20 - n for n in steps) for steps in (range(6), range(6, 20))]
+    torch.testing.assert_close(first.grad, torch.full((3,), 8 * ways[0], dtype=torch.float64))
+    torch.testing.assert_close(second.grad, torch.full((3,), 16 * ways[1], dtype=torch.float64))
+
+
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_checkpoints_leave_gradients_as_they_are(setting):
     """To round-off, as the segments' shares of a gradient are added in another order; 20 is no multiple of 7."""

@@ -17,7 +17,14 @@ from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.gaussians.surface import covariance
 from gaussian_swaying.rendering.camera import OrbitCamera
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.recorder import Recorder, atomic, encode_video, load_trajectory, write_json
+from gaussian_swaying.simulation.recorder import (
+    Recorder,
+    atomic,
+    encode_video,
+    load_trajectory,
+    write_json,
+    write_table,
+)
 
 
 def _names(folder):
@@ -123,6 +130,12 @@ def test_diagnostics_are_a_table_too(make_pipeline, tmp_path):
     for row, entry in zip(rows, summary["per_frame"], strict=True):
         assert {name: float(value) for name, value in row.items()} == pytest.approx(entry)
     assert float(rows[-1]["wind_work"]) > 0
+
+
+def test_rows_of_an_older_run_leave_their_gaps(tmp_path):
+    write_table(tmp_path / "table.csv", [{"a": 1}, {"a": 2, "b": 3}])
+    with (tmp_path / "table.csv").open(newline="") as file:
+        assert list(csv.DictReader(file)) == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]
 
 
 def test_what_is_switched_off_is_not_written(make_pipeline, tmp_path):

@@ -73,6 +73,8 @@ def test_a_material_that_flows(tmp_path, capsys):
     """A law with its own arguments on the command line; `total` refuses it in one sentence."""
     law = ["--material.law", "Sand", "--material.law.init_args.friction_angle", "35"]
     check_refused([*SMALL, *law], tmp_path / "out", capsys, "Sand", "solver.formulation", "updated")
+    steep = ["--material.law", "Sand", "--material.law.init_args.friction_angle", "120"]
+    check_refused([*SMALL, *steep], tmp_path / "out", capsys, "`friction_angle` between 0 and 90 degrees, but got 120")
     assert _code([*SMALL, *law, "--solver.formulation", "updated", "--output", str(tmp_path / "out")]) == 0
     stored = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())
     assert stored["material"]["law"]["init_args"]["friction_angle"] == 35.0
