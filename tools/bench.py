@@ -206,9 +206,19 @@ def _gradient_lines(result: dict[str, Any]) -> list[str]:
             f"| `{row['formulation']}` | {row['substeps']} | {row['checkpoint'] or 'none'} | {row['memory_MiB']:.0f} | "
             f"{row['seconds']:.1f} | {row['gradient_E']:.6g} |"
         )
-    shown = {k: v for k, v in result["fit"].items() if isinstance(v, (int, float, bool))}
-    lines += ["", "`tools/fit_flag.py`, a flag's wind and stiffness from its own trajectory: "]
-    lines += [", ".join(f"{name} {value:.6g}" for name, value in shown.items()) + ".", ""]
+    fit = result["fit"]
+    names = [("wind", "m/s"), ("E", "Pa")]
+    found = [
+        f"{name} {value:.6g} {unit} (true {truth:g}, first guess {guess:g}, error {100 * error:.4f} %)"
+        for (name, unit), value, truth, guess, error in zip(
+            names, fit["values"], fit["truth"], fit["guess"], fit["relative_errors"], strict=True
+        )
+    ]
+    lines += [
+        "",
+        "`tools/fit_flag.py` finds the wind and the stiffness of a flag from its own trajectory, recorded with",
+    ]
+    lines += [f"noise of {1e3 * fit['noise']:g} mm: {' and '.join(found)} in {fit['seconds']:.0f} s.", ""]
     return lines
 
 
