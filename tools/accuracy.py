@@ -397,8 +397,8 @@ def _sand(rows: list[Row]) -> list[str]:
     for row in select(rows, "sand slope"):
         r = row["result"]
         lines += [
-            f"A layer on an incline stands at {r['stands']:.0f} and flows at {r['flows']:.0f} degrees; the friction angle "
-            f"of its acceleration is {r['friction_deg']:.2f} (theory {r['exact']:.2f}).",
+            f"A layer on an incline stands at {r['stands']:.0f} and flows at {r['flows']:.0f} degrees; the friction "
+            f"angle of its acceleration is {r['friction_deg']:.2f} (theory {r['exact']:.2f}).",
             "",
         ]
     names = {
