@@ -486,7 +486,7 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
 def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
-    """Between two handles: upright in the end, and after the release its energy only falls."""
+    """Between two handles: after the release its energy only falls, and once it is calm it has its shape again."""
     position = _lattice(3, 3, 6)
     fast = 0.9 * 0.3 / 2 / 0.1
     grips = [
@@ -494,13 +494,13 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
         Handle(Box([None, None, 0.24], [None, None, None]), velocity=[0, 0, -fast], end=0.1),
     ]
     points = _points(position, law=law())
-    pipeline = _pipeline(points, grips, formulation=formulation, frame_dt=5e-3, damping=5.0)
+    pipeline = _pipeline(points, grips, formulation=formulation, frame_dt=5e-3, damping=60.0)
     state, _ = _advance(pipeline, 20)
     pressed = pipeline.scene.frame.point_to_scene(state.position)[:, 2]
     assert float(pressed.max() - pressed.min()) < 0.15
-    state, after = _advance(pipeline, 12, state)
+    state, after = _advance(pipeline, 40, state)
     assert _rise(after) <= SHADOW
-    assert after[-1].J_min > 0
+    assert after[-1].J_min > 0.5
     assert _energy(after[-1]) < _energy(after[0])
 
 
