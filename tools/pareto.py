@@ -138,8 +138,8 @@ def page(results: list[dict[str, Any]], pictures: Path) -> list[str]:
         "Every point of the plots is one run. Solid points have a substep that is stable for any arrangement of",
         f"particles (CFL up to {PROVEN_CFL}); hollow ones are longer and happened to be stable for the regular",
         "lattices of these problems. The star is the default (`total`, float32, CFL 0.4, adaptive). The line is the",
-        "Pareto front of the solid points. CFL 0.8 costs half and happens to work here; a single particle, or a sheet in",
-        "an unlucky place of the grid, would be unstable with it, so it is no default.",
+        "Pareto front of the solid points. CFL 0.8 costs half and happens to work here; a single particle, or a sheet",
+        "in an unlucky place of the grid, would be unstable with it, so it is no default.",
         "",
     ]
     for result in results:
