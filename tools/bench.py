@@ -161,7 +161,10 @@ def sim(options: argparse.Namespace) -> None:
 def accuracy(options: argparse.Namespace) -> None:
     """Measure errors against closed forms and experiments."""
     device, result = _start(options)
-    result["rows"] = accuracy_cases.measure(device.type, options.thorough, options.only)
+    path = Path(options.results) / f"accuracy_{device.type}.json"
+    kept = json.loads(path.read_text())["rows"] if options.only and path.exists() else []
+    result["rows"] = [row for row in kept if options.only not in row["problem"]]
+    result["rows"] += accuracy_cases.measure(device.type, options.thorough, options.only)
     _write(options, f"accuracy_{device.type}", result)
     validation_page(options)
 

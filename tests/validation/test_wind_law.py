@@ -6,15 +6,14 @@ import pytest
 import torch
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, deform_patch, rotation_to_quat
+from gaussian_swaying.gaussians.surface import deform_patch
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.validation.plates import Hinge, hinged_plate, hinged_plate_angle
 from gaussian_swaying.validation.settings import Settings
+from gaussian_swaying.validation.surfaces import sphere_of_gaussians, surface_drag
 
 SIDE, SPACING, THICKNESS, DENSITY, AIR, C = 0.4, 0.05, 0.01, 20.0, 1.225, 1.2
 
@@ -74,18 +73,12 @@ def test_a_falling_plate_reaches_its_terminal_velocity(law):
 @pytest.mark.parametrize("law", ["paper", "projected"])
 def test_force_on_a_plate_does_not_depend_on_the_gaussians_that_carry_it(law):
     """Number and overlap of the Gaussians vary: the force stays within 3 % with `coverage`, not with `paper`."""
-    forces = {"coverage": [], "paper": []}
-    for spacing, overlap in ((0.05, 0.5), (0.02, 0.3), (0.02, 1.0), (0.0125, 0.6)):
-        cloud = FlagScene(width=0.8, height=0.8, spacing=spacing, overlap=overlap, ripple=0.0).generate()
-        model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
-        for mode, found in forces.items():
-            area = model.areas(mode)
-            aero = AeroForce(C_D=C, C_F=0.0, C_L=0.0, air_density=AIR, law=law)
-            force = aero(torch.tensor([0.0, 3.0, 0.0]), torch.zeros(len(cloud), 3), model.normals(), area)
-            found.append(float(force[:, 1].sum()))
-    exact = 0.5 * AIR * 9.0 * 0.64 * C
-    assert forces["coverage"] == pytest.approx([exact] * 4, rel=0.03)
-    assert max(forces["paper"]) > 3 * min(forces["paper"])
+    kinds = [(256, 0.5), (1600, 0.3), (1600, 1.0), (4096, 0.6)]
+    assert [surface_drag("plate", *kind, "coverage", law)["share"] for kind in kinds] == pytest.approx(
+        [1] * 4, rel=0.03
+    )
+    literal = [surface_drag("plate", *kind, "paper", law)["share"] for kind in kinds]
+    assert max(literal) > 3 * min(literal)
 
 
 # ---- a plate on a hinge
@@ -160,27 +153,6 @@ def test_a_hinge_lets_turn_and_holds(formulation):
 # ---- a sphere of Gaussians
 
 
-def _sphere(count, overlap, radius=0.5):
-    """Discs of standard deviation overlap times spacing on a spiral over a sphere."""
-    index = torch.arange(count, dtype=torch.float64)
-    z, angle = 1 - 2 * (index + 0.5) / count, index * math.pi * (3 - math.sqrt(5))
-    ring = (1 - z * z).sqrt()
-    normal = torch.stack([ring * angle.cos(), ring * angle.sin(), z], dim=-1)
-    helper = torch.nn.functional.one_hot(normal.abs().argmin(-1), 3).to(normal)
-    first = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=-1)
-    axes = torch.stack([first, torch.linalg.cross(normal, first), normal], dim=-1)
-    sigma = overlap * radius * math.sqrt(4 * math.pi / count)
-    cloud = GaussianCloud(
-        means=(radius * normal).float(),
-        quats=rotation_to_quat(axes).float(),
-        scales=torch.tensor([sigma, sigma, 0.1 * sigma]).log().expand(count, 3).contiguous(),
-        opacities=torch.full((count,), 4.6),
-        sh=torch.zeros(count, 1, 3),
-        normals=None,
-    )
-    return GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
-
-
 # Integrals over a sphere of radius R, flow along d, with the angle a between d and the outward normal N; n = +-N along
 # the flow, so that both halves feel the wind: |n.d| dA gives 2 pi R^2, (n.d)^2 dA gives 4 pi R^2 / 3.
 #   paper drag       n                 2 pi R^2
@@ -206,7 +178,7 @@ def test_force_on_a_sphere_does_not_depend_on_the_gaussians_that_carry_it(option
     aero = AeroForce(**({"C_D": 0.0, "C_F": 0.0, "C_L": 0.0, "air_density": AIR} | options))
     unit = 0.5 * AIR * 9.0 * radius**2
     for count, overlap in ((500, 0.5), (2000, 0.3), (2000, 1.0), (6000, 0.6)):
-        model = _sphere(count, overlap, radius)
+        model = sphere_of_gaussians(count, overlap, radius)
         force = aero(flow, torch.zeros(count, 3), model.normals(), model.areas("coverage")).sum(0) / unit
         assert float((force - exact * flow / 3).norm()) < 0.03 * (exact or 2 * math.pi)
 
@@ -215,7 +187,7 @@ def test_the_literal_areas_scale_the_force_on_a_sphere_by_the_overlap():
     """Areas pi s1 s2 add up to pi overlap^2 times the surface: 0.28 to 3.1 here."""
     aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=AIR)
     for overlap in (0.3, 1.0):
-        model = _sphere(2000, overlap)
+        model = sphere_of_gaussians(2000, overlap)
         force = aero(torch.tensor([3.0, 0, 0]), torch.zeros(2000, 3), model.normals(), model.areas("paper"))
         expected = math.pi * overlap**2 * 0.5 * AIR * 9.0 * 2 * math.pi * 0.25
         assert float(force[:, 0].sum()) == pytest.approx(expected, rel=0.01)
