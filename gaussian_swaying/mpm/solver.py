@@ -342,6 +342,8 @@ class MPMSolver(nn.Module):
     def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.
 
+        A VelocityBox is the exception: it copies the corners of its region to the device.
+
         Where the substep changes, forces act for the mean of the old and the new one: the velocities stand half a
         substep beside the positions, and the full new one would jolt them (an error of first order, and energy). A
         substep that shrinks to less than a third is the exception: forces then act for twice the new one.
