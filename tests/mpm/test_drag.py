@@ -29,10 +29,11 @@ def _run(solver, state, wind, dt, steps, aero=AERO):
     normal = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(state.position)
     area = torch.full_like(solver.points.mass, 0.05**2)
     fastest = 0.0
-    for _ in range(steps):
+    for k in range(steps):
         force = aero(wind, state.velocity, normal, area)
         drag = aero.resistance(wind, state.velocity, area)
-        state = solver.step(solver.fit_grid(state, dt), dt, force, drag)
+        state = solver.fit_grid(state, min(20, steps) * dt) if k % 20 == 0 else state
+        state = solver.step(state, dt, force, drag)
         fastest = max(fastest, float(state.velocity.norm(dim=-1).max()))
     return state, fastest
 
@@ -65,11 +66,11 @@ def test_a_free_sheet_never_overtakes_the_wind(formulation):
 def test_what_hangs_still_feels_all_of_its_weight_and_wind(formulation):
     """In equilibrium nothing moves, so the drag is the explicit one whatever the substep: the same sag, with weight."""
     places = []
-    for dt in (5e-5, 4e-4):
+    for dt in (1e-4, 5e-4):
         points = _sheet(0.02, e=3e4)
         pin = PinnedRegion(Box([None, None, 0.35], [None, None, None]))
         solver = MPMSolver(dx=0.1, formulation=formulation, damping=30.0, boundaries=[pin])
-        state, _ = _run(solver, solver.init_state(points), [0.0, 0.0, -15.0], dt, round(0.4 / dt), ALONG)
+        state, _ = _run(solver, solver.init_state(points), [0.0, 0.0, -15.0], dt, round(0.3 / dt), ALONG)
         assert float(state.velocity.abs().max()) < 1e-3
         places.append(state.position - points.position)
     sag = float(places[0].abs().max())
