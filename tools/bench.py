@@ -298,7 +298,7 @@ def pages(options: argparse.Namespace) -> None:
         lines += _substep_table(result) if "substep" in result else _run_table(result)
         goals += _goals(result)
     lines += ["## Goals", "", "| goal | measured | reached |", "|---|---|---|", *goals, ""]
-    target = ROOT / "docs" / "benchmarks.md"
+    target = Path(options.results).parent / "benchmarks.md"
     target.write_text("\n".join(lines))
     print(f"wrote {target}")
     validation_page(options)
