@@ -1,4 +1,7 @@
-"""What a run leaves on disk. Every file is written under a temporary name and then renamed."""
+"""What a run leaves on disk. Every file is written under a temporary name and then renamed.
+
+Frames are written in the background, see :mod:`gaussian_swaying.simulation.writer`; the video is encoded meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,21 @@ import json
 import os
 import shutil
 import subprocess
+import tempfile
+import threading
+import weakref
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying.simulation.writer import FrameWriter, HostCopy
 
 MARKER = "run.json"
 # what a run writes, and so must not find in a folder that no run made
@@ -25,10 +32,14 @@ _OURS = ["frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summ
 _OURS += ["config.yaml", "video.mp4"]
 
 
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+
+
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
     """Give a temporary path in the same folder that becomes ``path`` if the block succeeds, and nothing if not."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = _temporary(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -51,13 +62,105 @@ def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def to_uint8(image: Tensor) -> np.ndarray:
-    """Colours in [0, 1], shape (H, W, 3), to 8 bits, rounded."""
-    return (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+class VideoEncoder:
+    """ffmpeg in a process of its own, given one frame after the other.
+
+    H.264 in yuv420p; odd sizes are padded by a row or column, as the format needs even ones. The file appears under its
+    name in :meth:`finish`. An encoder that is given up before leaves neither a process nor a file behind.
+
+    Args:
+        path: The .mp4 file.
+        fps: Frames per second.
+    """
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path, self.fps = path, fps
+        self._temporary = _temporary(path)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._size: tuple[int, ...] = ()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._end: Callable[[], Any] = lambda: None
+
+    def write(self, image: np.ndarray) -> None:
+        """Add a frame, uint8 (H, W, 3). One thread at a time.
+
+        Raises:
+            OSError: If ffmpeg fails, with its last message, or the frame has another size than the first.
+        """
+        with self._lock:
+            if self._closed:
+                raise OSError(f"{self.path.name} is closed")
+            if self._process is None:
+                self._start(*image.shape[:2])
+        if image.shape[:2] != self._size:
+            (height, width), (first_height, first_width) = image.shape[:2], self._size
+            raise OSError(
+                f"ffmpeg could not write {self.path.name}: a frame is {width} x {height}, the first one is "
+                f"{first_width} x {first_height}"
+            )
+        assert self._process is not None
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(np.ascontiguousarray(image).data)
+        except BrokenPipeError:
+            raise self._failure() from None
+
+    def finish(self) -> None:
+        """Wait for ffmpeg and give the file its name; without frames there is none.
+
+        Raises:
+            OSError: If ffmpeg fails, with its last message.
+        """
+        if self._process is None:
+            return
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # the exit status tells
+            self._process.stdin.close()
+        if self._process.wait() != 0:
+            raise self._failure()
+        os.replace(self._temporary, self.path)
+        self.abort()
+
+    def abort(self) -> None:
+        """Give up what is not finished; no more frames are taken."""
+        with self._lock:
+            self._closed = True
+        self._end()
+
+    def _start(self, height: int, width: int) -> None:
+        import imageio_ffmpeg
+
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+        command += ["-s", f"{width}x{height}", "-r", str(self.fps), "-i", "-", "-an", "-vcodec", "libx264"]
+        command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
+        command += ["-movflags", "+faststart", str(self._temporary.resolve())]
+        self._size = (height, width)
+        self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - unlike a pipe, never full
+        # in a session of its own, so that Ctrl-C does not end it before its last frame
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=self._messages, start_new_session=True)
+        self._end = weakref.finalize(self, _end_process, self._process, self._messages, self._temporary)
+
+    def _failure(self) -> OSError:
+        assert self._process is not None
+        self._process.wait()
+        self._messages.seek(0)
+        message = self._messages.read().decode(errors="replace").strip()
+        return OSError(f"ffmpeg could not write {self.path.name}: {message.splitlines()[-1] if message else '?'}")
+
+
+def _end_process(process: subprocess.Popen[bytes], messages: IO[bytes], temporary: Path) -> None:
+    process.kill()
+    process.wait()
+    assert process.stdin is not None
+    with suppress(OSError):
+        process.stdin.close()
+    messages.close()
+    temporary.unlink(missing_ok=True)
 
 
 def encode_video(frames: list[Path], path: Path, fps: float) -> None:
-    """Encode images as H.264 in yuv420p; odd sizes are padded by a row or column, as the format needs even ones.
+    """Encode images with :class:`VideoEncoder`.
 
     Args:
         frames: PNG files in order.
@@ -65,28 +168,17 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
         fps: Frames per second.
 
     Raises:
-        OSError: If ffmpeg fails, with its last message.
+        OSError: If ffmpeg fails, with its last message, or the images differ in size.
     """
     import imageio.v3 as iio
-    import imageio_ffmpeg
 
-    height, width = iio.imread(frames[0]).shape[:2]
-    with atomic(path) as temporary:
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-        command += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-an", "-vcodec", "libx264"]
-        command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
-        command += ["-movflags", "+faststart", str(temporary.resolve())]
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
-        assert process.stdin is not None
-        assert process.stderr is not None
-        with suppress(BrokenPipeError):  # ffmpeg's own message, read below, says why it stopped
-            for frame in frames:
-                process.stdin.write(iio.imread(frame)[..., :3].tobytes())
-        with suppress(BrokenPipeError):
-            process.stdin.close()
-        message = process.stderr.read().decode(errors="replace").strip()
-        if process.wait() != 0:
-            raise OSError(f"ffmpeg could not write {path.name}: {message.splitlines()[-1] if message else '?'}")
+    encoder = VideoEncoder(path, fps)
+    try:
+        for frame in frames:
+            encoder.write(iio.imread(frame)[..., :3])
+        encoder.finish()
+    finally:
+        encoder.abort()
 
 
 class Recorder:
@@ -95,9 +187,13 @@ class Recorder:
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
     ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
+    Images, trajectory, .ply and checkpoint are written in the background: the methods take a copy and return. They
+    wait only if the disk or ffmpeg is so far behind that the queue is full. What cannot be written is raised by the
+    next of them, by :meth:`wait` or by :meth:`close`.
+
     Args:
         images: Write a PNG per frame.
-        video: Encode the PNGs at the end; needs ``images``.
+        video: Encode the frames; needs ``images``.
         ply_every: Write the deformed Gaussians as a 3DGS .ply every so many frames; 0 for never.
         trajectory: Keep position (float32, metres, z up) and F (float16) of the simulated particles per frame.
         checkpoint_every: Keep the state for ``--resume`` every so many frames; 0 for never.
@@ -122,6 +218,10 @@ class Recorder:
         self.images, self.video, self.trajectory = images, video, trajectory
         self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), fps
         self._folder: Path | None = None
+        self._writer = FrameWriter()
+        self._encoder: VideoEncoder | None = None
+        self._encoded: list[int] = []  # the frames that the encoder was given
+        self._real_time_fps = 25.0
 
     @property
     def folder(self) -> Path:
@@ -130,7 +230,13 @@ class Recorder:
             raise RuntimeError("The recorder has no folder yet: call `open(folder)` first.")
         return self._folder
 
-    def open(self, folder: str | os.PathLike[str], config: str = "", resume: bool = False) -> dict[str, Any] | None:
+    def open(
+        self,
+        folder: str | os.PathLike[str],
+        config: str = "",
+        resume: bool = False,
+        real_time_fps: float = 25.0,
+    ) -> dict[str, Any] | None:
         """Prepare the output folder.
 
         An earlier run found there is moved aside, never overwritten. Any other files in the folder are left alone; if
@@ -140,13 +246,18 @@ class Recorder:
             folder: Where to write.
             config: The whole configuration as YAML, kept beside the results and compared when resuming.
             resume: Continue the run in the folder.
+            real_time_fps: Frames per second at which the video shows the simulated time.
 
         Returns:
             The checkpoint to continue from, or None.
 
         Raises:
             ValueError: If the folder cannot be written, or there is nothing to resume or something else.
+            OSError: If something of an earlier folder, that was not closed, could not be written.
         """
+        self.wait()
+        self._give_up_video()
+        self._writer, self._encoded, self._real_time_fps = FrameWriter(), [], real_time_fps
         path = Path(folder)
         if resume:
             checkpoint = self._load_checkpoint(path, config)
@@ -174,6 +285,8 @@ class Recorder:
             if config:
                 with atomic(path / "config.yaml") as temporary:
                     temporary.write_text(config)
+            if self.video:  # that of a resumed run is made of its PNGs
+                self._encoder = VideoEncoder(path / "video.mp4", self.fps or real_time_fps)
         except OSError as error:
             raise ValueError(
                 f"The output folder {path} cannot be written ({error.strerror or error}): choose another with --output."
@@ -207,58 +320,148 @@ class Recorder:
         return checkpoint
 
     def write_image(self, index: int, image: Tensor) -> None:
-        """Write one frame as PNG from colours in [0, 1], shape (H, W, 3)."""
-        import imageio.v3 as iio
+        """Write one frame as PNG from colours in [0, 1], shape (H, W, 3), rounded to 8 bits; and add it to the video.
 
-        with atomic(self.folder / "frames" / f"{index:05d}.png") as temporary:
-            iio.imwrite(temporary, to_uint8(image), compress_level=3)
+        Raises:
+            OSError: If something could not be written before, here as in the other methods that write.
+        """
+        path = self.folder / "frames" / f"{index:05d}.png"
+        copy = HostCopy((image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8))
+
+        def write() -> None:
+            import imageio.v3 as iio
+
+            with atomic(path) as temporary:
+                iio.imwrite(temporary, copy.get().numpy(), compress_level=3)
+
+        self._submit(path, write)
+        if self._encoder is not None:
+            encoder, encoded = self._encoder, self._encoded
+
+            def encode() -> None:
+                try:
+                    encoder.write(copy.get().numpy())
+                    encoded.append(index)
+                except Exception:
+                    encoder.abort()  # `close` misses the frame, encodes the PNGs and tells what fails then
+
+            self._submit(encoder.path, encode)
 
     def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
         """Keep position [m] (P, 3) and F (P, 3, 3) of one frame; packed into one file by :meth:`close`."""
-        with atomic(self.folder / "trajectory" / f"{index:05d}.npz") as temporary:
-            arrays: dict[str, Any] = {f"position_{index:05d}": position.float().cpu().numpy()}
-            arrays[f"F_{index:05d}"] = F.half().cpu().numpy()
-            np.savez(temporary, **arrays)
+        path = self.folder / "trajectory" / f"{index:05d}.npz"
+        copy = HostCopy({f"position_{index:05d}": position.float(), f"F_{index:05d}": F.half()})
+
+        def write() -> None:
+            arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in copy.get().items()}
+            with atomic(path) as temporary:
+                np.savez(temporary, **arrays)
+
+        self._submit(path, write)
 
     def write_ply(self, index: int, write: Callable[[Path], None]) -> None:
-        """Write one frame's Gaussians; ``write(path)`` is itself whole or nothing."""
-        write(self.folder / "ply" / f"{index:05d}.ply")
+        """Write one frame's Gaussians.
+
+        Args:
+            index: Frame number.
+            write: Called with the path in another thread, later, so what it holds on to must not change. On a GPU it
+                sees what was asked of the current stream before. Must itself write the file whole or not at all.
+        """
+        path = self.folder / "ply" / f"{index:05d}.ply"
+        ready = torch.cuda.Event(blocking=True) if torch.cuda.is_initialized() else None
+        if ready is not None:
+            ready.record()
+
+        def work() -> None:
+            if ready is not None:
+                ready.synchronize()
+            write(path)
+
+        self._submit(path, work)
 
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep what a resumed run needs. Written last, so that it never names a frame that is not complete."""
-        with atomic(self.folder / "checkpoint.pt") as temporary:
-            torch.save(checkpoint, temporary)
+        """Keep what a resumed run needs.
+
+        Written only once all that was handed over before is on disk, so that it never names a frame that is not
+        complete.
+        """
+        path, copy = self.folder / "checkpoint.pt", HostCopy(checkpoint)
+
+        def write() -> None:
+            with atomic(path) as temporary:
+                torch.save(copy.get(), temporary)
+
+        self._submit(path, write, after_all=True)
+
+    def _submit(self, path: Path, write: Callable[[], None], after_all: bool = False) -> None:
+        self._writer.submit(path.relative_to(self.folder).as_posix(), write, after_all)
+
+    def wait(self) -> None:
+        """Return once everything handed over is on disk, but for the end of the video.
+
+        Raises:
+            OSError: If something could not be written, unless another method has raised it before.
+        """
+        self._writer.wait()
 
     def frame_files(self, count: int) -> list[Path]:
         """The PNGs of the first ``count`` frames that exist."""
         files = [self.folder / "frames" / f"{index:05d}.png" for index in range(count)]
         return [file for file in files if file.exists()]
 
-    def close(self, frames: int, summary: dict[str, Any], real_time_fps: float = 25.0) -> list[Path]:
-        """Pack the trajectory, encode the video and write the summary of the frames recorded so far.
+    def close(self, frames: int, summary: dict[str, Any], real_time_fps: float | None = None) -> list[Path]:
+        """Wait for all files, pack the trajectory, finish the video and write the summary of the frames so far.
 
         Args:
             frames: Number of frames recorded.
             summary: What goes to ``summary.json``.
-            real_time_fps: Frames per second at which the video shows the simulated time.
+            real_time_fps: Frames per second at which the video shows the simulated time, if not as in :meth:`open`.
 
         Returns:
             The files and folders of the run, for telling the user.
+
+        Raises:
+            OSError: If something could not be written, unless another method has raised it before. What does not
+                depend on it is kept all the same.
         """
-        self.write_summary(summary)
-        made = [self.folder / "summary.json"]
-        if self.ply_every and frames:
-            made.append(self.folder / "ply")
-        if self.trajectory and frames:
-            self._pack_trajectory(frames)
-            made.append(self.folder / "trajectory.npz")
-        if self.images and frames:
-            made.append(self.folder / "frames")
-            files = self.frame_files(frames)
-            if self.video and files:  # last: it needs another program
-                encode_video(files, self.folder / "video.mp4", self.fps or real_time_fps)
-                made.append(self.folder / "video.mp4")
+        failure = None
+        try:
+            self.write_summary(summary)
+            made = [self.folder / "summary.json"]
+            try:
+                self.wait()
+            except Exception as error:
+                failure = error
+            if self.ply_every and frames:
+                made.append(self.folder / "ply")
+            if self.trajectory and frames:
+                self._pack_trajectory(frames)
+                made.append(self.folder / "trajectory.npz")
+            if self.images and frames:
+                made.append(self.folder / "frames")
+                files = self.frame_files(frames)
+                if self.video and files:  # last: it needs another program
+                    self._finish_video(files, self.fps or real_time_fps or self._real_time_fps)
+                    made.append(self.folder / "video.mp4")
+        finally:
+            self._give_up_video()
+        if failure is not None:
+            raise failure
         return made
+
+    def _finish_video(self, files: list[Path], fps: float) -> None:
+        """End the video if it shows these frames at this rate, or else make one of the files."""
+        encoder = self._encoder
+        if encoder is not None and encoder.fps == fps and self._encoded == [int(file.stem) for file in files]:
+            with suppress(OSError):
+                return encoder.finish()
+        self._give_up_video()  # before another is made under the same name
+        encode_video(files, self.folder / "video.mp4", fps)
+
+    def _give_up_video(self) -> None:
+        if self._encoder is not None:
+            self._encoder.abort()
+            self._encoder = None
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write ``summary.json``, and its entry ``per_frame`` as ``diagnostics.csv`` too."""
@@ -280,7 +483,8 @@ class Recorder:
                         if name.rsplit("_", 1)[1][:5] in wanted and name not in done:
                             done.add(name)
                             out.writestr(name, archive.read(name))
-        shutil.rmtree(shards)
+        if shards.exists():  # if not closed before
+            shutil.rmtree(shards)
 
 
 def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, Tensor]:
@@ -324,4 +528,4 @@ def _free_name(path: Path) -> Path:
     return candidate
 
 
-__all__ = ["Recorder", "atomic", "encode_video", "load_trajectory", "write_json"]
+__all__ = ["Recorder", "VideoEncoder", "atomic", "encode_video", "load_trajectory", "write_json"]

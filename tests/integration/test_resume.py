@@ -14,7 +14,7 @@ import torch
 
 from gaussian_swaying.simulation.config import main
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
+from gaussian_swaying.simulation.recorder import load_trajectory
 
 ROOT = Path(__file__).parents[2]
 PIN = (
@@ -125,6 +125,55 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
     _same_as_uninterrupted(folder, whole)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGINT")
+def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
+    """The disk hangs, the run waits for it and is stopped: it ends in order, with the frames and video so far."""
+    folder, full, go_on = tmp_path / "run", tmp_path / "full", tmp_path / "go_on"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    code = (
+        "import functools, pathlib, sys, time\n"
+        "import imageio.v3 as iio\n"
+        "from gaussian_swaying.simulation import config, recorder\n"
+        f"full, go_on = pathlib.Path({str(full)!r}), pathlib.Path({str(go_on)!r})\n"
+        "class Writer(recorder.FrameWriter):\n"
+        "    def submit(self, *arguments, **settings):\n"
+        "        if self.pending == self.limit: full.touch()\n"
+        "        super().submit(*arguments, **settings)\n"
+        "recorder.FrameWriter = functools.partial(Writer, limit=8)\n"
+        "write = iio.imwrite\n"
+        "def hang(path, *arguments, **settings):\n"
+        "    while not go_on.exists(): time.sleep(0.01)\n"
+        "    write(path, *arguments, **settings)\n"
+        "iio.imwrite = hang\n"
+        "sys.exit(config.main(sys.argv[1:]))\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *_arguments(folder)], env=environment, stdout=subprocess.DEVNULL
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while not full.exists() and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.05)
+        assert full.exists()
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+        assert process.poll() is None  # what is in the queue is not dropped
+        go_on.touch()
+        assert process.wait(120) == 130
+    finally:
+        process.kill()
+        process.wait()
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["status"] == "interrupted"
+    assert 0 < summary["frames"] < FRAMES
+    assert len(iio.imread(folder / "video.mp4")) == summary["frames"]
+    assert torch.load(folder / "checkpoint.pt", weights_only=True)["frame"] == summary["frames"] - 1
+    assert not [path for path in folder.rglob(".*")]
+    assert main(_arguments(folder, "--resume")) == 0
+    _same_as_uninterrupted(folder, whole)
+
+
 def test_a_finished_run_can_be_lengthened(whole, tmp_path):
     folder = tmp_path / "run"
     assert main([*_arguments(folder), "--frames", "3"]) == 0
@@ -206,17 +255,22 @@ def test_a_refused_run_does_not_move_the_earlier_one(stopped, capsys):
 
 
 def test_checkpoints_are_written_after_what_they_promise(tmp_path, monkeypatch):
-    """A checkpoint of frame k exists only once the picture and the trajectory of frame k do."""
+    """A checkpoint of frame k exists only once the picture and the trajectory of frame k do, however slow they are."""
     seen = []
-    write = Recorder.write_checkpoint
+    save, write = torch.save, iio.imwrite
 
-    def check(self, checkpoint):
-        name = f"{checkpoint['frame']:05d}"
-        assert (self.folder / "frames" / f"{name}.png").exists()
-        assert (self.folder / "trajectory" / f"{name}.npz").exists()
+    def check(checkpoint, path):
+        for frame in range(checkpoint["frame"] + 1):
+            assert (path.parent / "frames" / f"{frame:05d}.png").exists()
+            assert (path.parent / "trajectory" / f"{frame:05d}.npz").exists()
         seen.append(checkpoint["frame"])
-        write(self, checkpoint)
+        save(checkpoint, path)
 
-    monkeypatch.setattr(Recorder, "write_checkpoint", check)
+    def slow(*arguments, **settings):
+        time.sleep(0.1)
+        write(*arguments, **settings)
+
+    monkeypatch.setattr(torch, "save", check)
+    monkeypatch.setattr(iio, "imwrite", slow)
     assert main(_arguments(tmp_path / "run")) == 0
     assert seen == list(range(FRAMES))

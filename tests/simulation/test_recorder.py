@@ -1,9 +1,16 @@
 """What a run leaves on disk, and what it leaves when something breaks."""
 
 import csv
+import gc
 import json
 import math
+import os
 import subprocess
+import sys
+import threading
+import time
+from functools import partial
+from pathlib import Path
 
 import imageio.v3 as iio
 import imageio_ffmpeg
@@ -16,9 +23,11 @@ from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.gaussians.surface import covariance
 from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.simulation import recorder as recorder_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.recorder import (
     Recorder,
+    VideoEncoder,
     atomic,
     encode_video,
     load_trajectory,
@@ -69,7 +78,7 @@ def _failing(monkeypatch, target, name):
 
 @pytest.mark.parametrize("what", ["image", "trajectory", "checkpoint", "ply", "summary"])
 def test_a_failing_write_leaves_no_half_file(what, make_pipeline, tmp_path, monkeypatch):
-    recorder = Recorder(ply_every=1)
+    recorder = Recorder(ply_every=1, video=False)
     recorder.open(tmp_path / "run")
     before = _names(tmp_path)
     if what == "image":
@@ -95,8 +104,13 @@ def test_a_failing_write_leaves_no_half_file(what, make_pipeline, tmp_path, monk
         write = lambda: recorder.write_ply(1, lambda p: pipeline.export(pipeline.scene.rest(), p))  # noqa: E731
     else:
         write = lambda: recorder.write_summary({"a": object()})  # noqa: E731
-    with pytest.raises((OSError, ZeroDivisionError, TypeError)):
+
+    def write_and_wait():
         write()
+        recorder.wait()
+
+    with pytest.raises((OSError, ZeroDivisionError, TypeError)):
+        write_and_wait()
     assert _names(tmp_path) == before
 
 
@@ -243,6 +257,321 @@ def test_a_video_that_cannot_be_made_loses_nothing_else(make_pipeline, tmp_path,
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 3
     load_trajectory(tmp_path / "run" / "trajectory.npz", 2)
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
+
+
+def test_frames_of_different_sizes_are_no_video(tmp_path):
+    files = [tmp_path / "0.png", tmp_path / "1.png"]
+    for file, width in zip(files, (16, 32), strict=True):
+        iio.imwrite(file, np.zeros((16, width, 3), dtype=np.uint8))
+    with pytest.raises(OSError, match=r"out\.mp4: a frame is 32 x 16, the first one is 16 x 16"):
+        encode_video(files, tmp_path / "out.mp4", 10.0)
+    assert _names(tmp_path) == ["0.png", "1.png"]
+
+
+# ---- in the background
+
+
+LONG = 60  # s; only a test that fails waits so long
+
+
+def _grey(k):
+    return torch.full((16, 16, 3), 50 * k / 255)
+
+
+def _levels(folder):
+    return [round(float(frame.mean()) / 50) for frame in iio.imread(folder / "video.mp4")]
+
+
+def _not_again(monkeypatch):
+    monkeypatch.setattr(recorder_module, "encode_video", lambda *_: pytest.fail("the video was encoded again"))
+
+
+def _before_imwrite(monkeypatch, action):
+    """Do something in the thread that writes a PNG, given its frame number."""
+    write = iio.imwrite
+
+    def wrapped(path, *arguments, **settings):
+        action(int(path.name.split(".")[1]))
+        write(path, *arguments, **settings)
+
+    monkeypatch.setattr(iio, "imwrite", wrapped)
+
+
+def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
+    """Frame 0 is compressed after frame 4; the video is encoded while the run goes on, and not a second time."""
+    later, finished = threading.Event(), []
+
+    def reverse(frame):
+        if frame == 0:
+            assert later.wait(LONG)
+        finished.append(frame)
+        if frame == 4:
+            later.set()
+
+    _before_imwrite(monkeypatch, reverse)
+    _not_again(monkeypatch)
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run", real_time_fps=10.0)
+    for k in range(5):
+        recorder.write_image(k, _grey(k))
+    recorder.close(5, {})
+    assert finished[-1] == 0
+    assert _levels(tmp_path / "run") == [0, 1, 2, 3, 4]
+    assert "10 fps" in _probe(tmp_path / "run" / "video.mp4")
+    for k in range(5):
+        assert (iio.imread(tmp_path / "run" / "frames" / f"{k:05d}.png") == 50 * k).all()
+
+
+def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypatch):
+    gate = threading.Event()
+    _before_imwrite(monkeypatch, lambda _: gate.wait(LONG))
+    recorder = Recorder()
+    recorder.open(tmp_path / "run")
+    image, position, F, log = _grey(2), torch.ones(4, 3), torch.ones(4, 3, 3).half(), [1]
+    try:
+        recorder.write_image(0, image)
+        recorder.write_trajectory(0, position, F)
+        recorder.write_checkpoint({"frame": 0, "state": {"position": position}, "log": log})
+        for tensor in (image, position, F):
+            tensor.zero_()
+        log.append(2)
+    finally:
+        gate.set()
+    recorder.close(1, {})
+    assert (iio.imread(tmp_path / "run" / "frames" / "00000.png") == 100).all()
+    assert _levels(tmp_path / "run") == [2]
+    for stored, shape in zip(load_trajectory(tmp_path / "run" / "trajectory.npz", 0), [(4, 3), (4, 3, 3)], strict=True):
+        assert torch.equal(stored, torch.ones(shape))
+    checkpoint = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert torch.equal(checkpoint["state"]["position"], torch.ones(4, 3))
+    assert checkpoint["log"] == [1]
+
+
+def test_a_frame_that_cannot_be_written_is_in_no_checkpoint(tmp_path, monkeypatch):
+    """What came before it is kept, with its video; nothing is half-written; the error comes once, in one sentence."""
+    fail = threading.Event()
+
+    def disk_full(frame):
+        if frame == 1:
+            assert fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    _before_imwrite(monkeypatch, disk_full)
+    recorder = Recorder()
+    recorder.open(tmp_path / "run")
+    for k in range(2):
+        recorder.write_image(k, _grey(k))
+        recorder.write_trajectory(k, torch.zeros(4, 3), torch.zeros(4, 3, 3))
+        recorder.write_checkpoint({"frame": k})
+    fail.set()
+    with pytest.raises(OSError, match=r"^frames/00001\.png could not be written: No space left on device$"):
+        recorder.wait()
+    with pytest.raises(OSError, match=r"frames/00001\.png"):
+        recorder.write_image(2, _grey(2))
+    recorder.close(2, {})
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True) == {"frame": 0}
+    assert _levels(tmp_path / "run") == [0]
+    load_trajectory(tmp_path / "run" / "trajectory.npz", 0)
+    assert _names(tmp_path / "run" / "frames") == ["00000.png"]
+    assert not [name for name in _names(tmp_path / "run") if name.split("/")[-1].startswith(".")]
+
+
+def test_close_tells_what_nobody_asked_about_before(tmp_path, monkeypatch):
+    fail = threading.Event()
+
+    def disk_full(frame):
+        if frame == 1:
+            assert fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    _before_imwrite(monkeypatch, disk_full)
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    for k in range(2):
+        recorder.write_image(k, _grey(k))
+    fail.set()
+    with pytest.raises(OSError, match=r"frames/00001\.png could not be written: No space left on device"):
+        recorder.close(2, {"a": 1})
+    assert _names(tmp_path / "run") == ["frames", "frames/00000.png", "run.json", "summary.json", "video.mp4"]
+
+
+@pytest.mark.parametrize("frame", [2, 3])
+def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_pipeline, tmp_path, monkeypatch):
+    """Also if the last frame is the one that cannot be written, and that shows only after the simulation."""
+    fail = threading.Event()
+
+    def disk_full(k):
+        if k == frame:
+            assert k < 3 or fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        wait = Recorder.wait
+        patch.setattr(Recorder, "wait", lambda self: (fail.set() if self._folder else None, wait(self)))
+        _before_imwrite(patch, disk_full)
+        with pytest.raises(OSError, match=f"frames/0000{frame}.png could not be written: No space left on device"):
+            _run(make_pipeline(), tmp_path / "run", 4)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["status"] == "failed"
+    assert "No space left" in summary["reason"]
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["frame"] < frame
+    _run(make_pipeline(), tmp_path / "run", 4, resume=True)
+    _run(make_pipeline(), tmp_path / "whole", 4)
+    videos = [iio.imread(tmp_path / name / "video.mp4") for name in ("run", "whole")]
+    assert len(videos[0]) == 4
+    assert np.array_equal(*videos)
+
+
+def test_a_resumed_run_has_the_whole_video(tmp_path):
+    for first in (0, 2):
+        recorder = Recorder(trajectory=False)
+        checkpoint = recorder.open(tmp_path / "run", resume=first > 0)
+        assert (checkpoint is None) == (first == 0)
+        for k in range(first, first + 3):  # frame 2 is done again
+            recorder.write_image(k, _grey(k if first else 0))
+            recorder.write_checkpoint({"frame": 1, "state": {}, "log": [], "config": "", "wall_s": {}})
+        recorder.close(first + 3, {})
+    assert _levels(tmp_path / "run") == [0, 0, 2, 3, 4]
+
+
+def test_ffmpeg_that_breaks_off_costs_no_frame(tmp_path, monkeypatch):
+    """The video is made of the PNGs then."""
+    write, calls = VideoEncoder.write, []
+
+    def breaks_off(self, image):
+        calls.append(1)
+        if len(calls) == 3:
+            self._process.kill()
+            self._process.wait()
+        write(self, image)
+
+    monkeypatch.setattr(VideoEncoder, "write", breaks_off)
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    for k in range(5):
+        recorder.write_image(k, _grey(k))
+    recorder.close(5, {})
+    assert _levels(tmp_path / "run") == [0, 1, 2, 3, 4]
+    assert len(calls) == 10
+
+
+@pytest.mark.parametrize(
+    ("order", "frames", "expected"), [([1, 0, 2], 3, [0, 1, 2]), ([0, 1, 1], 2, [0, 1]), ([0, 1, 2], 2, [0, 1])]
+)
+def test_the_video_shows_the_frames_that_were_asked_for(order, frames, expected, tmp_path):
+    """In whatever order they came, and without one that was begun after the last complete one."""
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    for k in order:
+        recorder.write_image(k, _grey(k))
+    recorder.close(frames, {})
+    assert _levels(tmp_path / "run") == expected
+
+
+def test_the_rate_may_be_given_at_the_end(tmp_path):
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run", real_time_fps=10.0)
+    recorder.write_image(0, _grey(1))
+    recorder.close(1, {}, 50.0)
+    assert "50 fps" in _probe(tmp_path / "run" / "video.mp4")
+
+
+def test_closing_twice_changes_nothing(tmp_path):
+    recorder = Recorder()
+    recorder.open(tmp_path / "run")
+    for k in range(2):
+        recorder.write_image(k, _grey(k))
+        recorder.write_trajectory(k, torch.zeros(4, 3), torch.zeros(4, 3, 3))
+    made = recorder.close(2, {"a": 1})
+    names = _names(tmp_path / "run")
+    assert recorder.close(2, {"a": 1}) == made
+    assert _names(tmp_path / "run") == names
+    assert _levels(tmp_path / "run") == [0, 1]
+    load_trajectory(tmp_path / "run" / "trajectory.npz", 1)
+
+
+@pytest.mark.parametrize("how", ["forgotten", "opened again", "closed in vain"])
+def test_a_recorder_that_is_not_closed_leaves_its_frames_and_no_process(how, tmp_path):
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    recorder.write_image(0, _grey(1))
+    recorder.wait()
+    process = recorder._encoder._process
+    assert process.poll() is None
+    if how == "forgotten":
+        del recorder
+        gc.collect()
+    elif how == "opened again":
+        recorder.open(tmp_path / "other")
+    else:
+        with pytest.raises(TypeError):
+            recorder.close(1, {"a": object()})
+    assert process.poll() is not None
+    assert _names(tmp_path / "run") == ["frames", "frames/00000.png", "run.json"]
+
+
+def test_a_program_that_ends_without_closing_loses_no_frame(tmp_path):
+    """Nor does it hang, or leave half a video."""
+    code = (
+        "import time, torch, imageio.v3 as iio\n"
+        "from gaussian_swaying.simulation.recorder import Recorder\n"
+        "write = iio.imwrite\n"
+        "iio.imwrite = lambda *a, **k: (time.sleep(0.5), write(*a, **k))\n"
+        "recorder = Recorder()\n"
+        f"recorder.open({str(tmp_path / 'run')!r})\n"
+        "for k in range(3): recorder.write_image(k, torch.zeros(16, 16, 3))\n"
+        "raise SystemExit(7)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, timeout=LONG).returncode == 7
+    assert _names(tmp_path / "run" / "frames") == ["00000.png", "00001.png", "00002.png"]
+    assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
+
+
+def test_a_run_holds_no_more_than_the_queue(make_pipeline, tmp_path, monkeypatch):
+    most = []
+
+    class Watched(recorder_module.FrameWriter):
+        def submit(self, *arguments, **settings):
+            super().submit(*arguments, **settings)
+            most.append(self.pending)
+
+    monkeypatch.setattr(recorder_module, "FrameWriter", partial(Watched, limit=3, workers=1))
+    _before_imwrite(monkeypatch, lambda _: time.sleep(0.05))
+    _not_again(monkeypatch)
+    _run(make_pipeline(), tmp_path / "run", 5)
+    assert max(most) == 3
+    assert len(most) == 20
+    assert len(iio.imread(tmp_path / "run" / "video.mp4")) == 5
+
+
+@pytest.mark.gpu
+def test_recording_never_makes_the_host_wait_for_the_gpu(tmp_path):
+    """The picture, trajectory and checkpoint are what they were at the call, though all is changed right after it."""
+    recorder = Recorder(video=False)
+    recorder.open(tmp_path / "run")
+    image, position, F = torch.rand(1080, 1920, 3), torch.rand(100_000, 3), torch.rand(100_000, 3, 3)
+    on_gpu = [tensor.cuda() for tensor in (image, position, F)]
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        recorder.write_image(0, on_gpu[0])
+        recorder.write_trajectory(0, on_gpu[1], on_gpu[2])
+        recorder.write_checkpoint({"frame": 0, "state": {"F": on_gpu[2]}})
+        for tensor in on_gpu:
+            tensor.zero_()
+        recorder.wait()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    recorder.close(1, {})
+    stored = torch.from_numpy(iio.imread(tmp_path / "run" / "frames" / "00000.png"))
+    assert torch.equal(stored, (image * 255 + 0.5).to(torch.uint8))
+    found = load_trajectory(tmp_path / "run" / "trajectory.npz", 0)
+    assert torch.equal(found[0], position)
+    assert torch.equal(found[1], F.half().float())
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["state"]
+    assert state["F"].device.type == "cpu"
+    assert torch.equal(state["F"], F)
 
 
 # ---- summary
