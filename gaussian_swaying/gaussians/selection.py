@@ -14,6 +14,19 @@ from gaussian_swaying._checks import check_positive, check_shape, check_vector
 class Region(ABC):
     """A part of space. Subclasses can be named in a configuration."""
 
+    def on(self, points: Tensor, values: Sequence[float]) -> Tensor:
+        """Numbers of the region with the type and device of some points.
+
+        They are kept as long as the region, so that a later call copies nothing to a GPU and a recorded CUDA graph
+        never reads what was freed.
+        """
+        known: dict[tuple[object, ...], Tensor] = self.__dict__.setdefault("_known", {})
+        key = (tuple(values), points.dtype, points.device)
+        if key not in known:
+            with torch.inference_mode(False):
+                known[key] = torch.tensor(values, dtype=points.dtype, device=points.device)
+        return known[key]
+
     @abstractmethod
     def contains(self, points: Tensor) -> Tensor:
         """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
@@ -56,7 +69,7 @@ class Box(Region):
     def contains(self, points: Tensor) -> Tensor:
         """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
         check_shape("points", points, 3)
-        return ((points >= points.new_tensor(self.min)) & (points <= points.new_tensor(self.max))).all(-1)
+        return ((points >= self.on(points, self.min)) & (points <= self.on(points, self.max))).all(-1)
 
 
 class Sphere(Region):
@@ -82,7 +95,7 @@ class Sphere(Region):
     def contains(self, points: Tensor) -> Tensor:
         """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
         check_shape("points", points, 3)
-        return (points - points.new_tensor(self.center)).square().sum(-1) <= self.radius**2
+        return (points - self.on(points, self.center)).square().sum(-1) <= self.radius**2
 
 
 class Cylinder(Region):
@@ -118,8 +131,8 @@ class Cylinder(Region):
     def contains(self, points: Tensor) -> Tensor:
         """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
         check_shape("points", points, 3)
-        axis = points.new_tensor(self.axis)
-        offset = points - points.new_tensor(self.center)
+        axis = self.on(points, self.axis)
+        offset = points - self.on(points, self.center)
         along = (offset * axis).sum(-1)
         across = (offset - along[..., None] * axis).square().sum(-1)
         return (along.abs() <= 0.5 * self.height) & (across <= self.radius**2)

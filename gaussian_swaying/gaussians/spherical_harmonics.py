@@ -84,8 +84,44 @@ def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
         ValueError: If a tensor does not have the shape above.
     """
     check_shape("sh", sh, None, 3)
-    basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), sh_degree(sh.shape[-2]))
+    check_shape("directions", directions, 3)
+    degree = sh_degree(sh.shape[-2])
+    if degree == 0:  # the same in every direction
+        return SH_DC * sh[..., 0, :].expand(torch.broadcast_shapes((*sh.shape[:-2], 3), directions.shape))
+    unit = torch.nn.functional.normalize(directions, dim=-1)
+    basis = sh_basis(unit, degree) if unit.device.type == "cpu" else _basis_by_product(unit, degree)
     return (basis[..., None] * sh).sum(-2)
+
+
+_kept: dict[tuple[int, torch.dtype, torch.device], Tensor] = {}
+
+
+def _basis_by_product(directions: Tensor, degree: int) -> Tensor:
+    """:func:`sh_basis` as one product of matrices: a GPU takes longer to start dozens of operations than to do them."""
+    key = (degree, directions.dtype, directions.device)
+    if key not in _kept:
+        with torch.inference_mode(False):
+            _kept[key] = _coefficients(degree).to(directions.device, directions.dtype)
+    return _monomials(directions, degree) @ _kept[key]
+
+
+def _monomials(points: Tensor, degree: int) -> Tensor:
+    """All products of ``degree`` factors out of 1, x, y, z for points (..., 3); shape (..., 4^degree)."""
+    factors = torch.nn.functional.pad(points, (1, 0), value=1.0)
+    products = factors
+    for _ in range(degree - 1):
+        products = (products[..., :, None] * factors[..., None, :]).flatten(-2)
+    return products
+
+
+@functools.cache
+def _coefficients(degree: int) -> Tensor:
+    """Matrix that takes :func:`_monomials` to :func:`sh_basis`, float64, shape (4^degree, (degree + 1)^2)."""
+    with torch.inference_mode(False):
+        axis = torch.arange(-3, 4, 2, dtype=torch.float64)  # four values: cubic polynomials are determined by them
+        points = torch.cartesian_prod(axis, axis, axis)
+        matrix = torch.linalg.pinv(_monomials(points, degree)) @ sh_basis(points, degree)
+        return matrix.where(matrix.abs() > 1e-9, 0.0)  # round-off
 
 
 def sh_to_color(sh: Tensor, directions: Tensor) -> Tensor:
@@ -141,10 +177,11 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 @functools.cache
 def _sampling(band: int) -> tuple[Tensor, Tensor]:
     """Directions (2l+1, 3) and the inverse of their band's matrix (condition number below 6), in float64."""
-    count = 2 * band + 1
-    index = torch.arange(count, dtype=torch.float64)
-    z = -0.3 + 1.1 * (index + 0.5) / count
-    angle = index * (torch.pi * (3 - 5**0.5))
-    radius = (1 - z * z).sqrt()
-    directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
-    return directions, torch.linalg.inv(sh_basis(directions, band)[:, band * band :])
+    with torch.inference_mode(False):  # they are kept, and may be needed for a gradient later
+        count = 2 * band + 1
+        index = torch.arange(count, dtype=torch.float64)
+        z = -0.3 + 1.1 * (index + 0.5) / count
+        angle = index * (torch.pi * (3 - 5**0.5))
+        radius = (1 - z * z).sqrt()
+        directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
+        return directions, torch.linalg.inv(sh_basis(directions, band)[:, band * band :])

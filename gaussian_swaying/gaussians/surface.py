@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
+import importlib.util
 import os
+import warnings
 from dataclasses import dataclass
+from types import ModuleType
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +17,7 @@ from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
-from gaussian_swaying.mpm.linalg import cofactor, determinant, polar_rotation
+from gaussian_swaying.mpm.linalg import cofactor, determinant, matmul3, polar_rotation
 
 
 def quat_to_rotation(quats: Tensor) -> Tensor:
@@ -126,7 +131,7 @@ def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tens
     """
     check_shape("deformation_gradient", deformation_gradient, 3, 3)
     check_shape("covariances", covariances, 3, 3)
-    return deformation_gradient @ covariances @ deformation_gradient.mT
+    return matmul3(matmul3(deformation_gradient, covariances), deformation_gradient.mT)
 
 
 def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
@@ -208,10 +213,11 @@ def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -
 
 def _unit_normal(vector: Tensor, determinants: Tensor, normals: Tensor) -> Tensor:
     """F^-T N made unit from cof(F) N (..., 3) and det F (...); the normals at rest where that is zero."""
-    vector = torch.where(determinants[..., None] < 0, -vector, vector)
-    largest = vector.detach().abs().amax(-1, keepdim=True)
+    largest = torch.linalg.vector_norm(vector.detach(), float("inf"), dim=-1, keepdim=True)
     flat = largest == 0
-    vector = torch.where(flat, normals, vector / torch.where(flat, 1, largest))  # scaled: squares cannot underflow
+    # + 0.0, as the sign of a negative zero is no reflection
+    scale = torch.where(flat, 1, largest).copysign(determinants.detach()[..., None] + 0.0)
+    vector = torch.where(flat, normals, vector / scale)  # scaled: squares cannot underflow
     return vector / vector.square().sum(-1, keepdim=True).sqrt()
 
 
@@ -221,6 +227,57 @@ def _cofactor_times(deformation_gradient: Tensor, normals: Tensor) -> tuple[Tens
     check_shape("normals", normals, 3)
     cof = cofactor(deformation_gradient)
     return cof, (cof * normals[..., None, :]).sum(-1)
+
+
+def deform_all(
+    deformation_gradient: Tensor, covariances: Tensor, normals: Tensor, rotations: bool = True
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Covariances, normals and rotations after a deformation, on a GPU in one kernel if triton is there.
+
+    Args:
+        deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
+        covariances: Covariances A at rest [scene units^2], shape (N, 3, 3).
+        normals: Unit normals N at rest, shape (N, 3).
+        rotations: Whether the rotations are asked for.
+
+    Returns:
+        :func:`deform_covariance`, :func:`deform_normal` and
+        :func:`~gaussian_swaying.mpm.linalg.polar_rotation`, or None in its place.
+
+    Raises:
+        ValueError: If a tensor does not have the shape above.
+    """
+    check_shape("deformation_gradient", deformation_gradient, 3, 3)
+    check_shape("covariances", covariances, 3, 3)
+    check_shape("normals", normals, 3)
+    tensors = (deformation_gradient, covariances, normals)
+    single = all(tensor.dtype == torch.float32 for tensor in tensors)
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+    if deformation_gradient.device.type == "cuda" and single and not wanted:
+        kernels = _kernels()
+        if kernels is not None:
+            return kernels.deform_all(*tensors, rotations)
+    return (
+        deform_covariance(deformation_gradient, covariances),
+        deform_normal(deformation_gradient, normals),
+        polar_rotation(deformation_gradient) if rotations else None,
+    )
+
+
+@functools.cache
+def _kernels() -> ModuleType | None:
+    """The kernels, if triton is there and finds a compiler; tried on one patch."""
+    if importlib.util.find_spec("triton") is None:
+        return None
+    try:
+        kernels = importlib.import_module("gaussian_swaying.gaussians.surface_triton")
+        matrix = torch.zeros(1, 3, 3, device="cuda")
+        for rotations in (False, True):
+            kernels.deform_all(matrix, matrix, matrix[:, 0], rotations)
+    except Exception as error:  # whatever it is, the definition does the same
+        warnings.warn(f"triton cannot compile its kernels here ({error}): pictures take longer.", stacklevel=2)
+        return None
+    return kernels
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,6 +357,11 @@ class GaussianSurfaceModel(nn.Module):
         """All spherical harmonics coefficients, shape (N, K, 3)."""
         return torch.cat([self.sh0, self.shN], dim=1)
 
+    @property
+    def view_dependent(self) -> bool:
+        """Whether the colours depend on where they are seen from."""
+        return self.shN.shape[1] > 0
+
     def covariance(self) -> Tensor:
         """Covariances at rest [scene units^2], shape (N, 3, 3)."""
         return covariance(self.quats, self.scales)
@@ -352,9 +414,6 @@ class GaussianSurfaceModel(nn.Module):
         """
         check_shape("position", position, len(self), 3)
         check_shape("deformation_gradient", deformation_gradient, len(self), 3, 3)
-        return DeformedGaussians(
-            means=position,
-            covariances=deform_covariance(deformation_gradient, self.covariance()),
-            normals=deform_normal(deformation_gradient, self.normals()),
-            rotations=polar_rotation(deformation_gradient),
-        )
+        covariances, normals, rotations = deform_all(deformation_gradient, self.covariance(), self.normals())
+        assert rotations is not None
+        return DeformedGaussians(position, covariances, normals, rotations)

@@ -48,7 +48,7 @@ class Nodes:
 
     Attributes:
         time: Time at the start of the substep [s], scalar float64 tensor.
-        dt: Substep [s].
+        dt: Substep [s], a number or a scalar float64 tensor.
         position: Where the nodes are [m], shape (..., G, 3), for a boundary with ``needs_position``.
         lattice: Where the lattice points are [m], shape (..., G, 3), for one with ``needs_lattice``: in ``total`` they
             have moved with the material, and a velocity that is affine in them moves it rigidly up to its border.
@@ -58,7 +58,7 @@ class Nodes:
     """
 
     time: Tensor
-    dt: float
+    dt: float | Tensor
     position: Tensor | None = None
     lattice: Tensor | None = None
     share: Tensor | None = None
@@ -123,6 +123,9 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
 
 class Boundary(nn.Module, ABC):
     """Base of all conditions.
+
+    What :meth:`forward` does can be recorded in a CUDA graph and replayed at other times and with other substeps: it
+    copies nothing from or to the host, after a first call at most.
 
     Args:
         start: Time from which it acts [s].
@@ -290,9 +293,13 @@ class Handle(PinnedRegion):
             across = torch.linalg.cross(axis, arm, dim=-1)
             # the chord of the arc (Rodrigues), not the tangent: the velocity whose explicit step ends on the circle
             angle = self.rate * nodes.dt
-            inward = (2 * math.sin(angle / 2) ** 2 / nodes.dt) * torch.linalg.cross(axis, across, dim=-1)
-            driven = driven + (math.sin(angle) / nodes.dt) * across + inward
+            inward = (2 * _sin(angle / 2) ** 2 / nodes.dt) * torch.linalg.cross(axis, across, dim=-1)
+            driven = driven + (_sin(angle) / nodes.dt) * across + inward
         return torch.where((nodes.held & self.active(nodes.time))[..., None], driven, velocity)
+
+
+def _sin(angle: float | Tensor) -> float | Tensor:
+    return angle.sin() if isinstance(angle, Tensor) else math.sin(angle)
 
 
 class SequentialRelease(PinnedRegion):
@@ -326,7 +333,7 @@ class SequentialRelease(PinnedRegion):
         """The release with its region and direction in metres, z up."""
         moved = copy.copy(self)
         moved.region = RegionInFrame(self.region, frame)
-        moved._buffers = dict(self._buffers) | {"direction": frame.direction_to_sim(self.direction)}
+        moved._buffers = dict(self._buffers) | {"direction": frame.direction_to_sim(self.direction).clone()}
         return moved
 
     def release_time(self, rest_position: Tensor) -> Tensor:
@@ -411,7 +418,7 @@ class Plane(Boundary):
     def in_frame(self, frame: FrameLike) -> Plane:
         """The plane in metres, z up."""
         moved = Plane([0, 0, 0], [0, 0, 1], self.kind, self.friction, self.start, self.end)
-        moved.point, moved.normal = frame.point_to_sim(self.point), frame.direction_to_sim(self.normal)
+        moved.point, moved.normal = frame.point_to_sim(self.point), frame.direction_to_sim(self.normal).clone()
         return moved
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:

@@ -4,7 +4,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
+    _eye: Tensor | None = field(default=None, init=False, repr=False)  # of a camera that came from the host
 
     def __post_init__(self) -> None:
         check_shape("world_to_camera", self.world_to_camera, 4, 4)
@@ -64,16 +65,30 @@ class Camera:
     @property
     def position(self) -> Tensor:
         """Eye in world coordinates [scene units], shape (3,)."""
+        if self._eye is not None:
+            return self._eye
         inverse, _ = torch.linalg.inv_ex(self.world_to_camera)
         return inverse[:3, 3]
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Camera":
-        """Return the camera with its matrices on another device or in another precision."""
-        return replace(
-            self,
-            world_to_camera=self.world_to_camera.to(device=device, dtype=dtype),
-            intrinsics=self.intrinsics.to(device=device, dtype=dtype),
-        )
+        """Return the camera with its matrices on another device or in another precision.
+
+        From the host to a GPU they go in one copy, which the host does not wait for.
+        """
+        target = self.intrinsics.device if device is None else torch.device(device)
+        parts, eye = (self.world_to_camera, self.intrinsics), self._eye
+        if target.type == "cuda" and all(part.device.type == "cpu" and not part.requires_grad for part in parts):
+            packed = torch.cat([part.reshape(-1).to(dtype=dtype) for part in (*parts, self.position)])
+            packed = packed.pin_memory().to(target, non_blocking=True)
+            view, intrinsics, eye = packed[:16].view(4, 4), packed[16:25].view(3, 3), packed[25:]
+        else:
+            view, intrinsics = (part.to(device=device, dtype=dtype) for part in parts)
+            eye = None if eye is None else eye.to(device=device, dtype=dtype)
+            if view is self.world_to_camera and intrinsics is self.intrinsics:
+                return self
+        moved = replace(self, world_to_camera=view, intrinsics=intrinsics)
+        object.__setattr__(moved, "_eye", eye)
+        return moved
 
 
 def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
@@ -90,26 +105,36 @@ def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
     Raises:
         ValueError: If ``up`` is zero or not finite.
     """
-    x, y, z = _unit("up", up).tolist()
+    return torch.tensor(_rows_from_z(_unit("up", up)), dtype=torch.float64)
+
+
+# A camera is made for every frame: plain numbers take a tenth of the time of small tensors.
+
+
+def _rows_from_z(up: Sequence[float]) -> list[list[float]]:
+    """Rows of :func:`rotation_from_z`, from a vector of length one."""
+    x, y, z = up
     if z < -1.0 + 1e-12:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        return [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
     f = 1.0 / (1.0 + z)  # Rodrigues' formula with axis (-y, x, 0) and cosine z
-    rows = [[1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]]
-    return torch.tensor(rows, dtype=torch.float64)
+    return [[1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]]
 
 
-def _vector(name: str, value: Sequence[float] | Tensor) -> Tensor:
-    """Return a checked 3-vector in float64 on the CPU."""
-    return torch.tensor(check_vector(name, value), dtype=torch.float64)
-
-
-def _unit(name: str, value: Sequence[float] | Tensor) -> Tensor:
-    """Return a checked 3-vector of length one in float64 on the CPU."""
-    vector = _vector(name, value)
-    length = float(vector.norm())
+def _unit(name: str, value: Sequence[float] | Tensor) -> tuple[float, ...]:
+    """Return a checked 3-vector of length one."""
+    vector = check_vector(name, value)
+    length = math.hypot(*vector)
     if length < 1e-12:
         raise ValueError(f"Expected `{name}` to be a direction, but got the zero vector.")
-    return vector / length
+    return tuple(item / length for item in vector)
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def look_at_camera(
@@ -151,20 +176,20 @@ def look_at_camera(
     """
     width, height = _check_pixels("width", width), _check_pixels("height", height)
     tangent = math.tan(math.radians(0.5 * _check_fov("fov_y_degrees", fov_y_degrees)))
-    eye_point, up_axis = _vector("eye", eye), _unit("up", up)
-    forward = _vector("target", target) - eye_point
-    distance = float(forward.norm())
+    eye_point, up_axis = check_vector("eye", eye), _unit("up", up)
+    forward = [a - b for a, b in zip(check_vector("target", target), eye_point, strict=True)]
+    distance = math.hypot(*forward)
     if distance < 1e-12:
-        raise ValueError(f"Expected `eye` and `target` to differ, but both are {eye_point.tolist()}.")
-    forward = forward / distance
-    right = torch.linalg.cross(forward, up_axis)
-    if float(right.norm()) < 1e-6:
-        raise ValueError(f"Expected `up` not to lie along the line of sight, but got {up_axis.tolist()}.")
-    right = right / right.norm()
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    world_to_camera = torch.eye(4, dtype=torch.float64)
-    world_to_camera[:3, :3] = rotation
-    world_to_camera[:3, 3] = -(rotation @ eye_point) + 0.0  # + 0.0 turns -0.0 into 0.0
+        raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(eye_point)}.")
+    forward = [item / distance for item in forward]
+    right = _cross(forward, up_axis)
+    across = math.hypot(*right)
+    if across < 1e-6:
+        raise ValueError(f"Expected `up` not to lie along the line of sight, but got {list(up_axis)}.")
+    right = [item / across for item in right]
+    axes = (right, _cross(forward, right), forward)
+    rows = [[*axis, 0.0 - _dot(axis, eye_point)] for axis in axes]  # never -0.0
+    world_to_camera = torch.tensor([*rows, [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
     focal = 0.5 * height / tangent
     intrinsics = torch.tensor(
         [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]], dtype=torch.float64
@@ -219,9 +244,9 @@ def orbit_camera(
     azimuth, elevation = math.radians(azimuth_degrees), math.radians(elevation_degrees)
     horizontal = math.cos(elevation)
     local = [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)]
-    offset = rotation_from_z(up) @ torch.tensor(local, dtype=torch.float64)
-    center_point = _vector("center", center)
-    eye = center_point + radius * offset
+    center_point = check_vector("center", center)
+    offset = [_dot(row, local) for row in _rows_from_z(_unit("up", up))]
+    eye = [c + radius * o for c, o in zip(center_point, offset, strict=True)]
     return look_at_camera(eye, center_point, up, fov_y_degrees, width, height, near, device=device, dtype=dtype)
 
 
@@ -428,9 +453,8 @@ class OrbitCamera(CameraPath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         check_positive("size", size)
-        offset = torch.tensor(self.target_offset, dtype=torch.float64)
         return orbit_camera(
-            _vector("center", center) + size * offset,
+            [c + size * o for c, o in zip(check_vector("center", center), self.target_offset, strict=True)],
             up,
             size * self.radius,
             self.azimuth + self.degrees_per_second * time,
@@ -474,7 +498,7 @@ class LookAtCamera(CameraPath):
         self.eye, self.target = check_vector("eye", eye), check_vector("target", target)
         if self.eye == self.target:
             raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(self.eye)}.")
-        self.up = None if up is None else tuple(_unit("up", up).tolist())
+        self.up = None if up is None else _unit("up", up)
         self.width, self.height = _check_pixels("width", width), _check_pixels("height", height)
         self.fov_y = _check_fov("fov_y", fov_y)
         check_positive("near", near)

@@ -90,7 +90,7 @@ def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: to
     """Split colour and depth and add the background, which gsplat 1.5.3 refuses together with packed=True."""
     color, depth = pixels[..., :3], pixels[..., 3:].clone()
     if background is not None:
-        color = color + (1.0 - alpha) * background.to(color)
+        color = torch.addcmul(color, 1.0 - alpha, background.to(color))
     return RenderOutput(color.to(dtype), alpha.to(dtype), depth.to(dtype))
 
 

@@ -121,19 +121,21 @@ def phong_shading(
     check_shape("normal", normal, 3)
     check_shape("light", light, 3)
     check_shape("view_direction", view_direction, 3)
-    factor = k_a + k_d * _lambert(normal, light, two_sided)
-    highlight = _highlight(normal, light, view_direction, shininess)
+    against = (view_direction * light).sum(-1, keepdim=True)
+
+    def terms(normal: Tensor) -> tuple[Tensor, Tensor]:
+        """Factor of the colour, and max(0, r.v)^shininess with r.v = 2 (n.L) (n.v) - L.v; shapes (..., 1)."""
+        cosine = (normal * light).sum(-1, keepdim=True)
+        facing = (normal * view_direction).sum(-1, keepdim=True)
+        factor = k_a + k_d * (cosine.abs() if two_sided else cosine.clamp_min(0.0))
+        return factor, (2.0 * cosine * facing - against).clamp_min(0.0) ** shininess
+
+    factor, highlight = terms(normal)
     if rest_normal is not None:
         check_shape("rest_normal", rest_normal, 3)
-        factor = _relative(factor, k_a + k_d * _lambert(rest_normal, light, two_sided))
-        highlight = highlight - _highlight(rest_normal, light, view_direction, shininess)
-    return (color * factor + k_s * highlight).clamp_min(0.0)
-
-
-def _highlight(normal: Tensor, light: Tensor, view_direction: Tensor, shininess: float) -> Tensor:
-    """Return max(0, r.v)^shininess, shape (..., 1)."""
-    reflected = 2.0 * (normal * light).sum(-1, keepdim=True) * normal - light
-    return (reflected * view_direction).sum(-1, keepdim=True).clamp_min(0.0) ** shininess
+        rest_factor, rest_highlight = terms(rest_normal)
+        factor, highlight = _relative(factor, rest_factor), highlight - rest_highlight
+    return torch.add(color * factor, highlight, alpha=k_s).clamp_min(0.0)
 
 
 def _unit_light(light: Sequence[float]) -> Tensor:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.linalg import determinant, singular_values
+from gaussian_swaying.mpm.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 
@@ -107,13 +108,15 @@ class TearingGauge:
             found = [nearest_neighbours(scene, count) for scene in flat]
             distance, index = (torch.stack(values).to(position.device) for values in zip(*found, strict=True))
             self.neighbour = torch.where(distance <= self.reach, index, own)
+        scene = torch.arange(len(flat), device=position.device)[:, None, None]
+        self.neighbour = (self.neighbour + position.shape[-2] * scene).reshape(-1)  # over the particles of all scenes
         self.elastic = solver.laws.elastic_particles()
 
     def __call__(self, position: Tensor) -> Tensor:
         """Which particles are torn off a neighbour, from positions (..., P, 3) [m]; bool, shape (scenes, P)."""
         flat = position.reshape(-1, *position.shape[-2:])
-        scene = torch.arange(len(flat), device=flat.device)[:, None, None]
-        apart = torch.linalg.vector_norm(flat[scene, self.neighbour] - flat[:, :, None], dim=-1)
+        near = flat.reshape(-1, 3).index_select(0, self.neighbour).reshape(*flat.shape[:2], -1, 3)
+        apart = torch.linalg.vector_norm(near - flat[:, :, None], dim=-1)
         torn = (apart > self.reach).any(-1)
         return torn if self.elastic is None else torn & self.elastic.reshape(torn.shape)
 
@@ -143,9 +146,10 @@ def diagnose(
     solver: MPMSolver,
     state: MPMState,
     substeps: int,
-    cfl: float,
+    cfl: Tensor | float,
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
+    check: bool = False,
 ) -> FrameDiagnostics:
     """Measure the health of a state (one GPU synchronisation).
 
@@ -156,39 +160,52 @@ def diagnose(
         cfl: Largest Courant number of the frame.
         wind_work: Work of the wind during the frame [J].
         tearing: Counts torn particles; none are counted without it.
+        check: Also do what :func:`check_state` does, within the same synchronisation.
 
     Returns:
         The measurements.
+
+    Raises:
+        SimulationDiverged: With ``check``, naming time, particle, cause and remedy.
     """
-    energies, momenta = solver.energies(state), solver.momenta(state)
-    momentum = torch.cat([momenta[name].double().reshape(-1, 3).sum(0) for name in ("linear", "angular")])
-    torn = state.time.new_zeros(()) if tearing is None else tearing(state.position).sum().double()
-    stretch = singular_values(state.F_total)
-    volume = determinant(state.F_total)
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
-    values = torch.stack(
-        [
-            state.time,
-            torch.as_tensor(cfl, dtype=torch.float64, device=state.time.device),
-            *(energies[name].sum().double() for name in ("kinetic", "elastic", "potential")),
-            torch.as_tensor(wind_work, dtype=torch.float64, device=state.time.device),
-            *momentum,
-            state.lost.sum().double(),
-            torn,
-            volume.amin().double(),
-            volume.amax().double(),
-            stretch.amin(),
-            stretch.amax(),
-            moved.mean().double(),
-            moved.amax().double(),
-        ]
-    ).tolist()
+    energies, momenta = solver.energies(state), solver.momenta(state)
+    energy = torch.stack([energies[name] for name in ("kinetic", "elastic", "potential")]).double()
+    momentum = torch.stack([momenta[name] for name in ("linear", "angular")]).double()
+    counts = [state.lost.sum()] + ([] if tearing is None else [tearing(state.position).sum()])
+    extremes = torch.stack([*torch.aminmax(determinant(state.F_total)), moved.mean(), moved.amax()])
+    F = state.F_total.double()
+    stretch = torch.stack(torch.aminmax(symmetric_eigenvalues(matmul3(F.mT, F)))).clamp(min=0).sqrt()
+    given = [value.to(state.time).reshape(1) for value in (cfl, wind_work) if isinstance(value, Tensor)]
+    parts = {
+        "time": state.time[None],
+        "energy": energy.reshape(3, -1).sum(-1),
+        "momentum": momentum.reshape(2, -1, 3).sum(1).reshape(-1),
+        "counts": torch.stack(counts).double(),
+        "extremes": extremes.double(),
+        "stretch": stretch,
+        "given": torch.cat(given) if given else stretch[:0],
+        "verdict": _verdict(solver, state, moved) if check else stretch[:0],
+    }
+    values = iter(torch.cat(list(parts.values())).tolist())
+    found = {name: [next(values) for _ in range(len(part))] for name, part in parts.items()}
+    if check:
+        _raise_if_bad(solver, found["verdict"], found["time"][0])
+    given_values = iter(found["given"])
+    cfl, wind_work = (next(given_values) if isinstance(value, Tensor) else float(value) for value in (cfl, wind_work))
     axes = [f"{kind}momentum_{axis}" for kind in ("", "angular_") for axis in "xyz"]
-    names = ("time", "cfl", "kinetic", "elastic", "potential", "wind_work", *axes, "lost", "torn", "J_min", "J_max")
-    names += ("stretch_min", "stretch_max")
-    found = dict(zip((*names, "displacement_mean", "displacement_max"), values, strict=True))
-    counts = {name: int(found.pop(name)) for name in ("lost", "torn")}
-    return FrameDiagnostics(substeps=substeps, **counts, **found)
+    return FrameDiagnostics(
+        time=found["time"][0],
+        substeps=substeps,
+        cfl=cfl,
+        **dict(zip(("kinetic", "elastic", "potential"), found["energy"], strict=True)),
+        wind_work=wind_work,
+        **dict(zip(axes, found["momentum"], strict=True)),
+        lost=int(found["counts"][0]),
+        torn=int(sum(found["counts"][1:])),
+        **dict(zip(("J_min", "J_max", "displacement_mean", "displacement_max"), found["extremes"], strict=True)),
+        **dict(zip(("stretch_min", "stretch_max"), found["stretch"], strict=True)),
+    )
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:
@@ -201,30 +218,46 @@ def check_state(solver: MPMSolver, state: MPMState) -> None:
     Raises:
         SimulationDiverged: Naming time, particle, cause and remedy.
     """
-    rest = solver.points.position
-    size = float((rest.reshape(-1, 3).amax(0) - rest.reshape(-1, 3).amin(0)).amax().clamp(min=solver.dx))
-    finite = (
-        torch.isfinite(state.position).all(-1)
-        & torch.isfinite(state.velocity).all(-1)
-        & torch.isfinite(state.F_elastic).all(-1).all(-1)
-    )
-    far = torch.linalg.vector_norm(state.position - rest, dim=-1) > 1000 * size
-    bad = ~finite | state.lost | far
-    if not bool(bad.any()):
+    moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
+    time, *verdict = torch.cat([state.time[None], _verdict(solver, state, moved)]).tolist()
+    _raise_if_bad(solver, verdict, time)
+
+
+_FAR, _LOST, _NOT_FINITE = 1, 2, 3  # what is wrong with a particle; the last is the worst
+
+
+def _verdict(solver: MPMSolver, state: MPMState, moved: Tensor) -> Tensor:
+    """What is wrong with the first bad particle (0 for none), its index, the lost ones, the object's size [m].
+
+    ``moved`` is how far each particle is from rest [m], shape (..., P). Four float64 values.
+    """
+    low, high = torch.aminmax(solver.points.position.reshape(-1, 3), dim=0)
+    size = (high - low).amax().clamp(min=solver.dx)
+    values = torch.cat([state.position, state.velocity, state.F_elastic.flatten(-2)], dim=-1)
+    finite = torch.linalg.vector_norm(values, math.inf, dim=-1) < math.inf  # not for NaN either
+    wrong = torch.where(state.lost, _LOST, (moved > 1000 * size).int())
+    wrong = torch.where(finite, wrong, _NOT_FINITE).reshape(-1)
+    first = (wrong > 0).int().argmax(0, keepdim=True)
+    found = torch.cat([wrong.index_select(0, first), first, state.lost.sum()[None]])
+    return torch.cat([found.double(), size[None].double()])
+
+
+def _raise_if_bad(solver: MPMSolver, verdict: list[float], time: float) -> None:
+    """Raise SimulationDiverged if the values of :func:`_verdict` name a particle."""
+    wrong, particle, lost = (int(value) for value in verdict[:3])
+    if wrong == 0:
         return
-    particle = int(bad.reshape(-1).int().argmax())
-    time = float(state.time)
-    if not bool(finite.reshape(-1)[particle]):
+    if wrong == _NOT_FINITE:
         cause = "its position, velocity or deformation is NaN or infinite"
         remedy = (
             "lower `solver.cfl`"
             if solver.substep is None
             else f"lower `solver.substep` (stable at rest: {solver.stable_substep():.3g} s) or set it to null"
         ) + ", or check the wind and the boundary velocities"
-    elif bool(state.lost.reshape(-1)[particle]):
-        cause = f"it left the grid ({int(state.lost.sum())} particles did)"
+    elif wrong == _LOST:
+        cause = f"it left the grid ({lost} particles did)"
         remedy = "enclose the scene with an EnclosingBox or a Plane, or lower the speeds that carry it away"
     else:
-        cause = f"it is more than 1000 object sizes ({size:.3g} m) away from where it started"
+        cause = f"it is more than 1000 object sizes ({verdict[3]:.3g} m) away from where it started"
         remedy = "pin or enclose the object, or lower `solver.cfl`"
     raise SimulationDiverged(time, particle, cause, remedy)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -25,6 +25,26 @@ class SimFrame:
     origin: Tensor
     rotation: Tensor
     metres_per_unit: float
+    _known: dict[tuple[torch.dtype, torch.device], tuple[Tensor, ...]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    _turns: list[bool] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    def _on(self, device: torch.device, dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
+        """Origin, rotation R, R ⊗ R and I on a device; kept, so that a later call copies nothing to a GPU."""
+        key = (dtype, device)
+        if key not in self._known:
+            with torch.inference_mode(False):
+                values = (self.origin, self.rotation, torch.kron(self.rotation, self.rotation), torch.eye(3))
+                self._known[key] = tuple(value.to(device, dtype) for value in values)
+        return self._known[key]
+
+    @property
+    def turns(self) -> bool:
+        """Whether the axes differ from the scene's, as they do unless z is up in it."""
+        if not self._turns:
+            self._turns.append(not torch.equal(self.rotation, torch.eye(3).to(self.rotation)))
+        return self._turns[0]
 
     @classmethod
     def fit(
@@ -69,30 +89,28 @@ class SimFrame:
             scale = float(longest_side) / extent
         return cls((0.5 * (low + high)) @ rotation, rotation, scale)
 
-    def _turn(self, vectors: Tensor, rotation: Tensor) -> Tensor:
-        return (vectors.double() @ rotation.to(vectors.device).T).to(vectors.dtype)
-
     def point_to_sim(self, points: Tensor) -> Tensor:
         """Scene points (..., 3) to metres, z up. Computed in float64, so far-away scenes keep their detail."""
-        centred = (points.double() - self.origin.to(points.device)) * self.metres_per_unit
-        return (centred @ self.rotation.to(points.device).T).to(points.dtype)
+        origin, rotation, *_ = self._on(points.device)
+        return ((points.double() - origin) * self.metres_per_unit @ rotation.T).to(points.dtype)
 
     def point_to_scene(self, points: Tensor) -> Tensor:
         """Points in metres, z up (..., 3) to scene coordinates."""
-        turned = (points.double() / self.metres_per_unit) @ self.rotation.to(points.device)
-        return (turned + self.origin.to(points.device)).to(points.dtype)
+        origin, rotation, *_ = self._on(points.device)
+        return ((points.double() / self.metres_per_unit) @ rotation + origin).to(points.dtype)
 
     def displacement_to_scene(self, displacement: Tensor) -> Tensor:
         """Displacements in metres, z up (..., 3) to scene units and axes."""
-        return self._turn(displacement, self.rotation.T) / self.metres_per_unit
+        turned = self.direction_to_scene(displacement)
+        return turned if self.metres_per_unit == 1 else turned / self.metres_per_unit
 
     def direction_to_sim(self, directions: Tensor) -> Tensor:
         """Turn directions (..., 3) from scene axes to the z-up frame, without scaling."""
-        return self._turn(directions, self.rotation)
+        return directions @ self._on(directions.device, directions.dtype)[1].T if self.turns else directions
 
     def direction_to_scene(self, directions: Tensor) -> Tensor:
         """Turn directions (..., 3) from the z-up frame to scene axes, without scaling."""
-        return self._turn(directions, self.rotation.T)
+        return directions @ self._on(directions.device, directions.dtype)[1] if self.turns else directions
 
     def area_to_sim(self, area: Tensor) -> Tensor:
         """Areas in square scene units to m²."""
@@ -100,18 +118,20 @@ class SimFrame:
 
     def covariance_to_sim(self, covariance: Tensor) -> Tensor:
         """Covariances (..., 3, 3) in square scene units to m², z up."""
-        rotation = self.rotation.to(covariance)
+        rotation = self._on(covariance.device, covariance.dtype)[1]
         return rotation @ covariance @ rotation.T * self.metres_per_unit**2
 
     def covariance_to_scene(self, covariance: Tensor) -> Tensor:
         """Covariances (..., 3, 3) in m², z up, to scene units and axes."""
-        rotation = self.rotation.to(covariance)
+        rotation = self._on(covariance.device, covariance.dtype)[1]
         return rotation.T @ covariance @ rotation / self.metres_per_unit**2
 
     def gradient_to_scene(self, F: Tensor) -> Tensor:
         """Deformation gradients (..., 3, 3) from the z-up frame to scene axes: Rᵀ F R, exactly I where F is."""
-        rotation, eye = self.rotation.to(F), torch.eye(3, dtype=F.dtype, device=F.device)
-        return eye + rotation.T @ (F - eye) @ rotation
+        if not self.turns:
+            return F
+        *_, both, eye = self._on(F.device, F.dtype)
+        return eye + ((F - eye).flatten(-2) @ both).unflatten(-1, (3, 3))  # one product, not two of small matrices
 
     def describe(self) -> str:
         """One line for people who place boxes and cameras."""

@@ -16,10 +16,8 @@ from gaussian_swaying.gaussians.selection import Everything, Region, select_simu
 from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
-    deform_covariance,
-    deform_normal,
+    deform_all,
 )
-from gaussian_swaying.mpm.linalg import polar_rotation
 from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.frame import SimFrame
@@ -148,6 +146,9 @@ class SimulatedScene(nn.Module):
         frame: Scene units to metres.
         bounds: Smallest and largest corner of the simulated part at rest [scene units].
         size: Its longest side [scene units].
+        moving: Indices of the Gaussians that move, the simulated and then the carried ones, shape (M,).
+        all_move: Whether these are all, in their order.
+        rest_facing: Normals at rest of those that move, in the z-up frame, shape (M, 3).
     """
 
     def __init__(self, scene: Scene, material: Material, dx: float, dtype: torch.dtype = torch.float32) -> None:
@@ -175,8 +176,17 @@ class SimulatedScene(nn.Module):
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
         position = self.frame.point_to_sim(cloud.means[simulated].double())
-        self.register_buffer("patch_normal", self.frame.direction_to_sim(normals[simulated]).to(dtype))
+        self.register_buffer("patch_normal", self.frame.direction_to_sim(normals[simulated].double()).to(dtype))
         self.register_buffer("patch_area", self.frame.area_to_sim(areas).to(dtype))
+        # what every picture would otherwise compute again
+        moving = torch.cat([simulated, carried])
+        self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
+        self.register_buffer("moving", moving, persistent=False)
+        arm = cloud.means[carried] - cloud.means[simulated[self.anchor]]
+        self.register_buffer("arm", arm, persistent=False)
+        facing = self.frame.direction_to_sim(normals[moving].double()).to(normals.dtype)
+        self.register_buffer("rest_facing", facing, persistent=False)
+        self.register_buffer("identity", torch.eye(3, dtype=cloud.means.dtype), persistent=False)
         self.simulated: Tensor
         self.carried: Tensor
         self.anchor: Tensor
@@ -184,6 +194,10 @@ class SimulatedScene(nn.Module):
         self.rest_normals: Tensor
         self.patch_normal: Tensor
         self.patch_area: Tensor
+        self.moving: Tensor
+        self.arm: Tensor
+        self.rest_facing: Tensor
+        self.identity: Tensor
         count = len(simulated)
         fields = {name: torch.full((count,), getattr(material, name), dtype=dtype) for name in _MATERIAL_FIELDS}
         laws, law_index = [material.law or FixedCorotated()], torch.zeros(count, dtype=torch.long)
@@ -224,14 +238,16 @@ class SimulatedScene(nn.Module):
     def rest(self) -> DeformedGaussians:
         """The Gaussians at rest."""
         means = self.model.means.detach()
-        eye = torch.eye(3, dtype=means.dtype, device=means.device).expand(len(means), 3, 3)
+        eye = self.identity.expand(len(means), 3, 3)
         return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye)
 
-    def deformed(self, state: MPMState) -> DeformedGaussians:
+    def deformed(self, state: MPMState, rotations: bool = True) -> DeformedGaussians:
         """The Gaussians where the material has taken them: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
 
         Args:
             state: State of one scene, fields of shape (P, ·).
+            rotations: Whether to compute the rotations; otherwise they are those of rest, which is enough for colours
+                that are the same from everywhere.
 
         Returns:
             All Gaussians, the static ones at rest.
@@ -240,20 +256,23 @@ class SimulatedScene(nn.Module):
         kind = rest.means.dtype
         move = self.frame.displacement_to_scene((state.position - self.points.position).to(kind))
         F = self.frame.gradient_to_scene(state.F_total.to(kind))
-        index, gradient = self.simulated, F
-        means = rest.means.clone()
-        means[index] = rest.means[index] + move
         if len(self.carried):
             near = F[self.anchor]
-            arm = rest.means[self.carried] - rest.means[index[self.anchor]]
-            turned = (near @ arm[..., None])[..., 0] - arm  # a difference, so that nothing moves at rest
-            means[self.carried] = rest.means[self.carried] + (move[self.anchor] + turned)
-            index, gradient = torch.cat([index, self.carried]), torch.cat([F, near])
-        covariances, normals, rotations = rest.covariances.clone(), rest.normals.clone(), rest.rotations.clone()
-        covariances[index] = deform_covariance(gradient, rest.covariances[index])
-        normals[index] = deform_normal(gradient, rest.normals[index])
-        rotations[index] = polar_rotation(gradient)
-        return DeformedGaussians(means, covariances, normals, rotations)
+            turned = (near * self.arm[:, None, :]).sum(-1) - self.arm  # a difference, so that nothing moves at rest
+            move, F = torch.cat([move, move[self.anchor] + turned]), torch.cat([F, near])
+        if self.all_move:
+            covariances, normals, turns = deform_all(F, rest.covariances, rest.normals, rotations)
+            return DeformedGaussians(
+                rest.means + move, covariances, normals, rest.rotations if turns is None else turns
+            )
+        index = self.moving
+        covariances, normals, turns = deform_all(F, rest.covariances[index], rest.normals[index], rotations)
+        return DeformedGaussians(
+            rest.means.index_add(0, index, move),
+            rest.covariances.index_copy(0, index, covariances),
+            rest.normals.index_copy(0, index, normals),
+            rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
+        )
 
 
 _MATERIAL_FIELDS = ("E", "nu", "density", "thickness")

@@ -1,5 +1,7 @@
 """Regions and the choice of what is simulated."""
 
+import copy
+
 import pytest
 import torch
 
@@ -67,6 +69,42 @@ def test_batches_and_devices(region, device, dtype):
         assert isinstance(wrapped, Region)
         with pytest.raises(ValueError, match="Expected `points` of shape"):
             wrapped.contains(torch.rand(4, 2))
+
+
+def test_a_changed_region_is_asked_anew():
+    """Corners are kept as tensors, but only for the numbers that they were made of."""
+    box, point = Box([0, 0, 0], [1, 1, 1]), torch.tensor([[1.5, 0.5, 0.5]])
+    assert box.contains(point).tolist() == [False]
+    box.max = (2.0, 1.0, 1.0)
+    assert box.contains(point).tolist() == [True]
+    assert copy.deepcopy(box).contains(point.double()).tolist() == [True]
+
+
+def test_constants_of_an_inference_serve_gradients():
+    sphere = Sphere([0, 0, 0], 1)
+    with torch.inference_mode():
+        sphere.contains(torch.zeros(1, 3))
+    points = torch.rand(4, 3, requires_grad=True)
+    sphere.contains(points)  # subtracts the centre
+    (points - sphere.on(points, sphere.center)).square().sum().backward()
+    assert torch.equal(points.grad, 2 * points.detach())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    "region",
+    [Everything(), Box([0, None, 0], [1, 1, None]), Sphere([0, 0, 0], 1), Cylinder([0, 0, 0], [0, 1, 0], 1, 1)],
+)
+def test_asking_a_second_time_copies_nothing(region):
+    points = torch.rand(40, 3, device="cuda")
+    wrapped = Not(Union([region, Sphere([1, 1, 1], 0.1)]))
+    known = wrapped.contains(points)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        again = wrapped.contains(points)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(again, known)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying.gaussians import spherical_harmonics
 from gaussian_swaying.gaussians.spherical_harmonics import evaluate_sh, rotate_sh, sh_basis, sh_to_color
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
@@ -68,6 +69,50 @@ def test_evaluation(device, dtype, degree):
     torch.testing.assert_close(evaluate_sh(sh, 7 * directions), expected, rtol=0, atol=tolerance)
     torch.testing.assert_close(sh_to_color(sh, directions), (expected + 0.5).clamp(min=0), rtol=0, atol=tolerance)
     assert (sh_to_color(sh, directions) == 0).any()
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_the_basis_as_one_product(device, dtype, degree):
+    """What a GPU does is what the basis is, with its gradient."""
+    directions = _directions(device, dtype).requires_grad_()
+    found, known = spherical_harmonics._basis_by_product(directions, degree), sh_basis(directions, degree)
+    torch.testing.assert_close(found, known, rtol=0, atol=TOLERANCE[dtype])
+    weights = torch.randn_like(known)
+    gradients = [torch.autograd.grad((basis * weights).sum(), directions)[0] for basis in (found, known)]
+    # along a direction they may differ: the basis is asked about unit vectors only
+    across = [g - (g * directions).sum(-1, keepdim=True) * directions for g in gradients]
+    torch.testing.assert_close(across[0], across[1], rtol=0, atol=20 * TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_what_an_inference_kept_serves_gradients(degree, device, monkeypatch):
+    monkeypatch.setattr(spherical_harmonics, "_kept", {})
+    spherical_harmonics._sampling.cache_clear()
+    spherical_harmonics._coefficients.cache_clear()
+    sh = torch.randn(5, (degree + 1) ** 2, 3, device=device)
+    directions, turn = _directions(device, torch.float32, 5), torch.eye(3, device=device).repeat(5, 1, 1)
+    with torch.inference_mode():
+        spherical_harmonics._basis_by_product(directions, degree)
+        known = evaluate_sh(sh, directions), rotate_sh(sh, turn)
+    for given in (sh, directions, turn):
+        given.requires_grad_()
+    basis = spherical_harmonics._basis_by_product(directions, degree)
+    found = evaluate_sh(sh, directions), rotate_sh(sh, turn)
+    for a, b in zip(found, known, strict=True):
+        torch.testing.assert_close(a, b)
+    (found[0].sum() + found[1].sum() + basis.sum()).backward()
+    for given in (sh, directions, turn):
+        assert torch.isfinite(given.grad).all()
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_many_directions_of_one_gaussian(degree):
+    """The coefficients of one Gaussian seen from everywhere, and those of many seen from one side."""
+    sh, directions = torch.randn(4, (degree + 1) ** 2, 3), _directions("cpu", torch.float32, 6)
+    grid = evaluate_sh(sh[:, None], directions)
+    assert grid.shape == (4, 6, 3)
+    for i in range(4):
+        torch.testing.assert_close(evaluate_sh(sh[i], directions), grid[i])
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

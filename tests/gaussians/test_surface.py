@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying.gaussians import surface
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
@@ -12,6 +13,7 @@ from gaussian_swaying.gaussians.surface import (
     GaussianSurfaceModel,
     covariance,
     covariance_to_quat_scale,
+    deform_all,
     deform_area,
     deform_covariance,
     deform_normal,
@@ -20,6 +22,7 @@ from gaussian_swaying.gaussians.surface import (
     rotation_to_quat,
     smallest_axis_normal,
 )
+from gaussian_swaying.mpm.linalg import polar_rotation
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -154,6 +157,49 @@ def test_deformed_normal_of_singular_gradients(device, dtype):
     normal.sum().backward()
     assert torch.isfinite(f.grad).all()
     assert deform_area(f.detach(), up.expand(4, 3), torch.ones(4, device=device, dtype=dtype))[:3].tolist() == [6, 0, 0]
+
+
+def test_everything_at_once_is_each_by_itself(device, dtype):
+    """On a GPU in one kernel, if triton is there: turned over, flattened and undeformed patches included."""
+    f = _gradients(60, device, dtype)
+    f[1] = torch.diag(torch.tensor([2.0, 3.0, 0.0]))
+    f[2] = 1e-12 * torch.eye(3)
+    f[3] = torch.eye(3)
+    f = f.mT.contiguous().mT  # any strides
+    factor = torch.randn(len(f), 3, 3, device=device, dtype=dtype)
+    rest, normal = factor @ factor.mT, _unit(len(f), 3, device=device, dtype=dtype)
+    normal[1] = UP.to(normal)
+    covariances, normals, rotations = deform_all(f, rest, normal)
+    torch.testing.assert_close(covariances, deform_covariance(f, rest))
+    torch.testing.assert_close(normals, deform_normal(f, normal), rtol=1e-4, atol=1e-5)
+    stretched = [k for k in range(len(f)) if k not in (1, 2)]
+    torch.testing.assert_close(rotations[stretched], polar_rotation(f)[stretched], rtol=0, atol=1e-5)
+    assert torch.isfinite(rotations).all()
+    assert torch.equal(covariances[3], rest[3])
+    *same, none = deform_all(f, rest, normal, rotations=False)
+    assert none is None
+    assert torch.equal(same[0], covariances)
+    assert torch.equal(same[1], normals)
+
+
+@pytest.mark.gpu
+def test_the_kernel_is_the_one_that_is_asked(monkeypatch):
+    """Not with a gradient, nor in float64."""
+    pytest.importorskip("triton")
+    kernels, calls = surface._kernels(), []
+    assert kernels is not None
+    deform = kernels.deform_all
+    monkeypatch.setattr(kernels, "deform_all", lambda *a: calls.append(1) or deform(*a))
+    f = torch.eye(3, device="cuda").expand(4, 3, 3)
+    normal = torch.eye(3, device="cuda")[:1].expand(4, 3)
+    deform_all(f.double(), f.double(), normal.double())
+    deform_all(f.clone().requires_grad_(), f, normal)
+    assert calls == []
+    deform_all(f, f, normal)
+    with torch.no_grad():
+        deform_all(f.clone().requires_grad_(), f, normal)
+    assert calls == [1, 1]
+    assert deform_all(f[:0], f[:0], normal[:0])[2].shape == (0, 3, 3)
 
 
 def test_gradcheck(device):

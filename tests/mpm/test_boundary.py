@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.selection import Box, Sphere
+from gaussian_swaying.gaussians.selection import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.boundary import (
     EnclosingBox,
     Handle,
     Impulse,
+    Nodes,
     PinnedRegion,
     Plane,
     SequentialRelease,
@@ -518,6 +519,100 @@ CONDITIONS = {
     "box": lambda r: EnclosingBox([-0.13, 0.07, 0.13], [0.33, 0.43, 0.51], "separate", 0.3, end=0.5),
     "velocity": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5),
 }
+
+
+REGIONS = {
+    "everything": Everything(),
+    "box": Box([None, 0.1, 0.23], [0.35, None, None]),
+    "sphere": Sphere([0.1, 0.2, 0.2], 0.2),
+    "cylinder": Cylinder([0.2, 0.2, 0.2], [1.0, 2.0, 0.5], 0.15, 0.3),
+    "union": Union([Sphere([0.1, 0.1, 0.1], 0.15), Box([0.2, 0.2, 0.2], [0.4, 0.4, 0.4])]),
+    "not": Not(Cylinder([0.2, 0.2, 0.2], [0.0, 0.0, 1.0], 0.15, 0.3)),
+}
+# every condition, and the one that asks for a region in each substep over each kind of region
+ACTING = CONDITIONS | {
+    f"velocity-{name}": lambda _, region=region: VelocityBox(region, [0.1, 0.2, 0.3], end=0.5)
+    for name, region in REGIONS.items()
+}
+
+
+def _acting(name, device, dtype=torch.float64):
+    """A condition in the metres of some frame, and the velocities and nodes that it acts on."""
+    generator = torch.Generator().manual_seed(3)
+    position = torch.rand(200, 3, generator=generator, dtype=torch.float64) * 0.6 - 0.1
+    frame = SimFrame.fit(position, up=(0.2, 1.0, 0.3), metres_per_unit=2.0)
+    place = frame.point_to_sim(position).to(device, dtype)
+    nodes = Nodes(
+        time=torch.tensor(0.1, dtype=torch.float64, device=device),
+        dt=2e-3,
+        position=place,
+        lattice=place + 0.01,
+        share=torch.rand(200, generator=generator, dtype=torch.float64).to(device, dtype),
+        threshold=0.5,
+        held_mass=torch.tensor(0.7, device=device, dtype=dtype),
+    )
+    velocity = torch.randn(200, 3, generator=generator, dtype=torch.float64).to(device, dtype)
+    return ACTING[name](Box([None, None, 0.23], [None] * 3)).in_frame(frame).to(device), velocity, nodes
+
+
+@pytest.mark.parametrize("name", ACTING)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_substep_may_be_a_tensor(name, dtype):
+    boundary, velocity, nodes = _acting(name, "cpu", dtype)
+    known = boundary(velocity, nodes)
+    found = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(nodes.dt, dtype=torch.float64)))
+    assert found.dtype == dtype
+    torch.testing.assert_close(found, known, rtol=1e-12 if dtype == torch.float64 else 1e-6, atol=0)
+    assert not torch.equal(found, velocity)
+    if name in ("handle", "impulse"):  # what depends on the substep
+        longer = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(0.3, dtype=torch.float64)))
+        assert float((longer - known).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("name", ACTING)
+def test_a_condition_makes_its_constants_once(name, monkeypatch):
+    boundary, velocity, nodes = _acting(name, "cpu")
+    known = boundary(velocity, nodes)
+
+    def refuse(*_, **__):
+        raise AssertionError("made from numbers of the host")
+
+    for place, function in ((torch, "tensor"), (torch, "as_tensor"), (torch.Tensor, "new_tensor")):
+        monkeypatch.setattr(place, function, refuse)
+    assert torch.equal(boundary(velocity, nodes), known)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ACTING)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_recorded_condition_follows_time_and_substep(name, dtype):
+    """One CUDA graph for any time and any substep; nothing in it waits for the host or copies from it."""
+    boundary, velocity, nodes = _acting(name, "cuda", dtype)
+    nodes = dataclasses.replace(nodes, dt=torch.full_like(nodes.time, 1e-3))
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        boundary(velocity, nodes)
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            boundary(velocity, nodes)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        recorded = boundary(velocity, nodes)
+    seen = []
+    for time, dt in ((0.0, 1e-3), (0.2, 4e-3), (0.499, 2e-2), (0.7, 1e-3)):
+        nodes.time.fill_(time)
+        nodes.dt.fill_(dt)
+        graph.replay()
+        now = dataclasses.replace(nodes, time=torch.full_like(nodes.time, time), dt=dt)
+        torch.testing.assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=1e-7)
+        seen.append(recorded.clone())
+    assert not torch.equal(seen[0], velocity)
+    if name != "release":  # which the solver, not the condition, lets go
+        assert torch.equal(seen[3], velocity)
 
 
 @pytest.mark.parametrize("name", CONDITIONS)

@@ -1,5 +1,6 @@
 """Cameras against hand-computed geometry."""
 
+import dataclasses
 import json
 import math
 
@@ -48,6 +49,37 @@ def test_look_at_puts_the_target_at_the_centre_and_up_at_the_top(device, dtype):
     rotation = camera.world_to_camera[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=dtype), atol=1e-6, rtol=0)
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.gpu
+def test_a_camera_goes_to_the_gpu_without_a_wait():
+    """Matrices and eye in one copy; the eye, computed in float64 before, is as near as float32 can hold it."""
+    camera = look_at_camera((1e3, -3, 2), (0.5, 0.2, 0.1), (0, 0, 1), 35.0, 64, 48, dtype=torch.float64)
+    camera.to("cuda", torch.float32)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        moved = camera.to("cuda", torch.float32)
+        assert moved.to(moved.intrinsics.device, torch.float32) is moved
+        eye = moved.position
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(eye.cpu(), camera.position.float())
+    for name in ("world_to_camera", "intrinsics"):
+        assert torch.equal(getattr(moved, name).cpu(), getattr(camera, name).float())
+    # another matrix has another eye
+    shifted = moved.world_to_camera.clone()
+    shifted[2, 3] += 1.0
+    other = dataclasses.replace(moved, world_to_camera=shifted)
+    torch.testing.assert_close(other.position, torch.linalg.inv(shifted)[:3, 3])
+
+
+def test_a_camera_that_is_where_it_should_be_is_not_copied():
+    camera = look_at_camera((1, -3, 2), (0.5, 0.2, 0.1), (0, 0, 1), 35.0, 64, 48)
+    assert camera.to("cpu", torch.float32) is camera
+    assert camera.to() is camera
+    double = camera.to(dtype=torch.float64)
+    assert double.position.dtype == torch.float64
+    torch.testing.assert_close(double.position.float(), camera.position)
 
 
 def test_look_at_field_of_view_and_handedness():

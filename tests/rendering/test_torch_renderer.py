@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.base import make_renderer
+from gaussian_swaying.rendering.base import finite_gaussians, make_renderer
 from gaussian_swaying.rendering.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
 
@@ -213,6 +213,24 @@ def test_gradcheck():
 
     assert all(float(output.detach().std()) > 0.01 for output in render(*inputs))
     assert torch.autograd.gradcheck(render, inputs, eps=1e-7, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_bad_number_makes_a_gaussian_not_finite(dtype, device):
+    means, covariances, opacities, colors = fields = _scene(80, dtype, device)
+    assert bool(finite_gaussians(*fields).all())
+    covariances[0, 0, 0] = torch.finfo(dtype).max  # huge, yet a number
+    expected = torch.ones(80, dtype=torch.bool)
+    row = 1
+    for field in (means, covariances, opacities[:, None], colors):
+        for column in range(field[0].numel()):
+            for value in (math.nan, math.inf, -math.inf):
+                field[row].view(-1)[column] = value
+                expected[row] = False
+                row += 1
+    assert row > 40
+    assert finite_gaussians(*fields).tolist() == expected.tolist()
+    assert finite_gaussians(*(field[:0] for field in fields)).shape == (0,)
 
 
 def test_gradients_are_finite_where_gaussians_are_dropped():

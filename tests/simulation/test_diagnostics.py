@@ -1,6 +1,7 @@
 """Numbers of known states, and who is to blame for bad ones."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -141,6 +142,104 @@ def test_a_particle_far_away_is_named():
     position[11, 2] += 2000.0
     with pytest.raises(SimulationDiverged, match=r"particle 11: it is more than 1000 object sizes"):
         check_state(solver, state.replace(position=position))
+
+
+def test_what_is_worst_is_named_first():
+    """Of one particle that is several things at once; of several particles the first."""
+    solver, state = _solver()
+    lost = torch.zeros(30, dtype=torch.bool)
+    lost[[5, 9]] = True
+    position = state.position.clone()
+    position[5] = math.inf
+    with pytest.raises(SimulationDiverged, match=r"particle 5: .*NaN"):
+        check_state(solver, state.replace(lost=lost, position=position))
+    position[5], position[3] = 0.0, 3000.0
+    with pytest.raises(SimulationDiverged, match=r"particle 3: it is more than 1000 object sizes"):
+        check_state(solver, state.replace(lost=lost, position=position))
+
+
+@pytest.mark.parametrize("name", ["position", "velocity", "F_elastic"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_bad_component_is_enough(name, dtype):
+    solver, state = _solver()
+    for column in range(9 if name == "F_elastic" else 3):
+        for value in (math.nan, math.inf, -math.inf):
+            field = getattr(state, name).to(dtype).clone()
+            field[11].view(-1)[column] = value
+            with pytest.raises(SimulationDiverged, match=r"particle 11: .*NaN"):
+                check_state(solver, state.replace(**{name: field}))
+
+
+def test_a_measurement_can_check_as_well():
+    solver, state = _solver()
+    gauge = TearingGauge(solver)
+    known = diagnose(solver, state, 3, 0.25, 1.5, gauge)
+    assert diagnose(solver, state, 3, 0.25, 1.5, gauge, check=True) == known
+    tensors = torch.tensor(0.25), torch.tensor(1.5, dtype=torch.float64)
+    assert diagnose(solver, state, 3, tensors[0], tensors[1], gauge) == known
+    assert diagnose(solver, state, 3, 0.25, tensors[1], gauge, check=True) == known
+    assert (known.cfl, known.wind_work) == (0.25, 1.5)
+    bad = state.replace(velocity=state.velocity * math.nan, time=torch.tensor(0.25, dtype=torch.float64))
+    diagnose(solver, bad, 3, 0.25)
+    messages = []
+    for look in (lambda: check_state(solver, bad), lambda: diagnose(solver, bad, 3, 0.25, check=True)):
+        with pytest.raises(SimulationDiverged, match=r"t = 0\.25 s, particle 0: .*NaN") as info:
+            look()
+        messages.append(str(info.value))
+    assert messages[0] == messages[1]
+
+
+def test_scenes_of_a_batch_are_summed():
+    """Two scenes, one of them twice as heavy, against each by itself; the second particle of the second is lost."""
+    position = torch.rand(12, 3, dtype=torch.float64)
+    settings = {"volume": 0.02, "youngs_modulus": 1e4, "poisson_ratio": 0.3}
+    density = torch.tensor([[100.0], [200.0]], dtype=torch.float64)
+
+    def health(position, density, lost):
+        points = MaterialPoints.create(position, density=density, **settings)
+        solver = MPMSolver(dx=0.2, formulation="updated")
+        state = solver.init_state(points, torch.ones_like(position))
+        return diagnose(solver, state.replace(position=2 * position, lost=lost), 1, 0.1, tearing=TearingGauge(solver))
+
+    lost = torch.zeros(2, 12, dtype=torch.bool)
+    lost[1, 1] = True
+    both = health(torch.stack([position, position + 0.5]), density, lost)
+    each = [health(position + 0.5 * k, density[k], lost[k]) for k in range(2)]
+    for name in ("kinetic", "potential", "elastic", "momentum_x", "angular_momentum_y", "lost", "torn"):
+        assert getattr(both, name) == pytest.approx(sum(getattr(one, name) for one in each)), name
+    assert (both.lost, both.displacement_max) == (1, max(one.displacement_max for one in each))
+    assert both.torn > 0
+
+
+def test_a_check_reads_the_state_once(monkeypatch):
+    solver, state = _solver()
+    reads = []
+    for name in ("tolist", "item", "__bool__", "__float__", "__int__"):
+        original = getattr(torch.Tensor, name)
+        monkeypatch.setattr(
+            torch.Tensor, name, lambda self, original=original, name=name: reads.append(name) or original(self)
+        )
+    check_state(solver, state)
+    assert reads == ["tolist"]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_frame_is_measured_in_one_transfer(formulation):
+    position = torch.rand(200, 3, device="cuda")
+    points = MaterialPoints.create(position, volume=0.02, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    solver = MPMSolver(dx=0.2, formulation=formulation)
+    state = solver.init_state(points)
+    gauge, work = TearingGauge(solver), torch.zeros((), dtype=torch.float64, device="cuda")
+    diagnose(solver, state, 1, work, work, gauge, check=True)
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as waits:
+            warnings.simplefilter("always")
+            diagnose(solver, state, 1, work, work, gauge, check=True)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len([wait for wait in waits if "synchroniz" in str(wait.message)]) == 1
 
 
 def test_without_a_particle_none_is_named():

@@ -1,5 +1,7 @@
 """Scene units to metres and back, against closed forms."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -85,6 +87,51 @@ def test_deforming_in_the_scene_is_deforming_in_metres(up):
 def test_an_undeformed_gradient_stays_exactly_that(up):
     eye = torch.eye(3).expand(4, 3, 3)
     assert torch.equal(SimFrame.fit(_points(), up).gradient_to_scene(eye), eye)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_a_gradient_is_turned_from_both_sides(up):
+    frame = SimFrame.fit(_points(), up)
+    assert frame.turns == (up != [0, 0, 1])
+    F = torch.rand(2, 5, 3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    torch.testing.assert_close(frame.gradient_to_scene(F), frame.rotation.T @ F @ frame.rotation)
+    mirrored = frame.gradient_to_scene(F.mT.contiguous().mT)  # any strides
+    assert torch.equal(mirrored, frame.gradient_to_scene(F))
+
+
+def test_what_a_frame_keeps_is_its_own():
+    """Another origin, unit or rotation in a copy, another type and a gradient after an inference."""
+    with torch.inference_mode():
+        frame = SimFrame.fit(_points(), [0, 1, 0], metres_per_unit=2.0)
+        frame.point_to_sim(_points())
+        frame.direction_to_sim(_points().float())
+    other = dataclasses.replace(frame, origin=frame.origin.clone() + 1, rotation=rotation_from_z([1, 0, 0]).T)
+    expected = (_points() - other.origin) @ other.rotation.T * 2.0
+    torch.testing.assert_close(other.point_to_sim(_points()), expected)
+    points = _points().requires_grad_()
+    other.direction_to_sim(points).sum().backward()
+    torch.testing.assert_close(points.grad, other.rotation.sum(0).expand(50, 3))
+    assert frame.direction_to_sim(_points().float()).dtype == torch.float32
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("up", [[0, 0, 1], [0.3, -0.7, 0.2]])
+def test_a_second_conversion_copies_nothing(up):
+    frame, points = SimFrame.fit(_points(), up, longest_side=1.0), _points(torch.float32)
+    matrices = torch.rand(50, 3, 3)
+    names = ["point_to_sim", "point_to_scene", "displacement_to_scene", "direction_to_sim", "direction_to_scene"]
+    calls = [(name, points) for name in names]
+    calls += [(name, matrices) for name in ("covariance_to_sim", "covariance_to_scene", "gradient_to_scene")]
+    calls = [(name, value, value.cuda()) for name, value in calls]
+    for name, _, value in calls:
+        getattr(frame, name)(value)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        found = [getattr(frame, name)(value) for name, _, value in calls]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    for (name, value, _), result in zip(calls, found, strict=True):
+        torch.testing.assert_close(result.cpu(), getattr(frame, name)(value), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0.3, -0.7, 0.2]])

@@ -1,20 +1,27 @@
 """Frames from components: substeps, wind, cameras, colours and pictures."""
 
+import copy
 import dataclasses
 import math
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, WindField
 from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians import spherical_harmonics
 from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.base import finite_gaussians, make_renderer
 from gaussian_swaying.rendering.camera import LookAtCamera, OrbitCamera
-from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
+from gaussian_swaying.simulation import scene as scene_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, diagnose
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
@@ -341,6 +348,107 @@ def test_the_first_picture_is_that_of_the_splat(flag_ply, make_pipeline):
     state, _ = _advance(pipeline, 3)
     moved = pipeline.render(state, 0)
     assert float((moved.color - direct.color).square().mean()) > 100 * max(error, 1e-12)
+
+
+PICTURES = {
+    "plain": (None, {}),
+    "diffuse": (DiffuseShader([1.0, 0.5, 1.0], relative=True), {}),
+    "phong": (PhongShader([1.0, 0.5, 1.0], two_sided=True, relative=True), {"up": [0.0, -1.0, 0.0]}),
+    "part": (PhongShader(), {"region": Box([None] * 3, [0.6, None, None]), "up": [0.3, 1.0, 0.0]}),
+}
+
+
+class _Operations(TorchDispatchMode):
+    """Counts what would start a kernel on a GPU: all but views and what only takes memory."""
+
+    views = ("view", "_unsafe_view", "expand", "select", "slice", "unsqueeze", "squeeze", "transpose", "permute", "t.")
+    views += ("detach", "alias", "unbind", "as_strided", "split", "empty", "diagonal")
+
+    def __init__(self):
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += not str(function).removeprefix("aten.").startswith(self.views)
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_picture_takes_few_operations(name, degree, make_cloud, make_pipeline, monkeypatch):
+    """Each costs a GPU's host microseconds. What is one kernel there counts as one here."""
+    shader, settings = PICTURES[name]
+    pipeline = make_pipeline(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings)
+    state, camera = pipeline.start(), pipeline.camera_at(0)
+    monkeypatch.setattr(scene_module, "deform_all", lambda F, a, n, rotations: (a.neg(), n, F if rotations else None))
+    spherical_harmonics._basis_by_product(torch.ones(1, 3), degree)
+    monkeypatch.setattr(spherical_harmonics, "sh_basis", spherical_harmonics._basis_by_product)
+    pipeline.shade(state, camera)  # what is kept is made
+    with _Operations() as operations:
+        gaussians, colours = pipeline.shade(state, camera)
+    shading = operations.count
+    assert 10 < shading <= {"plain": 28, "diffuse": 42, "phong": 66, "part": 74}[name]
+    with _Operations() as operations:
+        finite_gaussians(gaussians.means, gaussians.covariances, pipeline.scene.model.opacity(), colours)
+    assert operations.count <= 4
+
+
+def _on_gpu(pipeline):
+    pipeline.to("cuda")
+    pipeline.renderer = make_renderer("cuda")
+    return pipeline
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_pipeline, monkeypatch):
+    """But in gsplat, which asks how many tiles the Gaussians touch: what happens in there is not looked at."""
+    gsplat = pytest.importorskip("gsplat")
+    shader, settings = PICTURES[name]
+    camera = OrbitCamera(width=64, height=36, degrees_per_second=100.0)
+    pipeline = make_pipeline(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings, camera=camera)
+    pipeline = _on_gpu(pipeline)
+    if not isinstance(pipeline.renderer, GsplatRenderer):
+        pytest.skip("gsplat cannot compile its kernels here")
+    state, rasterization = pipeline.start(), gsplat.rasterization
+
+    def let_wait(**arguments):
+        mode = torch.cuda.get_sync_debug_mode()
+        torch.cuda.set_sync_debug_mode("default")
+        try:
+            return rasterization(**arguments)
+        finally:
+            torch.cuda.set_sync_debug_mode(mode)
+
+    monkeypatch.setattr(gsplat, "rasterization", let_wait)
+    for frame in range(2):
+        pipeline.render(state, frame)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        pictures = [pipeline.render(state, frame) for frame in (2, 3)]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert float(pictures[0].alpha.mean()) > 0.01
+    assert not torch.equal(pictures[0].color, pictures[1].color)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_gpu_shades_as_the_cpu_does(name, make_cloud, make_pipeline):
+    shader, settings = PICTURES[name]
+    cloud = make_cloud(degree=3)
+    F = torch.eye(3) + 0.3 * torch.rand(40, 3, 3, generator=torch.Generator().manual_seed(3))
+    shaded = []
+    for place in ("cpu", "cuda"):
+        pipeline = make_pipeline(cloud, pinned=False, shader=copy.deepcopy(shader), scene=settings)
+        pipeline = _on_gpu(pipeline) if place == "cuda" else pipeline
+        state = pipeline.start()
+        state = state.replace(position=1.1 * state.position, F_total=F[: len(state.position)].to(place))
+        gaussians, colours = pipeline.shade(state, pipeline.camera_at(1))
+        shaded.append([colours, *(getattr(gaussians, n) for n in ("means", "covariances", "normals", "rotations"))])
+    for ours, theirs in zip(*shaded, strict=True):
+        torch.testing.assert_close(theirs.cpu(), ours, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("frame_dt", [0.0, -1.0, math.nan])

@@ -9,6 +9,7 @@ import torch
 from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.linalg import polar_rotation
 from gaussian_swaying.mpm.materials import NeoHookean, Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, cell_volume
@@ -102,6 +103,28 @@ def test_nothing_moves_at_rest(up, make_cloud, make_scene):
         assert torch.equal(deformed.means, scene.model.means)
         assert torch.equal(deformed.covariances, scene.rest_covariances)
         torch.testing.assert_close(deformed.normals, scene.rest_normals, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("up", UPS)
+@pytest.mark.parametrize("settings", [{}, {"region": LEFT}, {"region": LEFT, "opacity_threshold": 0.0}])
+def test_rotations_are_left_out_where_nobody_asks(up, settings, make_cloud, make_scene):
+    """And those that move are the same Gaussians whether they are all, in their order, or some."""
+    scene = make_scene(_faint_cloud(make_cloud) if settings else None, up=up, **settings)
+    assert scene.all_move == (not settings)
+    assert torch.equal(scene.moving, torch.cat([scene.simulated, scene.carried]))
+    facing = scene.frame.direction_to_sim(scene.rest_normals[scene.moving])
+    torch.testing.assert_close(scene.rest_facing, facing)
+    state = _rest_state(scene)
+    F = torch.eye(3) + 0.3 * torch.rand(scene.points.count, 3, 3, generator=torch.Generator().manual_seed(3))
+    state = state.replace(position=state.position + 0.2, F_total=F)
+    full, plain = scene.deformed(state), scene.deformed(state, rotations=False)
+    for name in ("means", "covariances", "normals"):
+        assert torch.equal(getattr(full, name), getattr(plain, name)), name
+        assert not torch.equal(getattr(full, name), getattr(scene.rest(), name)), name
+    assert torch.equal(plain.rotations, scene.rest().rotations)
+    turned = polar_rotation(scene.frame.gradient_to_scene(F))
+    torch.testing.assert_close(full.rotations[scene.simulated], turned)
+    assert not torch.equal(full.rotations, plain.rotations)
 
 
 @pytest.mark.parametrize("up", UPS)
