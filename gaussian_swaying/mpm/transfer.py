@@ -2,11 +2,17 @@ r"""Particle-grid transfers with quadratic B-splines as batched gather and scatt
 
 Both formulations of the solver go through :func:`scatter` and :func:`gather`; they differ only in the positions at
 which :func:`bspline_stencil` was built. This is the definition, on any device and differentiable.
+
+A weight is a product of three, one for each axis, and so is what takes its place in a gradient or a moment. The sums
+over the 27 nodes are therefore taken axis by axis, in three layers of nine nodes with the same x.
 """
 
 import math
-from dataclasses import dataclass
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,26 +23,59 @@ from gaussian_swaying.mpm.state import GridSpec
 
 @dataclass(frozen=True, slots=True)
 class Stencil:
-    """The 27 nodes around each particle.
+    """The 27 nodes around each particle, kept as the factors of their weights along the three axes.
 
     Attributes:
-        node: Flat index of the nodes over all scenes of the batch, shape (N * 27,), N particles in all scenes.
-        basis: For each particle the rows ``w``, then as asked for ``dw/dx``, ``dw/dy``, ``dw/dz`` and
-            ``w (x_i - x_p)`` (3 rows), shape (N, 4 or 7, 27).
+        first: Flat index, over all scenes of the batch, of the lowest of the nodes, shape (N,), N particles in all.
+        shift: What to add to it for the 27 nodes, shape (3, 3, 3), x first.
+        factors: Along each axis and at each of its three nodes the weight, then as asked for the derivative of the
+            weight and ``w (x_i - x_p)``, shape (1 to 3, 3 axes, 3 nodes, N).
         inside: Particles whose 27 nodes all lie in the grid, shape (..., P). The others have no weight.
         batch: Leading batch shape.
         node_count: Nodes G of one scene.
-        order: Order of the entries of ``node`` that sorts them, for sums that are the same in every run, or None.
+        order: Order of the entries of the three layers, joined, that sorts them, for sums that are the same in every
+            run, or None.
         start: Where the entries of each node begin in that order, shape (all nodes + 1,), or None.
+        matrices: ``basis`` as a sparse matrix from all nodes to the rows of all particles, and its transpose, for a
+            stencil that is used many times, or None.
     """
 
-    node: Tensor
-    basis: Tensor
+    first: Tensor
+    shift: Tensor
+    factors: Tensor
     inside: Tensor
     batch: tuple[int, ...]
     node_count: int
     order: Tensor | None = None
     start: Tensor | None = None
+    matrices: tuple[Tensor, Tensor] | None = None
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Stencil":
+        """Itself: nothing writes to a stencil, and PyTorch cannot copy a sparse matrix so."""
+        return self
+
+    def layer(self, i: int) -> Tensor:
+        """Flat index of the nine nodes with the ``i``-th x, shape (9 * N,), particles last."""
+        return (self.first + self.shift[i, :, :, None]).reshape(-1)
+
+    @property
+    def rows(self) -> int:
+        """Rows of ``basis``: ``w``, then as asked for ``dw/dx, dw/dy, dw/dz`` and ``w (x_i - x_p)`` (3 rows)."""
+        return 3 * len(self.factors) - 2
+
+    @property
+    def node(self) -> Tensor:
+        """Flat index of the nodes of each particle, shape (N * 27,)."""
+        return (self.first[:, None] + self.shift.reshape(-1)).reshape(-1)
+
+    @property
+    def basis(self) -> Tensor:
+        """The products of the factors, shape (N, rows, 27); no transfer forms them."""
+        products = []
+        for q, axis in [(0, 0), *((q, axis) for q in range(1, len(self.factors)) for axis in range(3))]:
+            x, y, z = (self.factors[q if axis == other else 0, other] for other in range(3))
+            products.append((x[:, None, None] * (y[:, None] * z)).reshape(27, -1))
+        return torch.stack(products).permute(2, 0, 1)
 
 
 def bspline_stencil(
@@ -46,6 +85,7 @@ def bspline_stencil(
     snap: float = 0.0,
     gradients: bool = True,
     deterministic: bool = False,
+    fixed: bool = False,
 ) -> Stencil:
     r"""Quadratic B-spline weights and their gradients (Jiang et al. 2016, "The material point method", eq. 123).
 
@@ -60,6 +100,8 @@ def bspline_stencil(
             that no node hangs by a vanishing mass alone.
         gradients: Also keep the gradients of the weights; MLS-MPM does without.
         deterministic: Also sort the nodes, so that sums over particles take the same order in every run on a GPU.
+        fixed: The stencil will be used many times: on a CPU, and without a gradient in ``position``, also keep
+            ``matrices``: 432 bytes for each row of each particle in float32, and transfers of a third of the time.
 
     Returns:
         The support of each particle.
@@ -75,45 +117,67 @@ def bspline_stencil(
     check_shape("position", position, "P", 3)
     dx = grid.dx
     batch = tuple(position.shape[:-2])
-    lattice = position.reshape(-1, 3) / dx
+    lattice = position.reshape(-1, 3).T / dx
     base = torch.floor(lattice.detach() - 0.5)
     f = lattice - base
     if snap > 0:
         f = torch.where(f - 0.5 < snap, 0.5, torch.where(1.5 - f < snap, 1.5, f))
     w = torch.stack([0.5 * (1.5 - f).square(), 0.75 - (f - 1).square(), 0.5 * (f - 0.5).square()], dim=1)
-    dw = torch.stack([f - 1.5, 2 - 2 * f, f - 0.5], dim=1) / dx
 
     offset, limit, strides, shift = _grid_constants(grid, position.device)
-    first = base.long() - offset
-    inside = ((first >= 0) & (first <= limit)).all(-1)
-    start = (torch.where(inside[:, None], first, 0) * strides).sum(-1)
+    low = base.long() - offset
+    inside = ((low >= 0) & (low <= limit)).all(0)
+    first = (torch.where(inside, low, 0) * strides).sum(0)
     if batch:
         scene = torch.arange(inside.numel(), device=position.device) // max(position.shape[-2], 1)
-        start = start + scene * grid.node_count
-    node = (start[:, None] + shift).reshape(-1)
+        first = first + scene * grid.node_count
 
-    w = w * inside[:, None, None]
-    dw = dw * inside[:, None, None]
-    (wx, wy, wz), (gx, gy, gz) = w.unbind(-1), dw.unbind(-1)
-
-    def product(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-        return (a[:, :, None, None] * (b[:, :, None] * c[:, None, :])[:, None]).reshape(-1, 27)
-
-    rows = [product(wx, wy, wz)]
+    w = w * inside
+    factors = [w]
     if gradients:
-        rows += [product(gx, wy, wz), product(wx, gy, wz), product(wx, wy, gz)]
+        factors.append(torch.stack([f - 1.5, 2 - 2 * f, f - 0.5], dim=1) / dx * inside)
     if moments:
         reach = torch.arange(3, device=f.device, dtype=f.dtype)
-        d = (reach[:, None] - f[:, None, :]) * dx
-        mx, my, mz = (w * d).unbind(-1)
-        rows += [product(mx, wy, wz), product(wx, my, wz), product(wx, wy, mz)]
-    order = border = None
-    if deterministic:
-        ranked, order = torch.sort(node, stable=True)
-        nodes = torch.arange(math.prod(batch) * grid.node_count + 1, device=node.device)
-        border = torch.searchsorted(ranked, nodes)
-    basis = torch.stack(rows, dim=1)
-    return Stencil(node, basis, inside.reshape(position.shape[:-1]), batch, grid.node_count, order, border)
+        factors.append(w * ((reach[:, None] - f[:, None]) * dx))
+    stencil = Stencil(first, shift, torch.stack(factors), inside.reshape(position.shape[:-1]), batch, grid.node_count)
+    if fixed and _sparse_products(stencil.factors):
+        return replace(stencil, matrices=_matrices(stencil))
+    if not deterministic:
+        return stencil
+    ranked, order = torch.sort(torch.cat([stencil.layer(i) for i in range(3)]), stable=True)
+    return replace(stencil, order=order, start=_borders(ranked, math.prod(batch) * grid.node_count))
+
+
+def _borders(ranked: Tensor, count: int) -> Tensor:
+    """Where each of ``count`` nodes begins among sorted ones, and their end; shape (count + 1,)."""
+    return torch.searchsorted(ranked, torch.arange(count + 1, device=ranked.device))
+
+
+def _sparse_products(factors: Tensor) -> bool:
+    """Whether the library's sparse products may serve: fast with indices of 32 bits, and constant in the gradient."""
+    few = 9 * factors.numel() < 2**31  # more than the entries
+    return factors.device.type == "cpu" and few and not factors.requires_grad and torch.backends.mkl.is_available()
+
+
+def _matrices(stencil: Stencil) -> tuple[Tensor, Tensor]:
+    """See ``Stencil.matrices``."""
+    rows, nodes = stencil.rows, math.prod(stencil.batch) * stencil.node_count
+    basis = stencil.basis.mT.reshape(-1, rows)  # an entry of ``node`` in a row
+    ranked, order = torch.sort(stencil.node, stable=True)
+    lines = len(stencil.first) * rows
+    column = stencil.node.reshape(-1, 1, 27).expand(-1, rows, 27)
+    particle_row = order[:, None] // 27 * rows + torch.arange(rows)
+    parts = (
+        (27 * torch.arange(lines + 1), column, basis.reshape(-1, 27, rows).mT, (lines, nodes)),
+        (rows * _borders(ranked, nodes), particle_row, basis[order], (nodes, lines)),
+    )
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
+        first, second = (
+            torch.sparse_csr_tensor(start.int(), index.flatten().int(), values.flatten(), size, check_invariants=False)
+            for start, index, values, size in parts
+        )
+    return first, second
 
 
 @lru_cache(maxsize=64)
@@ -121,12 +185,12 @@ def _grid_constants(grid: GridSpec, device: torch.device) -> tuple[Tensor, Tenso
     """Offset, largest first node, strides and the 27 shifts, kept on the device so that a step copies nothing to it."""
     nx, ny, nz = grid.resolution
     with torch.inference_mode(False):
-        offset = torch.tensor(grid.offset, device=device)
-        limit = torch.tensor([nx - 3, ny - 3, nz - 3], device=device)
-        strides = torch.tensor([ny * nz, nz, 1], device=device)
+        offset = torch.tensor(grid.offset, device=device)[:, None]
+        limit = torch.tensor([nx - 3, ny - 3, nz - 3], device=device)[:, None]
+        strides = torch.tensor([ny * nz, nz, 1], device=device)[:, None]
         reach = torch.arange(3, device=device)
         shift = reach[:, None, None] * (ny * nz) + reach[:, None] * nz + reach
-    return offset, limit, strides, shift.reshape(-1)
+    return offset, limit, strides, shift
 
 
 def scatter(stencil: Stencil, coefficients: Tensor) -> Tensor:
@@ -144,15 +208,32 @@ def scatter(stencil: Stencil, coefficients: Tensor) -> Tensor:
         Shape (..., G, K).
     """
     rows, columns = coefficients.shape[-2:]
-    flat = coefficients.reshape(-1, rows, columns)
-    values = torch.bmm(stencil.basis[:, :rows].mT, flat).reshape(-1, columns)
+    flat, nodes = coefficients.reshape(-1, rows, columns), math.prod(stencil.batch) * stencil.node_count
+    if stencil.matrices is not None:
+        if rows < stencil.rows:
+            flat = torch.nn.functional.pad(flat, (0, 0, 0, stencil.rows - rows))
+        out = _Product.apply(*reversed(stencil.matrices), flat.reshape(-1, columns))
+        return out.reshape(*stencil.batch, stencil.node_count, columns)
+    c = flat.permute(1, 2, 0).contiguous()  # particles last: every operation runs along them
+    (wx, wy, wz), kinds = stencil.factors[0], (rows - 1) // 3
+    z = wz[:, None] * c[0]
+    if kinds:
+        x, y, more = _products(stencil.factors[1 : 1 + kinds, :, :, None], c[1:].reshape(kinds, 3, 1, columns, -1))
+        z = z + more
+    layers, out = [], c.new_zeros(nodes, columns)
+    for i in range(3):
+        values = (wx[i] * wy)[:, None, None] * z
+        if kinds:
+            values = torch.addcmul(values, (wx[i] * y + x[i] * wy[:, None])[:, None], wz[:, None])
+        values = values.transpose(-1, -2).reshape(-1, columns)
+        if stencil.order is not None:
+            layers.append(values)
+        else:
+            # in place on a fresh tensor: differentiable, and half the memory traffic of the copying form
+            out = out.index_add_(0, stencil.layer(i), values)
     if stencil.order is not None:
-        ranked = values.index_select(0, stencil.order)
+        ranked = torch.cat(layers).index_select(0, stencil.order)
         out = torch.segment_reduce(ranked, "sum", offsets=stencil.start, unsafe=True, initial=0)
-    else:
-        out = values.new_zeros(math.prod(stencil.batch) * stencil.node_count, columns)
-        # in place on a fresh tensor: differentiable, and half the memory traffic of the copying form
-        out = out.index_add_(0, stencil.node, values)
     return out.reshape(*stencil.batch, stencil.node_count, columns)
 
 
@@ -168,8 +249,43 @@ def gather(field: Tensor, stencil: Stencil) -> Tensor:
         stencil has them.
     """
     columns = field.shape[-1]
-    values = field.reshape(-1, columns).index_select(0, stencil.node).reshape(-1, 27, columns)
-    return torch.bmm(stencil.basis, values).reshape(*stencil.inside.shape, -1, columns)
+    flat = field.reshape(-1, columns)
+    if stencil.matrices is not None:
+        return _Product.apply(*stencil.matrices, flat).reshape(*stencil.inside.shape, -1, columns)
+    x, y, z = stencil.factors.transpose(0, 2)[:, :, :, None].unbind(1)  # node, kind, 1, particle
+    value, along = [], []
+    for i in range(3):
+        values = flat.index_select(0, stencil.layer(i)).reshape(3, 3, -1, columns).transpose(-1, -2).contiguous()
+        columned = _products(z[:, :, None], values.transpose(0, 1))
+        value.append(_products(y, columned[0]))
+        along.append(_products(y[:, 0], columned[1:].transpose(0, 1)))
+    w = x[:, 0]
+    rows = [_products(w, [v[0] for v in value])[None]]
+    if stencil.rows > 1:
+        own = [_products(x[:, 1:], [v[0] for v in value]), _products(w, [v[1:] for v in value]), _products(w, along)]
+        rows.append(torch.stack(own, dim=1).flatten(0, 1))
+    return torch.cat(rows).permute(2, 0, 1).reshape(*stencil.inside.shape, -1, columns)
+
+
+def _products(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Tensor:
+    """Sum of products over the first dimension, one after the other: no product is kept."""
+    total = a[0] * b[0]
+    for k in range(1, len(a)):
+        total = torch.addcmul(total, a[k], b[k])
+    return total
+
+
+class _Product(torch.autograd.Function):
+    """Product of a constant sparse matrix, whose transpose is at hand, with a dense one."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor, transpose: Tensor, dense: Tensor) -> Tensor:
+        ctx.pair = (transpose, matrix)
+        return matrix @ dense
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, Tensor]:
+        return None, None, _Product.apply(*ctx.pair, grad.contiguous())
 
 
 def p2g(mass: Tensor, velocity: Tensor, affine: Tensor, stencil: Stencil) -> tuple[Tensor, Tensor]:
@@ -226,7 +342,7 @@ def scatter_momentum(
         Momentum [kg m/s] in columns 0 to 2 and mass [kg] in column 3, shape (..., G, 4).
     """
     count = mass.shape[-1]
-    if (stencil.basis.shape[1] == 4) != (mls_scale is not None):
+    if (stencil.rows == 4) != (mls_scale is not None):
         raise ValueError(
             "Expected a `stencil` without gradients for `mls_scale`, and with gradients and moments otherwise."
         )

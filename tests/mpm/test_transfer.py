@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, bounding_grid
@@ -190,10 +191,11 @@ def test_deterministic_sums_follow_the_order_of_the_particles(device):
     """The sum at a node is that of its particles one after the other, not of the order in which threads arrive."""
     position = torch.full((3, 3), 0.5, device=device)
     stencil = bspline_stencil(position, GRID, deterministic=True)
-    node = stencil.node.reshape(3, 27)
-    ranked = stencil.node[stencil.order].reshape(27, 3)
-    assert torch.equal(ranked, node[0].sort().values[:, None].expand(27, 3))
-    assert torch.equal(stencil.order.reshape(27, 3) // 27, torch.arange(3, device=device).expand(27, 3))
+    node = torch.cat([stencil.layer(i) for i in range(3)]).reshape(27, 3)
+    assert torch.equal(node.T.reshape(-1), stencil.node)
+    ranked = node.reshape(-1)[stencil.order].reshape(27, 3)
+    assert torch.equal(ranked, node[:, 0].sort().values[:, None].expand(27, 3))
+    assert torch.equal(stencil.order.reshape(27, 3) % 3, torch.arange(3, device=device).expand(27, 3))
 
 
 def test_deterministic_scatter_gradcheck(device):
@@ -225,6 +227,70 @@ def test_deterministic_runs_have_the_same_bits(formulation, device):
     for name in ("position", "velocity", "F_total", "affine"):
         assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))
     torch.testing.assert_close(ends[0].position, ends[2].position, rtol=0, atol=1e-5)
+
+
+# ---- stencils that are used many times
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
+def test_sparse_products_equal_the_plain_sums(dtype, batch):
+    """With first and second derivatives, particles outside the grid, and fewer rows than the stencil has."""
+    position = _particles("cpu", dtype, *batch, count=40)[0]
+    position[..., 0, :] = 5.0
+    plain, fixed = (bspline_stencil(position, GRID, moments=False, fixed=f) for f in (False, True))
+    assert plain.matrices is None
+    if not torch.backends.mkl.is_available():
+        pytest.skip("this PyTorch has no MKL, and so no sparse products")
+    assert fixed.matrices is not None
+    tol = 1e3 * torch.finfo(dtype).eps
+    for rows in (1, 4):
+        coefficients = torch.rand(*batch, 40, rows, 3, dtype=dtype, requires_grad=True)
+        field = torch.rand(*batch, GRID.node_count, 3, dtype=dtype, requires_grad=True)
+        found = []
+        for stencil in (plain, fixed):
+            sums, values = scatter(stencil, coefficients), gather(field, stencil)
+            loss = sums.square().sum() + (DX * values).square().sum() + (sums * field).sum()
+            first = torch.autograd.grad(loss, [coefficients, field], create_graph=True)
+            second = torch.autograd.grad(sum(g.square().sum() for g in first), [coefficients, field])
+            found.append([sums, values, *first, *second])
+        for a, b in zip(*found, strict=True):
+            torch.testing.assert_close(b, a, rtol=tol, atol=tol * max(1.0, float(a.detach().abs().max())))
+
+
+def test_no_sparse_products_where_the_weights_have_a_gradient():
+    position = _particles("cpu", torch.float64)[0].requires_grad_()
+    stencil = bspline_stencil(position, GRID, fixed=True)
+    assert stencil.matrices is None
+    (gradient,) = torch.autograd.grad(gather(torch.rand(GRID.node_count, 1).double(), stencil).sum(), position)
+    assert bool((gradient != 0).any())
+
+
+def test_second_derivatives_through_the_positions():
+    inputs = [t.requires_grad_() for t in _particles("cpu", torch.float64, count=2)]
+    assert torch.autograd.gradgradcheck(
+        lambda x, m, v, c: p2g(m, v, c, bspline_stencil(x, GRID))[1], inputs, fast_mode=True
+    )
+
+
+def test_transfers_keep_fewer_than_27_values_of_each_particle_at_a_time():
+    """Nine nodes at a time: the largest tensor of a scatter or gather, less what it is given and gives."""
+    count, columns = 5000, 3
+    position = _particles("cpu", torch.float32, count=count)[0]
+    stencil = bspline_stencil(position, GRID)
+    largest = 0
+
+    class Sizes(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, arguments=(), options=None):
+            nonlocal largest
+            out = function(*arguments, **(options or {}))
+            if isinstance(out, torch.Tensor):
+                largest = max(largest, out.numel())
+            return out
+
+    with Sizes(), torch.no_grad():
+        scatter(stencil, torch.rand(count, 7, columns))
+        gather(torch.rand(GRID.node_count, columns), stencil)
+    assert largest <= 21 * columns * count  # the coefficients and results are 7, a layer 9, both kinds of factors 18
 
 
 # ---- MLS-MPM
