@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from gaussian_swaying.aero.force import AeroForce, aero_force
+    from gaussian_swaying.aero.load import WindLoad
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
     from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
     from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "aero.force": ("AeroForce", "aero_force"),
+    "aero.load": ("WindLoad",),
     "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "UniformGust", "WindField"),
     "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
     "gaussians.selection": ("Box", "Cylinder", "Sphere"),
@@ -142,6 +144,7 @@ __all__ = [
     "UniformGust",
     "VelocityBox",
     "WindField",
+    "WindLoad",
     "aero_force",
     "load_trajectory",
     "read_ply",

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
+from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Impulse, Nodes
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
@@ -19,7 +21,11 @@ from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bound
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather, scatter, scatter_momentum
 
-ForceFunction = Callable[[MPMState], Tensor]
+if TYPE_CHECKING:
+    from gaussian_swaying.mpm.fused import FusedSolver
+
+ForceFunction = Callable[[MPMState], Tensor | tuple[Tensor, Tensor | None]]
+TRANSFERS = ("auto", "torch", "triton")
 
 
 class MPMSolver(nn.Module):
@@ -48,6 +54,12 @@ class MPMSolver(nn.Module):
         deterministic: On a GPU, sum in a fixed order, so that the same run gives the same bits; slower. On a CPU it is
             so anyway. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order, impulses first.
+        transfer: How substeps are computed. ``torch`` is the definition, on any device and with gradients; ``triton``
+            has a whole substep in two kernels on a CUDA device, in float32 and without gradients; ``auto`` takes
+            triton where it can.
+        compile: Compile stress and transfers with ``torch.compile``. The first substeps then take a minute or so, and
+            some again when the grid first changes or gradients are first asked for, but not for another ``dt``. No
+            second derivatives, and no ``checkpoint``.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -72,8 +84,13 @@ class MPMSolver(nn.Module):
         mls: bool = False,
         deterministic: bool = False,
         boundaries: Sequence[Boundary] = (),
+        transfer: str = "auto",
+        compile: bool = False,
     ) -> None:
         super().__init__()
+        check_choice("transfer", transfer, TRANSFERS)
+        if compile and transfer == "triton":
+            raise ValueError("The kernels of `transfer: triton` are compiled anyway: leave out `compile`.")
         check_positive("dx", dx)
         check_choice("formulation", formulation, ("total", "updated"))
         check_positive("damping", damping, allow_zero=True)
@@ -88,7 +105,8 @@ class MPMSolver(nn.Module):
         check_positive("max_nodes", max_nodes)
         self.dx, self.formulation, self.damping, self.cfl = float(dx), formulation, float(damping), float(cfl)
         self.stiffness_damping, self.mls, self.deterministic = float(stiffness_damping), mls, deterministic
-        self.substep, self.max_nodes = substep, int(max_nodes)
+        self.substep, self.max_nodes, self.compiled = substep, int(max_nodes), bool(compile)
+        self.transfer = transfer
         self.gravity = check_vector("gravity", gravity)
         # float64 on the device: no copy in a step, full precision in a float64 run
         self.register_buffer("_gravity", torch.tensor(self.gravity, dtype=torch.float64), persistent=False)
@@ -100,6 +118,8 @@ class MPMSolver(nn.Module):
         self._laws: LawDispatch | None = None
         self._static: dict[str, Tensor] = {}
         self._stencil: Stencil | None = None
+        self._fused: FusedSolver | None = None
+        self._fused_obstacle: str | None = None
         self._grid = GridSpec(self.dx, (0, 0, 0), (0, 0, 0))
 
     # ---- the object at rest
@@ -117,6 +137,13 @@ class MPMSolver(nn.Module):
         if self._laws is None:
             raise RuntimeError("The solver has no material yet: call `init_state(points)` first.")
         return self._laws
+
+    @property
+    def stencil(self) -> Stencil:
+        """The stencil of the particles at rest, in the ``total`` formulation."""
+        if self._stencil is None:
+            raise RuntimeError("The solver has no fixed stencil: it is of the total formulation and needs a material.")
+        return self._stencil
 
     @property
     def _acting(self) -> Sequence[Boundary]:
@@ -144,7 +171,10 @@ class MPMSolver(nn.Module):
                 f"The law {laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
                 "`solver.formulation` to updated, or choose an elastic law."
             )
-        self._points, self._laws, self._static = points, laws, {}
+        self._points, self._laws, self._static, self._fused = points, laws, {}, None
+        self._fused_obstacle = self._why_not_fused()
+        self._stress = self._built(laws.pk1 if self.total_lagrangian else laws.kirchhoff)
+        self._scatter_momentum, self._g2p = self._built(scatter_momentum), self._built(g2p)
         static, position, conditions = self._static, points.position, self._acting
         for k, boundary in enumerate(conditions):
             mask = boundary.particle_mask(position.detach())
@@ -159,9 +189,13 @@ class MPMSolver(nn.Module):
             return
         grid = self._bounding_grid(position, margin=0)
         snap = torch.finfo(position.dtype).eps ** 0.5
-        stencil = bspline_stencil(position, grid, moments=False, snap=snap, deterministic=self.deterministic)
+        stencil = bspline_stencil(position, grid, False, snap, deterministic=self.deterministic, fixed=True)
         mass = scatter(stencil, points.mass[..., None, None])[..., 0]
         self._stencil = stencil
+        # sparse products cannot be compiled, and are faster
+        sparse = stencil.matrices is not None
+        self._scatter = scatter if sparse else self._built(scatter)
+        self._gather = gather if sparse else self._built(gather)
         static["node_mass"] = mass
         static["node_inverse_mass"] = _safe_inverse(mass)
         if any(b.needs_position for b in conditions):
@@ -183,12 +217,60 @@ class MPMSolver(nn.Module):
                 static[f"share_{k}"] = share
         self._grid = grid
 
-    def _share(self, k: int, stencil: Stencil, inverse_mass: Tensor, time: Tensor | None) -> Tensor:
-        """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
+    def _built(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A pure function as it is, or compiled; the substep is no argument of any, so that it may change."""
+        return torch.compile(function, fullgraph=True) if self.compiled else function
+
+    def _why_not_fused(self) -> str | None:
+        """Why the Triton kernels cannot be used, whatever the state; None if they can."""
+        if self.transfer == "torch":
+            return "`transfer` is torch"
+        if self.compiled:
+            return "`compile` is set"
+        try:
+            from gaussian_swaying.mpm import fused
+        except ImportError as error:
+            obstacle: str | None = f"Triton cannot be imported ({error})"
+        else:
+            obstacle = fused.unsupported(self)
+        if self.transfer == "triton" and obstacle is not None:
+            raise ValueError(f"`transfer: triton` cannot be used, as {obstacle}: set it to auto or torch.")
+        return obstacle
+
+    def fused(self, *tensors: Tensor | None) -> FusedSolver | None:
+        """The Triton substep of this material; None where the torch one is to be used.
+
+        Args:
+            tensors: What the substep starts from; if one asks for a gradient, the torch substep is used.
+
+        Raises:
+            ValueError: If ``transfer`` is triton and a gradient is asked for.
+        """
+        if self._fused_obstacle is not None:
+            return None
+        if torch.is_grad_enabled():
+            points = self.points
+            own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
+            if any(t is not None and t.requires_grad for t in (*own, *tensors)):
+                if self.transfer == "triton":
+                    raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
+                return None
+        if self._fused is None:
+            from gaussian_swaying.mpm.fused import FusedTotal, FusedUpdated
+
+            self._fused = (FusedTotal if self.total_lagrangian else FusedUpdated)(self)
+        return self._fused
+
+    def held_mass(self, k: int, time: Tensor | None) -> Tensor:
+        """Mass of the particles that the ``k``-th boundary holds at a time [kg], zero elsewhere, shape (..., P)."""
         mass = self._static[f"pinned_mass_{k}"]
         if time is not None and f"release_{k}" in self._static:
             mass = torch.where(self._static[f"release_{k}"] > time + CLOCK, mass, 0.0)
-        return scatter(stencil, mass[..., None, None])[..., 0] * inverse_mass
+        return mass
+
+    def _share(self, k: int, stencil: Stencil, inverse_mass: Tensor, time: Tensor | None) -> Tensor:
+        """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
+        return scatter(stencil, self.held_mass(k, time)[..., None, None])[..., 0] * inverse_mass
 
     def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
         flat = position.detach().reshape(-1, 3)
@@ -244,7 +326,7 @@ class MPMSolver(nn.Module):
             velocity = torch.zeros_like(position)
         check_shape("velocity", velocity, points.count, 3)
         velocity = velocity.expand_as(position)
-        identity = torch.eye(3, dtype=position.dtype, device=position.device).expand(*position.shape[:-1], 3, 3)
+        identity = torch.eye(3, dtype=position.dtype, device=position.device).repeat(*position.shape[:-1], 1, 1)
         state = MPMState(
             position=position,
             velocity=velocity,
@@ -255,6 +337,7 @@ class MPMSolver(nn.Module):
             time=torch.zeros((), dtype=torch.float64, device=position.device),
             grid=self._grid if self.total_lagrangian else self._bounding_grid(position, margin),
             internal=self.laws.initial_internal(),
+            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
         )
         if not self.total_lagrangian:
             return state
@@ -318,6 +401,12 @@ class MPMSolver(nn.Module):
     def _cells_per_second(self, state: MPMState) -> Tensor:
         """How many cells the fastest wave crosses in a second."""
         F = state.F_elastic.detach()
+        if self._fused_obstacle is None:
+            from gaussian_swaying.mpm.fused import largest_speed
+
+            cells = largest_speed(self, state)
+            if cells is not None:
+                return cells
         speed = wave_speed(self.points, F, state.internal, spatial=not self.total_lagrangian, laws=self._laws)
         return cfl_number(1.0, self.dx, speed, None if self.total_lagrangian else state.velocity).detach()
 
@@ -342,8 +431,6 @@ class MPMSolver(nn.Module):
     def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.
 
-        A VelocityBox is the exception: it copies the corners of its region to the device.
-
         Where the substep changes, forces act for the mean of the old and the new one: the velocities stand half a
         substep beside the positions, and the full new one would jolt them (an error of first order, and energy). A
         substep that shrinks to less than a third is the exception: forces then act for twice the new one.
@@ -362,19 +449,43 @@ class MPMSolver(nn.Module):
             check_shape("force", force, self.points.count, 3)
         if drag is not None:
             check_shape("drag", drag, self.points.count)
+        fused = self.fused(*_tensors(state), force, drag)
+        if fused is not None:
+            return fused.rollout(state, dt, 1, force=force, drag=drag)
         advance = self._step_total if self.total_lagrangian else self._step_updated
-        return advance(state, dt, force, drag)
+        after = advance(state, dt, force, drag)
+        return after if force is None else after.replace(work=self._work(state, after, dt, force, drag))
+
+    @torch.no_grad()
+    def _work(self, state: MPMState, after: MPMState, dt: float, force: Tensor, drag: Tensor | None) -> Tensor:
+        """Work of the external force up to the end of a substep [J].
+
+        It is counted at the mean velocity: exactly what the step adds to the kinetic energy.
+        """
+        if drag is not None:
+            force = force - drag[..., None] * (after.velocity - state.velocity)
+        power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum(-1)
+        return state.work + (0.5 * self.kick(state, dt)) * power
 
     def rollout(
-        self, state: MPMState, dt: float, steps: int, force_fn: ForceFunction | None = None, checkpoint: int = 0
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        force_fn: ForceFunction | WindLoad | None = None,
+        checkpoint: int = 0,
     ) -> MPMState:
         """Advance by several substeps.
+
+        With the Triton kernels the substeps are replayed from CUDA graphs, without wind or in that of a ``WindLoad``;
+        another ``force_fn`` is called once a substep.
 
         Args:
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            force_fn: Gives the force of each substep [N], shape (..., P, 3), from its state.
+            force_fn: Gives the force of each substep [N], shape (..., P, 3), from its state, or the force and its drag
+                (see :meth:`step`).
             checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
                 in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
                 ``force_fn`` must then give the same force each time it sees the same state.
@@ -382,17 +493,35 @@ class MPMSolver(nn.Module):
         Returns:
             The state ``steps * dt`` later.
         """
+        load = force_fn if isinstance(force_fn, WindLoad) else None
+        if force_fn is None or load is not None:
+            patches = () if load is None else (load.normal, load.area)
+            fused = self.fused(*_tensors(state), *patches)
+            if fused is not None:
+                return fused.rollout(state, dt, steps, load)
+        winds = None if load is None else load.winds(state.time, dt, steps)
 
-        def advance(state: MPMState, count: int) -> MPMState:
-            for _ in range(count):
-                state = self.step(state, dt, None if force_fn is None else force_fn(state))
+        def force_at(state: MPMState, k: int) -> tuple[Tensor | None, Tensor | None]:
+            if load is not None:
+                assert winds is not None
+                return load.force(state, winds[k])
+            found = None if force_fn is None else force_fn(state)
+            return found if isinstance(found, tuple) else (found, None)
+
+        def advance(state: MPMState, first: int, count: int) -> MPMState:
+            for k in range(first, first + count):
+                state = self.step(state, dt, *force_at(state, k))
             return state
 
         if checkpoint <= 0 or not torch.is_grad_enabled():
-            return advance(state, steps)
+            return advance(state, 0, steps)
+        if self.compiled:
+            raise ValueError(
+                "Compiled substeps keep what their gradient needs: set `compile` or `checkpoint`, not both."
+            )
         for first in range(0, steps, checkpoint):
             count = min(checkpoint, steps - first)
-            state = recompute(partial(advance, count=count), state)
+            state = recompute(partial(advance, first=first, count=count), state)
         return state
 
     @staticmethod
@@ -407,12 +536,12 @@ class MPMSolver(nn.Module):
         assert displacement is not None
         points, static, laws = self.points, self._static, self.laws
         F = state.F_elastic
-        stress = laws.pk1(F, None)
+        stress = self._stress(F, None)
         if self.stiffness_damping > 0:
             stress = stress + kelvin_voigt_pk1(F, state.affine, laws.mu, laws.lam, self.stiffness_damping)
         stress = stress * points.volume[..., None, None]
         value = torch.zeros_like(state.position) if force is None else force
-        node_force = scatter(self._stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
+        node_force = self._scatter(self._stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
         inverse_mass = static["node_inverse_mass"][..., None]
         kick, yielding = self.kick(state, dt), None
         if drag is not None:
@@ -426,14 +555,16 @@ class MPMSolver(nn.Module):
             position = static["node_rest"] + scatter(self._stencil, shift[..., None, :]) * inverse_mass
         if any(b.needs_lattice for b in self._acting):
             lattice = state.grid.node_positions(velocity) + displacement
-        velocity = self._constrain(velocity, self._stencil, inverse_mass[..., 0], position, lattice, state.time, dt)
+        inverse = inverse_mass[..., 0]
+        share = partial(self._share, stencil=self._stencil, inverse_mass=inverse, time=state.time)
+        velocity = self._constrain(velocity, share, position, lattice, state.time, dt)
         state = state.replace(time=state.time + dt, substep=dt)
         return self._read_particles(state, displacement + dt * velocity, velocity)
 
     def _read_particles(self, state: MPMState, displacement: Tensor, velocity: Tensor) -> MPMState:
         """Particle fields of the ``total`` formulation, interpolated from the nodes."""
         assert self._stencil is not None
-        rows = gather(torch.cat([displacement, velocity], dim=-1), self._stencil)
+        rows = self._gather(torch.cat([displacement, velocity], dim=-1), self._stencil)
         F = rows[..., 1:4, :3].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
         return state.replace(
             position=self.points.position + rows[..., 0, :3],
@@ -449,17 +580,20 @@ class MPMSolver(nn.Module):
         points, laws = self.points, self.laws
         stencil = bspline_stencil(state.position, state.grid, gradients=not self.mls, deterministic=self.deterministic)
         F = state.F_elastic
-        stress = laws.kirchhoff(F, state.internal)
+        stress = self._stress(F, state.internal)
         if self.stiffness_damping > 0:
             rate = matmul3(state.affine, F)
             viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, self.stiffness_damping)
             stress = stress + matmul3(viscous, F.mT)
         kick = self.kick(state, dt)
         impulse = None if force is None else kick * force
+        if any(self.gravity):  # here, and not on the nodes, of which most may be empty
+            weight = kick * points.mass[..., None] * self._gravity.to(F)
+            impulse = weight if impulse is None else impulse + weight
         if drag is not None:
             held = (kick * drag)[..., None] * state.velocity
             impulse = held if impulse is None else impulse + held
-        nodes = scatter_momentum(
+        nodes = self._scatter_momentum(
             points.mass,
             state.velocity,
             state.affine,
@@ -473,13 +607,14 @@ class MPMSolver(nn.Module):
         if drag is not None:
             yielding = 1 / (1 + kick * scatter(stencil, drag[..., None, None]) * inverse_mass)
             velocity = velocity * yielding
-        velocity = self._accelerate(velocity, None, kick, yielding)
-        velocity = torch.where(inverse_mass > 0, velocity, 0.0)
+        if self.damping > 0:
+            velocity = velocity * math.exp(-self.damping * kick)
         position = None
         if any(b.needs_position or b.needs_lattice for b in self._acting):
             position = state.grid.node_positions(velocity).expand_as(velocity)
-        velocity = self._constrain(velocity, stencil, inverse_mass[..., 0], position, position, state.time, dt)
-        new_velocity, affine, gradient = g2p(velocity, stencil, self.dx)
+        share = partial(self._share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
+        velocity = self._constrain(velocity, share, position, position, state.time, dt)
+        new_velocity, affine, gradient = self._g2p(velocity, stencil, self.dx)
         identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         update = identity + dt * gradient
         F, internal = matmul3(update, F), state.internal
@@ -499,18 +634,14 @@ class MPMSolver(nn.Module):
             substep=dt,
         )
 
-    def _accelerate(
-        self, velocity: Tensor, acceleration: Tensor | None, dt: float, yielding: Tensor | None = None
-    ) -> Tensor:
-        """Apply the given acceleration, gravity and damping to node velocities.
+    def _accelerate(self, velocity: Tensor, acceleration: Tensor, dt: float, yielding: Tensor | None = None) -> Tensor:
+        """Apply the given acceleration, gravity and damping to node velocities of the ``total`` formulation.
 
         ``yielding`` is mass over mass plus implicit drag times ``dt``, shape (..., G, 1).
         """
-        if acceleration is not None:
-            velocity = velocity + dt * (acceleration if yielding is None else yielding * acceleration)
         if any(self.gravity):
-            gravity = self._gravity.to(velocity)
-            velocity = velocity + dt * (gravity if yielding is None else yielding * gravity)
+            acceleration = acceleration + self._gravity.to(velocity)
+        velocity = velocity + dt * (acceleration if yielding is None else yielding * acceleration)
         if self.damping > 0:
             velocity = velocity * math.exp(-self.damping * dt)
         return velocity
@@ -518,21 +649,22 @@ class MPMSolver(nn.Module):
     def _constrain(
         self,
         velocity: Tensor,
-        stencil: Stencil,
-        inverse_mass: Tensor,
+        share_of: Callable[[int], Tensor],
         position: Tensor | None,
         lattice: Tensor | None,
         time: Tensor,
-        dt: float,
+        dt: float | Tensor,
     ) -> Tensor:
-        """Apply the boundary conditions to node velocities, in order."""
+        """Apply the boundary conditions to node velocities, in order.
+
+        ``share_of(k)`` is the share of the nodal mass that the particles of the ``k``-th one hold, shape (..., G).
+        """
         static = self._static
         # what pushes comes before what holds, in whatever order they were given
         for k, boundary in sorted(enumerate(self._acting), key=lambda pair: not isinstance(pair[1], Impulse)):
             share = None
             if f"pinned_mass_{k}" in static:
-                share = static.get(f"share_{k}")
-                share = self._share(k, stencil, inverse_mass, time) if share is None else share
+                share = static[f"share_{k}"] if f"share_{k}" in static else share_of(k)
             threshold = (boundary.held_share or 0.0) if self.total_lagrangian else 0.0
             held_mass = static.get(f"held_mass_{k}")
             velocity = boundary(velocity, Nodes(time, dt, position, lattice, share, threshold, held_mass))
@@ -576,6 +708,12 @@ class MPMSolver(nn.Module):
 
 def _conditions(modules: nn.ModuleList) -> list[Boundary]:
     return [b for b in modules if isinstance(b, Boundary)]
+
+
+def _tensors(state: MPMState) -> list[Tensor]:
+    """The floating-point fields of a state."""
+    fields = [state.position, state.velocity, state.affine, state.F_elastic, state.F_total, state.internal]
+    return [t for t in (*fields, state.node_displacement, state.node_velocity) if t is not None]
 
 
 def _safe_inverse(mass: Tensor) -> Tensor:

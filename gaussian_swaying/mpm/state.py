@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -210,6 +210,7 @@ class MPMState:
         internal: The internal variable of each particle's plastic law (see its class), shape (..., P), or None if no
             law has one.
         substep: Length of the substep that led here [s]; 0 at the start.
+        work: Work of the external forces since the start [J], shape (...) over the batch, float64.
     """
 
     position: Tensor
@@ -224,6 +225,7 @@ class MPMState:
     node_velocity: Tensor | None = None
     internal: Tensor | None = None
     substep: float = 0.0
+    work: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
 
     def replace(self, **changes: Any) -> MPMState:
         """A copy with some fields changed."""

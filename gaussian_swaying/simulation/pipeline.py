@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,9 +19,10 @@ from tqdm import tqdm
 import gaussian_swaying
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
+from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
@@ -31,7 +33,6 @@ from gaussian_swaying.simulation.diagnostics import (
     SimulationDiverged,
     TearingGauge,
     check_spacing,
-    check_state,
     diagnose,
 )
 from gaussian_swaying.simulation.recorder import Recorder
@@ -104,13 +105,10 @@ class SimulationPipeline(nn.Module):
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
 
-    def force(self, state: MPMState, wind: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Wind force on every particle [N], shape (..., P, 3), at an air velocity [m/s] of shape (3,).
-
-        With it the resistance of a semi-implicit drag [kg/s], shape (..., P), or None.
-        """
-        normal, area = deform_patch(state.F_total, self.scene.patch_normal, self.scene.patch_area)
-        return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
+    @property
+    def load(self) -> WindLoad:
+        """The wind on the patches of the scene."""
+        return WindLoad(self.aero, self.wind, self.scene.patch_normal, self.scene.patch_area)
 
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
         """Advance by one frame.
@@ -134,7 +132,7 @@ class SimulationPipeline(nn.Module):
                 if steps > self._most_substeps:
                     cause = f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest"
                     self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
-                end, work, cfl = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
+                end, cfl = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 outrun = bool((end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any())
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
                 if retry == MAX_RETRIES or not (outrun or too_long):
@@ -147,12 +145,12 @@ class SimulationPipeline(nn.Module):
         except (FloatingPointError, ValueError) as error:
             # a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN
             self._give_up(state, str(error).rstrip("."))
-        check_state(self.solver, end)
+        health = diagnose(self.solver, end, steps, cfl, (end.work - state.work).sum(), self._tearing, check=True)
         if not cfl <= MAX_CFL:
             self._give_up(
                 end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
             )
-        return end, diagnose(self.solver, end, steps, cfl, work, self._tearing)
+        return end, health
 
     def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, blaming the particle with the largest deformation."""
@@ -165,31 +163,16 @@ class SimulationPipeline(nn.Module):
     def _substeps(self, state: MPMState) -> int:
         return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
 
-    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor, float]:
-        """The state some substeps later, the work of the wind on the way [J], and the largest Courant number."""
+    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, float]:
+        """The state some substeps later, and the largest Courant number on the way."""
         dt = self.frame_dt / steps
-        work = torch.zeros((), dtype=torch.float64, device=self.device)
-        idle = self.aero.idle
-        if not idle:
-            offsets = torch.arange(steps, dtype=torch.float64, device=self.device) * dt
-            winds = self.wind(state.time + offsets)
-        looks = {math.ceil((k + 1) * steps / CFL_SAMPLES) for k in range(CFL_SAMPLES)}
+        load = None if self.aero.idle else self.load
+        looks = sorted({math.ceil((k + 1) * steps / CFL_SAMPLES) for k in range(CFL_SAMPLES)})
         cfls = []
-        for k in range(steps):
-            if idle:
-                state = self.solver.step(state, dt)
-            else:
-                force, drag = self.force(state, winds[k])
-                after = self.solver.step(state, dt, force, drag)
-                if drag is not None:
-                    force = force - drag[..., None] * (after.velocity - state.velocity)
-                # at the mean velocity: exactly what the step adds to the kinetic energy
-                power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum()
-                work = work + (0.5 * self.solver.kick(state, dt)) * power
-                state = after
-            if k + 1 in looks:
-                cfls.append(self.solver.cfl_number(state, dt))
-        return state, work, float(torch.stack(cfls).amax())
+        for first, last in pairwise([0, *looks]):
+            state = self.solver.rollout(state, dt, last - first, load)
+            cfls.append(self.solver.cfl_number(state, dt))
+        return state, float(torch.stack(cfls).amax())
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
@@ -207,10 +190,13 @@ class SimulationPipeline(nn.Module):
     # ---- picture
 
     def camera_at(self, frame: int) -> Camera:
-        """The camera of a frame, on the device."""
+        """The camera of a frame, on the device and in the precision of the Gaussians; one copy, which nobody awaits."""
+        return self._camera(frame).to(self.device, self.scene.model.means.dtype)
+
+    def _camera(self, frame: int) -> Camera:
+        """The camera of a frame, in float64 on the host."""
         scene = self.scene
-        up = scene.frame.rotation[2]
-        return self.camera(frame, frame * self.frame_dt, scene.center, up, scene.size).to(self.device)
+        return self.camera(frame, frame * self.frame_dt, scene.center, scene.frame.rotation[2], scene.size)
 
     def check_camera(self, frame: int) -> None:
         """Raise ValueError if the camera of a frame lies inside the box of the object at rest.
@@ -219,7 +205,7 @@ class SimulationPipeline(nn.Module):
         """
         if isinstance(self.camera, TransformsCamera):
             return
-        camera, (low, high) = self.camera_at(frame), self.scene.bounds
+        camera, (low, high) = self._camera(frame), self.scene.bounds
         eye = camera.position.to(low)
         if bool(((eye > low) & (eye < high)).all()):
             raise ValueError(
@@ -232,21 +218,21 @@ class SimulationPipeline(nn.Module):
         """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
         scene = self.scene
         view = torch.nn.functional.normalize(gaussians.means - camera.position.to(gaussians.means), dim=-1)
-        at_rest = (view[:, None, :] @ gaussians.rotations)[:, 0, :]
+        at_rest = (view[..., None] * gaussians.rotations).sum(-2) if scene.model.view_dependent else view
         colours = scene.model.colors(at_rest)
         if self.shader is None:
             return colours
-        moving = torch.cat([scene.simulated, scene.carried])
-        normal = scene.frame.direction_to_sim(gaussians.normals[moving])
-        rest = scene.frame.direction_to_sim(scene.rest_normals[moving])
-        to_eye = -scene.frame.direction_to_sim(view[moving])
-        colours = colours.clone()
-        colours[moving] = self.shader(colours[moving], normal, rest_normal=rest, view_direction=to_eye)
-        return colours
+        index = scene.moving
+        parts = (colours, gaussians.normals, view)
+        if not scene.all_move:
+            parts = (colours[index], gaussians.normals[index], view[index])
+        normal, to_eye = (scene.frame.direction_to_sim(part) for part in (parts[1], -parts[2]))
+        shaded = self.shader(parts[0], normal, rest_normal=scene.rest_facing, view_direction=to_eye)
+        return shaded if scene.all_move else colours.index_copy(0, index, shaded)
 
     def shade(self, state: MPMState, camera: Camera) -> tuple[DeformedGaussians, Tensor]:
         """Deformed Gaussians in scene units and their colours (N, 3)."""
-        gaussians = self.scene.deformed(state)
+        gaussians = self.scene.deformed(state, rotations=self.scene.model.view_dependent)
         return gaussians, self.colors(gaussians, camera)
 
     def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
@@ -260,23 +246,24 @@ class SimulationPipeline(nn.Module):
         gaussians, colours = self.shade(state, camera)
         return self.draw(gaussians, colours, camera)
 
-    def export(self, gaussians: DeformedGaussians, path: Path) -> None:
-        """Write deformed Gaussians as a 3DGS .ply that any splat viewer opens, harmonics turned with the patches."""
+    def cloud(self, gaussians: DeformedGaussians) -> GaussianCloud:
+        """Deformed Gaussians in storage form, harmonics turned with the patches."""
         from gaussian_swaying.gaussians.spherical_harmonics import rotate_sh
 
         cloud = self.scene.model.to_cloud()
         quats, scales = covariance_to_quat_scale(gaussians.covariances)
-        write_ply(
-            path,
-            GaussianCloud(
-                means=gaussians.means,
-                quats=quats,
-                scales=scales,
-                opacities=cloud.opacities,
-                sh=rotate_sh(cloud.sh, gaussians.rotations),
-                normals=gaussians.normals,
-            ).to("cpu"),
+        return GaussianCloud(
+            means=gaussians.means,
+            quats=quats,
+            scales=scales,
+            opacities=cloud.opacities,
+            sh=rotate_sh(cloud.sh, gaussians.rotations),
+            normals=gaussians.normals,
         )
+
+    def export(self, gaussians: DeformedGaussians, path: Path) -> None:
+        """Write deformed Gaussians as a 3DGS .ply that any splat viewer opens, harmonics turned with the patches."""
+        write_ply(path, self.cloud(gaussians))
 
     # ---- the run
 
@@ -313,7 +300,7 @@ class SimulationPipeline(nn.Module):
         for frame in range(frames):
             self.check_camera(frame)
         state = self.start()  # what is refused is refused before anything is written
-        checkpoint = recorder.open(output, config, resume)
+        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt)
         first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
         if checkpoint is not None:
             state = MPMState.from_state_dict(checkpoint["state"], self.device)
@@ -348,12 +335,14 @@ class SimulationPipeline(nn.Module):
                                 "state": state.state_dict(),
                                 "log": log,
                                 "config": config,
-                                "wall_s": dict(walls.seconds),
+                                "wall_s": walls.read(),
                             }
                         )
                 done = frame + 1
                 bar.update()
                 bar.set_postfix(substeps=health.substeps, moved=f"{health.displacement_mean:.3f} m")
+            with walls("writing"):
+                recorder.wait()
         except SimulationDiverged as error:
             status, reason = "diverged", str(error)
             raise
@@ -366,17 +355,17 @@ class SimulationPipeline(nn.Module):
         finally:
             bar.close()
             summary: dict[str, Any] = {"status": status, "reason": reason}
-            summary |= self._summary(state, log, frames, walls, peak) | (settings or {})
+            summary |= self._summary(state, log[:done], frames, walls, peak) | (settings or {})
             # the video of a run that was stopped early is made too: nothing that was recorded is lost
             self.files = []
             try:
                 with walls("writing"):
-                    self.files = recorder.close(done, summary, 1 / self.frame_dt)
+                    self.files = recorder.close(done, summary)
             except OSError as error:
                 if status == "complete":
                     raise
                 print(f"{error}", file=sys.stderr)  # what stopped the run matters more
-        summary["wall_s"] = dict(walls.seconds)
+        summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
 
@@ -393,7 +382,8 @@ class SimulationPipeline(nn.Module):
                 recorder.write_image(frame, image)
         with walls("writing"):
             if exporting:
-                recorder.write_ply(frame, lambda path: self.export(gaussians, path))
+                cloud = self.cloud(gaussians)
+                recorder.write_ply(frame, lambda path: write_ply(path, cloud))
             if recorder.trajectory:
                 recorder.write_trajectory(frame, state.position, state.F_total)
 
@@ -419,7 +409,7 @@ class SimulationPipeline(nn.Module):
             "frame_dt_s": self.frame_dt,
             "substeps": int(sum(entry["substeps"] for entry in log)),
             "simulated_s": float(state.time),
-            "wall_s": dict(walls.seconds),
+            "wall_s": walls.read(wait=True),
             "peak_memory_bytes": peak.read(),
             "energy_start_J": energy[0] if energy else None,
             "energy_end_J": energy[-1] if energy else None,
@@ -435,21 +425,44 @@ class SimulationPipeline(nn.Module):
 
 
 class _Walls:
-    """Seconds spent in each part of the run; waits for the GPU at the borders."""
+    """Seconds spent in each part of the run.
+
+    Simulation, shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the
+    host need not wait there. Writing: how long the main thread was kept by the recorder, not what its threads did
+    meanwhile.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.seconds = {"simulation": 0.0, "shading": 0.0, "rendering": 0.0, "writing": 0.0}
+        self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     @contextmanager
     def __call__(self, part: str) -> Iterator[None]:
-        start = time.perf_counter()
+        if self.device.type == "cuda" and part != "writing":
+            stream = torch.cuda.current_stream(self.device)
+            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            start.record(stream)
+            try:
+                yield
+            finally:
+                end.record(stream)
+                self._events.append((part, start, end))
+            return
+        begin = time.perf_counter()
         try:
             yield
         finally:
-            if self.device.type == "cuda":
-                torch.cuda.synchronize(self.device)
-            self.seconds[part] += time.perf_counter() - start
+            self.seconds[part] += time.perf_counter() - begin
+
+    def read(self, wait: bool = False) -> dict[str, float]:
+        """The seconds of each part [s], without what a GPU has still to do unless asked to wait for it."""
+        if wait and self._events:
+            self._events[-1][2].synchronize()
+        while self._events and self._events[0][2].query():
+            part, start, end = self._events.pop(0)
+            self.seconds[part] += start.elapsed_time(end) / 1000
+        return dict(self.seconds)
 
 
 class _PeakMemory:

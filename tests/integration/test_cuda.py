@@ -6,11 +6,20 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.mpm.boundary import EnclosingBox, PinnedRegion, Plane
+from gaussian_swaying.gaussians.selection import Box, Cylinder, Everything, Not, Sphere, Union
+from gaussian_swaying.mpm.boundary import (
+    EnclosingBox,
+    Handle,
+    Impulse,
+    PinnedRegion,
+    Plane,
+    SequentialRelease,
+    VelocityBox,
+)
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.config import main
+from gaussian_swaying.simulation.frame import SimFrame
 from gaussian_swaying.simulation.recorder import load_trajectory
 
 pytestmark = pytest.mark.gpu
@@ -49,16 +58,23 @@ def test_resume(tmp_path):
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_a_step_never_makes_the_host_wait(formulation):
+    scene = torch.rand(500, 3, device="cuda")
+    frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.3), metres_per_unit=2.0)
     points = MaterialPoints.create(
-        torch.rand(500, 3, device="cuda"), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
+        frame.point_to_sim(scene), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
     )
+    corner, ball, rod = Box([None, None, 0.8], [None] * 3), Sphere([0, 0, 0], 0.5), Cylinder([1, 1, 1], [1, 2, 0], 1, 1)
     boundaries = [
-        PinnedRegion(Box([None, None, 0.8], [None, None, None])),
+        PinnedRegion(corner),
+        Handle(corner, [0.1, 0, 0], [0, 0, 1], [0.5, 0.5, 0.5]),
+        SequentialRelease(ball, [1, 0, 0]),
+        Impulse(ball, [0, 0, 0.1]),
         Plane([0, 0, -1], [0, 0, 1]),
         EnclosingBox([-2, -2, -2], [3, 3, 3]),
+        *(VelocityBox(region, [0, 0, 0.1]) for region in (corner, ball, rod, Union([ball, rod]), Not(Everything()))),
     ]
-    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=boundaries)
-    state = solver.step(solver.init_state(points), 1e-4)
+    solver = MPMSolver(dx=0.2, formulation=formulation, boundaries=boundaries)
+    state = solver.step(solver.init_state(points, frame=frame), 1e-4)
     torch.cuda.set_sync_debug_mode("error")
     try:
         end = solver.step(state, 1e-4, torch.zeros(500, 3, device="cuda"))

@@ -1,5 +1,6 @@
 """What a user of the package as a whole relies on: names, light imports, the rule for GPU tests, shipped files."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -43,6 +44,8 @@ def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in sorted((ROOT / "gaussian_swaying").rglob("*.py"))
     ]
+    if importlib.util.find_spec("triton") is None:  # comes with CUDA builds of torch
+        modules = [m for m in modules if not m.endswith(("_triton", ".fused"))]
     assert len(modules) > 25
     heavy = [
         "gsplat",

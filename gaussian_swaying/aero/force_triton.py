@@ -1,0 +1,56 @@
+"""The force of the wind as a Triton function, for the fused substep; the definition is ``aero.force.aero_force``."""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.mpm.linalg_triton import cofactor, cross3, dot3
+
+
+@triton.jit
+def deform_patch(F, n, area):
+    """Unit normal and area after a deformation, as ``gaussians.surface.deform_patch``."""
+    cof = cofactor(F)
+    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    x = cof[0] * n[0] + cof[1] * n[1] + cof[2] * n[2]
+    y = cof[3] * n[0] + cof[4] * n[1] + cof[5] * n[2]
+    z = cof[6] * n[0] + cof[7] * n[1] + cof[8] * n[2]
+    size = tl.sqrt(x * x + y * y + z * z)
+    flat = size == 0
+    scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
+    normal = (tl.where(flat, n[0], x * scale), tl.where(flat, n[1], y * scale), tl.where(flat, n[2], z * scale))
+    return normal, size * area
+
+
+@triton.jit
+def aero_force(
+    relative, n, area, drag, friction, lift, half_density,
+    PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
+):  # fmt: skip
+    """Force on a patch in a relative wind, and the relative speed."""
+    speed = tl.sqrt(dot3(relative, relative))
+    along = dot3(relative, n)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    tx = relative[0] - along * n[0]
+    ty = relative[1] - along * n[1]
+    tz = relative[2] - along * n[2]
+    if PROJECTED:
+        pressure = drag * speed * along  # sign times sign is one
+    else:
+        pressure = drag * speed * speed * sign
+    shear = friction * speed
+    if UNIT:
+        shear = shear * speed / tl.maximum(tl.sqrt(tx * tx + ty * ty + tz * tz), 1.2e-38)
+    across = cross3(relative, n)
+    if LIFT:
+        side = cross3(across, relative)
+        lifting = lift * sign
+    else:
+        side = across
+        lifting = lift * speed * sign
+    scale = half_density * area
+    force = (
+        scale * (pressure * n[0] + shear * tx + lifting * side[0]),
+        scale * (pressure * n[1] + shear * ty + lifting * side[1]),
+        scale * (pressure * n[2] + shear * tz + lifting * side[2]),
+    )
+    return force, speed

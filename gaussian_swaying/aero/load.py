@@ -1,0 +1,75 @@
+"""The wind on the patches of a body, as a load for ``MPMSolver.rollout``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_shape
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.gaussians.surface import deform_patch
+
+if TYPE_CHECKING:
+    from gaussian_swaying.mpm.state import MPMState
+
+
+class WindLoad:
+    """Wind on surface patches that deform with their particles.
+
+    ``MPMSolver.rollout`` takes it as ``force_fn``. It knows what the force depends on, so on a GPU the whole of it is
+    computed within the substep's own kernels.
+
+    Args:
+        aero: Coefficients and law of the force.
+        wind: The air, or one for each scene of a batch.
+        normal: Unit normals of the patches at rest, shape (..., P, 3).
+        area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind.
+
+    Raises:
+        ValueError: If the shapes do not agree, or there are not as many winds as scenes.
+
+    Example:
+        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
+        >>> load = WindLoad(AeroForce(C_F=0.0, C_L=0.0), WindField([0.0, 0.0, 2.0]), up, torch.ones(1))
+        >>> load.winds(torch.zeros((), dtype=torch.float64), dt=1e-3, steps=4).shape
+        torch.Size([4, 3])
+    """
+
+    def __init__(self, aero: AeroForce, wind: WindField | Sequence[WindField], normal: Tensor, area: Tensor) -> None:
+        check_shape("normal", normal, "P", 3)
+        check_shape("area", area, normal.shape[-2])
+        self.aero, self.normal, self.area = aero, normal, area
+        self.wind = wind if isinstance(wind, WindField) else tuple(wind)
+        if isinstance(self.wind, tuple) and normal.shape[:-2] != (len(self.wind),):
+            raise ValueError(
+                f"Expected one `wind` for each of the {tuple(normal.shape[:-2])} scenes, but got {len(self.wind)}."
+            )
+
+    def winds(self, time: Tensor, dt: float, steps: int) -> Tensor:
+        """Air velocity at the start of each of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on [m/s].
+
+        Returns:
+            Shape (steps, 3), or (steps, B, 1, 3) with a wind for each scene; float64.
+        """
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        if isinstance(self.wind, WindField):
+            return self.wind(times)
+        return torch.stack([wind(times) for wind in self.wind], dim=1)[:, :, None]
+
+    def force(self, state: MPMState, wind: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Force on every particle [N] (..., P, 3), and the resistance of a semi-implicit drag [kg/s] (..., P) or None.
+
+        Args:
+            state: The state at the start of the substep.
+            wind: Air velocity [m/s], broadcastable to (..., P, 3).
+        """
+        normal, area = deform_patch(state.F_total, self.normal, self.area)
+        return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
+
+    def __call__(self, state: MPMState) -> tuple[Tensor, Tensor | None]:
+        """:meth:`force` in the wind of ``state.time``."""
+        return self.force(state, self.winds(state.time, 0.0, 1)[0])

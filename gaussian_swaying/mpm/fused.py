@@ -1,0 +1,543 @@
+"""Runs substeps with the Triton kernels: buffers, the order of particles, CUDA graphs.
+
+Used by ``MPMSolver`` in place of its torch substep where no gradient is asked for; the torch substep is the definition.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.load import WindLoad
+from gaussian_swaying.mpm import transfer_triton as kernels
+from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.materials import FixedCorotated
+from gaussian_swaying.mpm.materials_triton import PLASTIC_KINDS, law_row
+from gaussian_swaying.mpm.state import GridSpec, MPMState
+
+if TYPE_CHECKING:
+    from gaussian_swaying.mpm.solver import MPMSolver
+
+MAX_STEPS = 256
+"""Substeps whose schedule the buffers hold; longer rollouts are run in parts."""
+
+RESORT = 32
+"""Substeps of ``updated`` after which the particles are sorted by cell again."""
+
+GRAPHS = (16, 4, 1)
+"""Numbers of substeps for which a graph is kept; a rollout is put together from them."""
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def unsupported(solver: MPMSolver) -> str | None:
+    """Why these kernels cannot run the solver's material, or None if they can."""
+    points = solver.points
+    if not (points.position.is_cuda or (INTERPRETED and solver.transfer == "triton")):
+        return "it needs a CUDA device"
+    if points.position.dtype != torch.float32:
+        return f"it computes in float32, and the material is {points.position.dtype}".replace("torch.", "")
+    if solver.deterministic and not solver.total_lagrangian:
+        return "in the updated formulation its sums have no fixed order, as `deterministic` asks for"
+    for law in points.laws:
+        if law_row(law) is None:
+            return f"the law {type(law).__name__} has no fused form"
+    return None
+
+
+class FusedSolver(ABC):
+    """Substeps of one solver with its material.
+
+    Args:
+        solver: Bound to its material; see :func:`unsupported`.
+    """
+
+    def __init__(self, solver: MPMSolver) -> None:
+        points = solver.points
+        self.solver, self.device = solver, points.position.device
+        self.particles = points.count
+        self.count = points.mass.numel()
+        self.scenes = self.count // max(self.particles, 1)
+        rows = [law_row(law) for law in points.laws]
+        table = [[float(row[0]), *row[1]] for row in rows if row is not None]
+        self.law_table = torch.tensor(table, device=self.device)
+        self.kinds = 0
+        for row in table:
+            self.kinds |= int(row[0])
+        self.law = torch.zeros(self.count, dtype=torch.int32, device=self.device)
+        if points.law_index is not None:
+            self.law = points.law_index.reshape(-1).int()
+        self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self.schedule = torch.zeros(MAX_STEPS + 2, kernels.SCHEDULE, device=self.device)
+        self.winds = torch.zeros(MAX_STEPS, self.scenes, 3, device=self.device)
+        self.coefficients = torch.zeros(4, device=self.device)
+        self.load = torch.zeros(8, self.count, device=self.device)
+        self.force_in = torch.zeros(0, 4, device=self.device)
+        self.time = torch.zeros((), dtype=torch.float64, device=self.device)
+        self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
+        self.gravity = [float(g) for g in solver.gravity]
+        self._patch_of: tuple[Tensor, Tensor] | None = None
+        self._graphs: dict[Any, dict[int, torch.cuda.CUDAGraph] | None] = {}
+        self._pool: Any = None
+
+    def rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        load: WindLoad | None = None,
+        force: Tensor | None = None,
+        drag: Tensor | None = None,
+    ) -> MPMState:
+        """Advance by ``steps`` substeps of ``dt`` [s], in wind or with a force that stays (see ``MPMSolver.step``)."""
+        limit = MAX_STEPS if self.solver.total_lagrangian else RESORT
+        while steps > 0:
+            part = min(steps, limit)
+            state = self._advance(state, dt, part, load, force, drag)
+            steps -= part
+        return state
+
+    def _advance(
+        self, state: MPMState, dt: float, steps: int, load: WindLoad | None, force: Tensor | None, drag: Tensor | None
+    ) -> MPMState:
+        """One part of a rollout."""
+        solver = self.solver
+        kick = solver.kick(state, dt)
+        decay = [math.exp(-solver.damping * t) for t in (kick, dt)]
+        rows = [[0.0, dt, 1.0, 0.0], [kick, dt, decay[0], 0.0], *[[dt, dt, decay[1], 0.0]] * steps]
+        self.schedule[: steps + 2].copy_(_upload(rows, self.device), non_blocking=True)
+        self.first_step.zero_()
+        self.time.copy_(state.time)
+        self.dt.fill_(dt)
+        options: dict[str, Any] = {
+            "KINDS": self.kinds,
+            "MULTI": len(self.law_table) > 1,
+            "VISCOUS": solver.stiffness_damping > 0,
+            "WIND": load is not None,
+            "FORCE": force is not None or drag is not None,
+            "IMPLICIT": drag is not None,
+            "PROJECTED": False,
+            "LIFT": False,
+            "UNIT": False,
+        }
+        if load is not None:
+            aero = load.aero
+            options["IMPLICIT"] = aero.drag_step == "semi_implicit"
+            options["PROJECTED"] = aero.law == "projected"
+            options["LIFT"] = aero.lift_direction == "lift"
+            options["UNIT"] = aero.unit_tangent
+            half = torch.full_like(aero.C_D, 0.5 * aero.air_density)
+            self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half]))
+            winds = load.winds(state.time, dt, steps)
+            self.winds[:steps].copy_(winds.reshape(steps, -1, 3).expand(-1, self.scenes, -1))
+            if self._patch_of is None or self._patch_of[0] is not load.normal or self._patch_of[1] is not load.area:
+                self._patch_of = (load.normal, load.area)
+                self._take_patches(load.normal.reshape(-1, 3), load.area.reshape(-1))
+        if options["FORCE"]:
+            self.force_in = torch.zeros(self.count, 4, device=self.device)
+            if force is not None:
+                self.force_in[:, :3] = force.reshape(-1, 3)
+            if drag is not None:
+                self.force_in[:, 3] = drag.reshape(-1)
+        if load is not None or options["FORCE"]:
+            self.load.zero_()
+        self._run(state, steps, options)
+        changes = self._read(state, steps, options)
+        if load is not None or options["FORCE"]:
+            changes["work"] = state.work + self._work().reshape(state.work.shape)
+        return state.replace(time=state.time + steps * dt, substep=dt, **changes)
+
+    @abstractmethod
+    def _take_patches(self, normal: Tensor, area: Tensor) -> None:
+        """Take the patches of a load, shapes (N, 3) and (N,)."""
+
+    @abstractmethod
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any]) -> None:
+        """Take the state into the buffers and run the substeps."""
+
+    @abstractmethod
+    def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
+        """The fields of the state after the substeps."""
+
+    @abstractmethod
+    def _work(self) -> Tensor:
+        """Work of the load in each scene [J], shape (scenes,), float64."""
+
+    def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
+        """Run ``body(offset)``, one substep, for each offset, from graphs where there are any.
+
+        The first time a key is seen the substeps run as they are, which compiles what is not yet compiled; the second
+        time they are recorded.
+        """
+
+        def several(count: int) -> None:
+            for offset in range(count):
+                body(offset)
+            self.first_step.add_(count)
+
+        if self.device.type != "cuda" or key not in self._graphs:
+            self._graphs[key] = None
+            for _ in range(steps):
+                several(1)
+            return
+        graphs = self._graphs[key]
+        if graphs is None:
+            graphs = self._graphs[key] = {}
+            while len(self._graphs) > 16:  # grids that were left behind
+                del self._graphs[next(iter(self._graphs))]
+        for size in GRAPHS:
+            while steps >= size:
+                if size not in graphs:
+                    graphs[size] = self._record(lambda size=size: several(size))  # type: ignore[misc]
+                graphs[size].replay()
+                steps -= size
+
+    def _record(self, work: Callable[[], None]) -> torch.cuda.CUDAGraph:
+        """A graph of what ``work`` launches; all graphs share one pool, as no two run at once."""
+        graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(self.device)
+        stream.wait_stream(torch.cuda.current_stream(self.device))
+        if self._pool is None:
+            self._pool = torch.cuda.graph_pool_handle()
+        with torch.cuda.stream(stream):
+            # other threads, that of the recorder say, may go on meanwhile
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                work()
+            finally:
+                graph.capture_end()
+        torch.cuda.current_stream(self.device).wait_stream(stream)
+        return graph
+
+
+class FusedTotal(FusedSolver):
+    """Substeps of the ``total`` formulation; everything but the nodal fields is constant."""
+
+    def __init__(self, solver: MPMSolver) -> None:
+        super().__init__(solver)
+        points, stencil, static = solver.points, solver.stencil, solver._static
+        grid = solver._grid
+        self.grid = grid
+        first = stencil.first
+        order = torch.argsort(first, stable=True)
+        cells, sizes = torch.unique_consecutive(first[order], return_counts=True)
+        self.order, self.cells = order.int(), len(cells)
+        ends = sizes.cumsum(0)
+        self.cell_start = torch.cat([ends.new_zeros(1), ends]).int()
+        self.cell_node = cells.int()
+        self.cell_scene = (cells // grid.node_count).int()
+        self.particle_cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), sizes).int()
+        # the place in the cell, from the slope of the first weight, (f - 1.5) / dx
+        self.fraction = (1.5 + stencil.factors[1, :, 0] * grid.dx)[:, order].contiguous()
+        rows = [points.volume, solver.laws.mu, solver.laws.lam, points.mass]
+        self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
+        self.law = self.law[order].contiguous()
+        self.patch = torch.zeros(4, self.count, device=self.device)
+        self.rest = points.position.contiguous()
+        inverse = static["node_inverse_mass"].reshape(-1)
+        active = (inverse > 0).nonzero()[:, 0]
+        self.active, self.inverse_mass = active.int(), inverse[active].contiguous()
+        place = torch.full((len(inverse),), self.cells, dtype=torch.int32, device=self.device)
+        place[cells] = torch.arange(self.cells, dtype=torch.int32, device=self.device)
+        _, ny, nz = grid.resolution
+        shifts = [(i * ny + j) * nz + k for i in range(3) for j in range(3) for k in range(3)]
+        below = [active - shift for shift in shifts]
+        self.source = torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below])
+        self.displacement = torch.zeros(len(inverse), 4, device=self.device)
+        self.velocity = torch.zeros(len(inverse), 4, device=self.device)
+        self.lanes = _lanes(sizes)
+        acting = solver._acting
+        self.plain = all(type(b) is PinnedRegion and b.start <= 0 and b.end == math.inf for b in acting)
+        self.position = any(b.needs_position for b in acting)
+        self.lattice = grid.node_positions(self.rest) if any(b.needs_lattice for b in acting) else None
+        held = torch.zeros(len(inverse), dtype=torch.bool, device=self.device)
+        if self.plain:
+            for k, boundary in enumerate(acting):
+                held |= (static[f"share_{k}"] > (boundary.held_share or 0.0)).reshape(-1)
+        self.held = held[active].to(torch.int8)
+        self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
+        self._partial: dict[int, Tensor] = {}
+
+    def _take_patches(self, normal: Tensor, area: Tensor) -> None:
+        order = self.order.long()
+        self.patch[:3].copy_(normal.T[:, order])
+        self.patch[3].copy_(area[order])
+
+    def _sums(self, width: int) -> Tensor:
+        """Buffer of the sums of each cell, with a row of zeros behind the last."""
+        if width not in self._partial:
+            self._partial[width] = torch.zeros(27, self.cells + 1, width, device=self.device)
+        return self._partial[width]
+
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any]) -> None:
+        assert state.node_displacement is not None
+        assert state.node_velocity is not None
+        self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
+        self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
+        key = tuple(options.values())
+        if options["FORCE"]:  # its buffer is another one each time
+            for _ in range(steps):
+                self._substep(0, options)
+                self.first_step.add_(1)
+        else:
+            self._repeat(steps, key, lambda offset: self._substep(offset, options))
+
+    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+        solver = self.solver
+        width = 8 if self.position else 4
+        partial = self._sums(width)
+        _, ny, nz = self.grid.resolution
+        per_program = max(1, 32 // self.lanes)
+        kernels.total_particles[(-(-self.cells // per_program),)](
+            self.fraction, self.material, self.law, self.law_table, self.patch, self.force_in, self.load, self.order,
+            self.count, self.cell_start, self.cell_node, self.cell_scene, self.cells,
+            self.displacement, self.velocity, partial,
+            self.schedule, self.winds, self.scenes, self.coefficients, self.first_step, offset,
+            ny * nz, nz, 1 / self.grid.dx, solver.stiffness_damping,
+            **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
+        )  # fmt: skip
+        block = 64
+        nodes = len(self.active)
+        kernels.total_nodes[(-(-nodes // block),)](
+            self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
+            self.displacement, self.velocity, self.shift, self.schedule, self.first_step, offset, *self.gravity,
+            IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width, HELD=self.plain and solver._acting,
+            MOVE=self.plain, BLOCK=block, num_warps=2,
+        )  # fmt: skip
+        if not self.plain:
+            self._constrain()
+
+    def _constrain(self) -> None:
+        """Boundary conditions that the kernels do not know, and the displacements after them."""
+        solver, static = self.solver, self.solver._static
+        shape = (*static["node_inverse_mass"].shape, 3)
+        velocity = self.velocity[:, :3].reshape(shape)
+        position = lattice = None
+        if self.position:
+            position = static["node_rest"] + self.shift[:, :3].reshape(shape)
+        if self.lattice is not None:
+            lattice = self.lattice + self.displacement[:, :3].reshape(shape)
+        inverse = static["node_inverse_mass"]
+        velocity = solver._constrain(
+            velocity, lambda k: solver._share(k, solver.stencil, inverse, self.time), position, lattice, self.time,
+            self.dt,
+        )  # fmt: skip
+        self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
+        self.displacement.addcmul_(self.velocity, self.dt.float())
+        self.time.add_(self.dt)
+
+    def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
+        shape = state.position.shape
+        position, velocity = (torch.empty(shape, device=self.device) for _ in range(2))
+        affine, F = (torch.empty(*shape, 3, device=self.device) for _ in range(2))
+        _, ny, nz = self.grid.resolution
+        block = 128
+        kernels.total_read[(-(-self.count // block),)](
+            self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
+            self.displacement, self.velocity, self.schedule[steps], position, velocity, affine, F,
+            ny * nz, nz, 1 / self.grid.dx,
+            WORK=options["WIND"] or options["FORCE"], IMPLICIT=options["IMPLICIT"], BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        nodes = (*self.solver._static["node_inverse_mass"].shape, 3)
+        return {
+            "position": position,
+            "velocity": velocity,
+            "affine": affine,
+            "F_elastic": F,
+            "F_total": F,
+            "node_displacement": self.displacement[:, :3].reshape(nodes).contiguous(),
+            "node_velocity": self.velocity[:, :3].reshape(nodes).contiguous(),
+        }
+
+    def _work(self) -> Tensor:
+        return self.load[0].double().reshape(self.scenes, self.particles).sum(1)  # cells are sorted by scene
+
+
+class FusedUpdated(FusedSolver):
+    """Substeps of the ``updated`` formulation; particles are sorted by cell at the start of each part."""
+
+    def __init__(self, solver: MPMSolver) -> None:
+        super().__init__(solver)
+        points = solver.points
+        self.plastic = bool(self.kinds & PLASTIC_KINDS.value)
+        self.moving = torch.zeros(44 if self.plastic else 35, self.count, device=self.device)
+        self.constants = torch.zeros(self.count, 9, device=self.device)
+        rows = [points.mass, points.volume, solver.laws.mu, solver.laws.lam, self.law]
+        self.constants[:, :5] = torch.stack([row.reshape(-1).float() for row in rows], dim=1)
+        self.scene = torch.arange(self.count, device=self.device) // max(self.particles, 1)
+        self.order = torch.zeros(self.count, dtype=torch.int32, device=self.device)
+        self.momentum = torch.zeros(0, 4, device=self.device)
+        self.velocity = torch.zeros(0, 4, device=self.device)
+        self.inverse_mass = torch.zeros(0, device=self.device)
+        self.weight = torch.zeros(0, device=self.device)
+        self.node_position: Tensor | None = None
+        self.grid = GridSpec(solver.dx, (0, 0, 0), (0, 0, 0))
+
+    def _take_patches(self, normal: Tensor, area: Tensor) -> None:
+        self.constants[:, 5:8] = normal
+        self.constants[:, 8] = area
+
+    def _take_grid(self, grid: GridSpec, width: int) -> None:
+        """Make room for a grid, and forget the graphs of a smaller one."""
+        nodes = grid.node_count * self.scenes
+        if nodes > len(self.velocity) or width != self.momentum.shape[1]:
+            room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
+            self.momentum = torch.zeros(room, width, device=self.device)
+            self.velocity = torch.zeros(room, 4, device=self.device)
+            held = room if len(self.solver._acting) else 0
+            self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
+            self._graphs.clear()
+        if grid != self.grid:
+            self.grid, self.node_position = grid, None
+            if any(b.needs_position or b.needs_lattice for b in self.solver._acting):
+                self.node_position = grid.node_positions(self.velocity)
+
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any]) -> None:
+        self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
+        grid = state.grid
+        place = (state.position.reshape(-1, 3) / grid.dx - 0.5).floor_().int()
+        (ox, oy, oz), (nx, ny, nz) = grid.offset, grid.resolution
+        x, y, z = place.unbind(-1)
+        key = ((x - ox).clamp(0, nx) * (ny + 1) + (y - oy).clamp(0, ny)) * (nz + 1) + (z - oz).clamp(0, nz)
+        if self.scenes > 1:
+            key = key + self.scene.int() * ((nx + 1) * (ny + 1) * (nz + 1))
+        self.order.copy_(torch.argsort(key))
+        block = 128
+        programs = (-(-self.count // block),)
+        internal = state.internal is not None
+        kernels.updated_load[programs](
+            self.order, state.position.contiguous(), state.velocity.contiguous(), state.affine.contiguous(),
+            state.F_elastic.contiguous(), state.F_total.contiguous(), state.lost.contiguous(),
+            state.internal.contiguous() if state.internal is not None else self.load, self.constants, self.moving,
+            self.count, PLASTIC=self.plastic, INTERNAL=internal, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        self._particles(0, options, gather=False, scatter=True)
+        if options["FORCE"]:
+            for _ in range(steps - 1):
+                self._substep(0, options)
+                self.first_step.add_(1)
+        elif steps > 1:
+            key_of_graph = (*options.values(), grid)
+            self._repeat(steps - 1, key_of_graph, lambda offset: self._substep(offset, options))
+        self._nodes(0, options)
+        self._particles(1, options, gather=True, scatter=False)
+
+    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+        self._nodes(offset, options)
+        self._particles(offset + 1, options, gather=True, scatter=True)
+
+    def _particles(self, offset: int, options: dict[str, Any], gather: bool, scatter: bool) -> None:
+        grid, solver = self.grid, self.solver
+        kernels.updated_particles[(-(-self.count // 32),)](
+            self.moving, self.order, self.load, self.count,
+            self.momentum, self.velocity, self.schedule, self.winds, self.scenes, self.coefficients, self.first_step,
+            offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx, 1 / grid.dx,
+            solver.stiffness_damping, self.particles,
+            **options, PLASTIC=self.plastic, MLS=solver.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
+            SCATTER=scatter, num_warps=1,
+        )  # fmt: skip
+
+    def _nodes(self, offset: int, options: dict[str, Any]) -> None:
+        grid, solver = self.grid, self.solver
+        nodes = grid.node_count * self.scenes
+        block = 256
+        acting = solver._acting
+        kernels.updated_nodes[(-(-nodes // block),)](
+            self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
+            *self.gravity, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=len(acting) > 0,
+            BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        if not acting:
+            return
+        shape = (*solver.points.position.shape[:-2], grid.node_count)
+        velocity = self.velocity[:nodes, :3].reshape(*shape, 3)
+        position = self.node_position
+        if position is not None:
+            position = position.expand_as(velocity)
+        velocity = solver._constrain(velocity, self._share, position, position, self.time, self.dt)
+        self.velocity[:nodes, :3].copy_(velocity.reshape(-1, 3))
+        self.time.add_(self.dt)
+
+    def _share(self, k: int) -> Tensor:
+        """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
+        grid, static = self.grid, self.solver._static
+        mass = self.solver.held_mass(k, self.time)
+        nodes = grid.node_count * self.scenes
+        weight = self.weight[:nodes].zero_()
+        block = 128
+        kernels.pin_mass[(-(-self.count // block),)](
+            self.moving, self.order, mass.contiguous(), weight, self.count, *grid.offset, *grid.resolution, grid.dx,
+            self.particles, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        shape = (*static[f"pinned_mass_{k}"].shape[:-1], grid.node_count)
+        return (weight * self.inverse_mass[:nodes]).reshape(shape)
+
+    def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
+        position, velocity = (torch.empty(state.position.shape, device=self.device) for _ in range(2))
+        affine, F = (torch.empty(state.F_elastic.shape, device=self.device) for _ in range(2))
+        F_total = torch.empty_like(F) if self.plastic else F
+        lost = torch.empty(state.lost.shape, dtype=torch.bool, device=self.device)
+        internal = None if state.internal is None else torch.empty(state.internal.shape, device=self.device)
+        block = 128
+        kernels.updated_read[(-(-self.count // block),)](
+            self.order, self.moving, self.count, position, velocity, affine, F, F_total, lost,
+            self.load if internal is None else internal,
+            PLASTIC=self.plastic, INTERNAL=internal is not None, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        return {
+            "position": position,
+            "velocity": velocity,
+            "affine": affine,
+            "F_elastic": F,
+            "F_total": F_total,
+            "lost": lost,
+            "internal": internal,
+        }
+
+    def _work(self) -> Tensor:
+        return torch.zeros(self.scenes, dtype=torch.float64, device=self.device).index_add_(
+            0, self.scene[self.order.long()], self.load[0].double()
+        )
+
+
+def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
+    """Cells per second as ``MPMSolver`` needs them for the Courant number, in one kernel; None for other laws."""
+    points, spatial = solver.points, not solver.total_lagrangian
+    if len(points.laws) > 1 or type(points.laws[0]) is not FixedCorotated:
+        return None
+    out = torch.zeros(1, device=points.position.device)
+    count, block = points.mass.numel(), 128
+    density = points.mass / points.volume
+    kernels.largest_speed[(-(-count // block),)](
+        state.F_elastic.contiguous(), density.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(),
+        state.velocity.contiguous(), out, count, SPATIAL=spatial, BLOCK=block, num_warps=4,
+    )  # fmt: skip
+    return out[0] / solver.dx
+
+
+def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
+    """A small table on the device, without making the host wait."""
+    table = torch.tensor(rows, dtype=torch.float32)
+    return table.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else table
+
+
+def _lanes(sizes: Tensor) -> int:
+    """Lanes per cell for which the warps of all cells have the least to do (one synchronisation)."""
+    best, least = 32, math.inf
+    for lanes in (4, 8, 16, 32, 64):
+        chunks = float((-(-sizes // lanes)).sum())
+        per_lane = max(1, lanes // 32)
+        warps = chunks * min(lanes, 32) / 32
+        # some 1200 instructions for a particle, and two for each of 81 sums and each halving of the lanes
+        cost = warps * (1200 * per_lane + 162 * math.log2(min(lanes, 32)))
+        if cost < least:
+            best, least = lanes, cost
+    return best
+
+
+__all__ = ["FusedSolver", "FusedTotal", "FusedUpdated", "unsupported"]
