@@ -57,8 +57,8 @@ class WindLoad:
         """
         times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
         if isinstance(self.wind, WindField):
-            return self.wind(times)
-        return torch.stack([wind(times) for wind in self.wind], dim=1)[:, :, None]
+            return self.wind(times).to(time.device)
+        return torch.stack([wind(times) for wind in self.wind], dim=1)[:, :, None].to(time.device)
 
     def force(self, state: MPMState, wind: Tensor) -> tuple[Tensor, Tensor | None]:
         """Force on every particle [N] (..., P, 3), and the resistance of a semi-implicit drag [kg/s] (..., P) or None.

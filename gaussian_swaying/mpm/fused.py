@@ -5,10 +5,11 @@ Used by ``MPMSolver`` in place of its torch substep where no gradient is asked f
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -79,6 +80,9 @@ class FusedSolver(ABC):
         self.coefficients = torch.zeros(4, device=self.device)
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
+        self.watches = [type(law) for law in points.laws] == [FixedCorotated]
+        """Whether rollouts can look at the speed of waves."""
+        self.speed = torch.zeros(1, device=self.device)
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in solver.gravity]
@@ -94,19 +98,40 @@ class FusedSolver(ABC):
         load: WindLoad | None = None,
         force: Tensor | None = None,
         drag: Tensor | None = None,
-    ) -> MPMState:
-        """Advance by ``steps`` substeps of ``dt`` [s], in wind or with a force that stays (see ``MPMSolver.step``)."""
-        limit = MAX_STEPS if self.solver.total_lagrangian else RESORT
-        while steps > 0:
-            part = min(steps, limit)
-            state = self._advance(state, dt, part, load, force, drag)
-            steps -= part
-        return state
+        looks: Sequence[int] = (),
+    ) -> tuple[MPMState, Tensor]:
+        """Advance by ``steps`` substeps of ``dt`` [s], in wind or with a force that stays (see ``MPMSolver.step``).
+
+        Args:
+            state: The state now.
+            dt: Substep [s].
+            steps: Number of substeps.
+            load: The wind, or None.
+            force: Force [N], shape (..., P, 3), or None.
+            drag: Its resistance [kg/s], shape (..., P), or None.
+            looks: After which substeps to look at the speed of waves, if ``watches``.
+
+        Returns:
+            The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
+        """
+        self.speed.zero_()
+        for first in range(0, steps, MAX_STEPS):
+            part = min(steps - first, MAX_STEPS)
+            marks = [look - first for look in looks if first < look <= first + part]
+            state = self._advance(state, dt, part, load, force, drag, marks)
+        return state, self.speed[0] / self.solver.dx
 
     def _advance(
-        self, state: MPMState, dt: float, steps: int, load: WindLoad | None, force: Tensor | None, drag: Tensor | None
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        load: WindLoad | None,
+        force: Tensor | None,
+        drag: Tensor | None,
+        looks: list[int],
     ) -> MPMState:
-        """One part of a rollout."""
+        """As many substeps as the buffers hold."""
         solver = self.solver
         kick = solver.kick(state, dt)
         decay = [math.exp(-solver.damping * t) for t in (kick, dt)]
@@ -115,6 +140,7 @@ class FusedSolver(ABC):
         self.first_step.zero_()
         self.time.copy_(state.time)
         self.dt.fill_(dt)
+        loaded = load is not None or force is not None or drag is not None
         options: dict[str, Any] = {
             "KINDS": self.kinds,
             "MULTI": len(self.law_table) > 1,
@@ -127,43 +153,41 @@ class FusedSolver(ABC):
             "UNIT": False,
         }
         if load is not None:
-            aero = load.aero
-            options["IMPLICIT"] = aero.drag_step == "semi_implicit"
-            options["PROJECTED"] = aero.law == "projected"
-            options["LIFT"] = aero.lift_direction == "lift"
-            options["UNIT"] = aero.unit_tangent
-            half = torch.full_like(aero.C_D, 0.5 * aero.air_density)
-            self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half]))
-            winds = load.winds(state.time, dt, steps)
-            self.winds[:steps].copy_(winds.reshape(steps, -1, 3).expand(-1, self.scenes, -1))
-            if self._patch_of is None or self._patch_of[0] is not load.normal or self._patch_of[1] is not load.area:
-                self._patch_of = (load.normal, load.area)
-                self._take_patches(load.normal.reshape(-1, 3), load.area.reshape(-1))
-        if options["FORCE"]:
+            self._take_wind(load, load.winds(state.time, dt, steps))
+            options["IMPLICIT"] = load.aero.drag_step == "semi_implicit"
+            options["PROJECTED"] = load.aero.law == "projected"
+            options["LIFT"] = load.aero.lift_direction == "lift"
+            options["UNIT"] = load.aero.unit_tangent
+        elif loaded:
             self.force_in = torch.zeros(self.count, 4, device=self.device)
             if force is not None:
                 self.force_in[:, :3] = force.reshape(-1, 3)
             if drag is not None:
                 self.force_in[:, 3] = drag.reshape(-1)
-        if load is not None or options["FORCE"]:
+        if loaded:
             self.load.zero_()
-        self._run(state, steps, options)
-        changes = self._read(state, steps, options)
-        if load is not None or options["FORCE"]:
+        changes = self._run(state, steps, options, looks)
+        if loaded:
             changes["work"] = state.work + self._work().reshape(state.work.shape)
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
+
+    def _take_wind(self, load: WindLoad, winds: Tensor) -> None:
+        aero = load.aero
+        half = torch.full_like(aero.C_D, 0.5 * aero.air_density)
+        self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half]))
+        self.winds[: len(winds)].copy_(winds.reshape(len(winds), -1, 3).expand(-1, self.scenes, -1))
+        if self._patch_of is None or self._patch_of[0] is not load.normal or self._patch_of[1] is not load.area:
+            self._patch_of = (load.normal, load.area)
+            shape = self.solver.points.mass.shape
+            self._take_patches(load.normal.expand(*shape, 3).reshape(-1, 3), load.area.expand(shape).reshape(-1))
 
     @abstractmethod
     def _take_patches(self, normal: Tensor, area: Tensor) -> None:
         """Take the patches of a load, shapes (N, 3) and (N,)."""
 
     @abstractmethod
-    def _run(self, state: MPMState, steps: int, options: dict[str, Any]) -> None:
-        """Take the state into the buffers and run the substeps."""
-
-    @abstractmethod
-    def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
-        """The fields of the state after the substeps."""
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
+        """Take the state into the buffers, run the substeps, and give the fields of the state after them."""
 
     @abstractmethod
     def _work(self) -> Tensor:
@@ -204,13 +228,19 @@ class FusedSolver(ABC):
         stream.wait_stream(torch.cuda.current_stream(self.device))
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
-        with torch.cuda.stream(stream):
-            # other threads, that of the recorder say, may go on meanwhile
-            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
-            try:
-                work()
-            finally:
-                graph.capture_end()
+        collecting = gc.isenabled()
+        gc.disable()  # a graph that is freed meanwhile would break the recording
+        try:
+            with torch.cuda.stream(stream):
+                # other threads, that of the recorder say, may go on
+                graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+                try:
+                    work()
+                finally:
+                    graph.capture_end()
+        finally:
+            if collecting:
+                gc.enable()
         torch.cuda.current_stream(self.device).wait_stream(stream)
         return graph
 
@@ -274,18 +304,31 @@ class FusedTotal(FusedSolver):
             self._partial[width] = torch.zeros(27, self.cells + 1, width, device=self.device)
         return self._partial[width]
 
-    def _run(self, state: MPMState, steps: int, options: dict[str, Any]) -> None:
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
         assert state.node_displacement is not None
         assert state.node_velocity is not None
         self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
         self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
-        key = tuple(options.values())
-        if options["FORCE"]:  # its buffer is another one each time
-            for _ in range(steps):
-                self._substep(0, options)
-                self.first_step.add_(1)
-        else:
-            self._repeat(steps, key, lambda offset: self._substep(offset, options))
+        done = 0
+        for look in [*looks, steps]:
+            if options["FORCE"]:  # its buffer is another one each time
+                for _ in range(look - done):
+                    self._substep(0, options)
+                    self.first_step.add_(1)
+            else:
+                self._repeat(look - done, tuple(options.values()), lambda offset: self._substep(offset, options))
+            done = look
+            if look in looks:
+                self._look()
+        return self._read(state, steps, options)
+
+    def _look(self) -> None:
+        _, ny, nz = self.grid.resolution
+        block = 128
+        kernels.total_look[(-(-self.count // block),)](
+            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.displacement, self.speed,
+            ny * nz, nz, 1 / self.grid.dx, BLOCK=block, num_warps=4,
+        )  # fmt: skip
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         solver = self.solver
@@ -306,8 +349,8 @@ class FusedTotal(FusedSolver):
         kernels.total_nodes[(-(-nodes // block),)](
             self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
             self.displacement, self.velocity, self.shift, self.schedule, self.first_step, offset, *self.gravity,
-            IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width, HELD=self.plain and solver._acting,
-            MOVE=self.plain, BLOCK=block, num_warps=2,
+            IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
+            HELD=self.plain and len(solver._acting) > 0, MOVE=self.plain, BLOCK=block, num_warps=2,
         )  # fmt: skip
         if not self.plain:
             self._constrain()
@@ -355,7 +398,8 @@ class FusedTotal(FusedSolver):
         }
 
     def _work(self) -> Tensor:
-        return self.load[0].double().reshape(self.scenes, self.particles).sum(1)  # cells are sorted by scene
+        # cells are sorted by scene
+        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
 
 
 class FusedUpdated(FusedSolver):
@@ -370,7 +414,7 @@ class FusedUpdated(FusedSolver):
         rows = [points.mass, points.volume, solver.laws.mu, solver.laws.lam, self.law]
         self.constants[:, :5] = torch.stack([row.reshape(-1).float() for row in rows], dim=1)
         self.scene = torch.arange(self.count, device=self.device) // max(self.particles, 1)
-        self.order = torch.zeros(self.count, dtype=torch.int32, device=self.device)
+        self.order = torch.arange(self.count, dtype=torch.int32, device=self.device)
         self.momentum = torch.zeros(0, 4, device=self.device)
         self.velocity = torch.zeros(0, 4, device=self.device)
         self.inverse_mass = torch.zeros(0, device=self.device)
@@ -397,16 +441,40 @@ class FusedUpdated(FusedSolver):
             if any(b.needs_position or b.needs_lattice for b in self.solver._acting):
                 self.node_position = grid.node_positions(self.velocity)
 
-    def _run(self, state: MPMState, steps: int, options: dict[str, Any]) -> None:
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
+        fields: dict[str, Any] = {}
+        marks = sorted({*looks, *range(RESORT, steps, RESORT), steps})
+        load, done = True, 0
+        for mark in marks:
+            if load:
+                self._load(state.replace(**fields))
+                self._particles(0, options, gather=False, scatter=True)
+            sort = mark == steps or mark % RESORT == 0
+            self._several(mark - done - (1 if sort else 0), options)
+            if sort:  # the end of a substep without the start of the next
+                self._nodes(0, options)
+                self._particles(1, options, gather=True, scatter=False)
+                self.first_step.add_(1)
+                fields = self._read(state)
+            if mark in looks:
+                self._look()
+            load, done = sort, mark
+        return fields
+
+    def _load(self, state: MPMState) -> None:
+        """Sort the particles by cell and take their fields."""
         grid = state.grid
         place = (state.position.reshape(-1, 3) / grid.dx - 0.5).floor_().int()
         (ox, oy, oz), (nx, ny, nz) = grid.offset, grid.resolution
         x, y, z = place.unbind(-1)
         key = ((x - ox).clamp(0, nx) * (ny + 1) + (y - oy).clamp(0, ny)) * (nz + 1) + (z - oz).clamp(0, nz)
         if self.scenes > 1:
-            key = key + self.scene.int() * ((nx + 1) * (ny + 1) * (nz + 1))
-        self.order.copy_(torch.argsort(key))
+            key = key + self.scene * ((nx + 1) * (ny + 1) * (nz + 1))
+        order = torch.argsort(key)
+        if self.scenes > 1:  # the work done so far follows its particle; the forces are zero here
+            self.load[0].copy_(self.load[0][torch.argsort(self.order)][order])
+        self.order.copy_(order)
         block = 128
         programs = (-(-self.count // block),)
         internal = state.internal is not None
@@ -416,16 +484,19 @@ class FusedUpdated(FusedSolver):
             state.internal.contiguous() if state.internal is not None else self.load, self.constants, self.moving,
             self.count, PLASTIC=self.plastic, INTERNAL=internal, BLOCK=block, num_warps=4,
         )  # fmt: skip
-        self._particles(0, options, gather=False, scatter=True)
+
+    def _several(self, steps: int, options: dict[str, Any]) -> None:
+        """Substeps from the start of one to the start of another."""
         if options["FORCE"]:
-            for _ in range(steps - 1):
+            for _ in range(steps):
                 self._substep(0, options)
                 self.first_step.add_(1)
-        elif steps > 1:
-            key_of_graph = (*options.values(), grid)
-            self._repeat(steps - 1, key_of_graph, lambda offset: self._substep(offset, options))
-        self._nodes(0, options)
-        self._particles(1, options, gather=True, scatter=False)
+        else:
+            self._repeat(steps, (*options.values(), self.grid), lambda offset: self._substep(offset, options))
+
+    def _look(self) -> None:
+        block = 128
+        kernels.updated_look[(-(-self.count // block),)](self.moving, self.count, self.speed, BLOCK=block, num_warps=4)
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         self._nodes(offset, options)
@@ -477,7 +548,7 @@ class FusedUpdated(FusedSolver):
         shape = (*static[f"pinned_mass_{k}"].shape[:-1], grid.node_count)
         return (weight * self.inverse_mass[:nodes]).reshape(shape)
 
-    def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
+    def _read(self, state: MPMState) -> dict[str, Any]:
         position, velocity = (torch.empty(state.position.shape, device=self.device) for _ in range(2))
         affine, F = (torch.empty(state.F_elastic.shape, device=self.device) for _ in range(2))
         F_total = torch.empty_like(F) if self.plastic else F
@@ -500,9 +571,8 @@ class FusedUpdated(FusedSolver):
         }
 
     def _work(self) -> Tensor:
-        return torch.zeros(self.scenes, dtype=torch.float64, device=self.device).index_add_(
-            0, self.scene[self.order.long()], self.load[0].double()
-        )
+        # whatever the order within a scene, the particles are sorted by scene
+        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
 
 
 def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
@@ -526,18 +596,15 @@ def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
     return table.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else table
 
 
+# time of a particle with so many lanes to a cell, relative to 32, on an H200
+_LANE_COST = {4: 1.45, 8: 1.02, 16: 1.0, 32: 1.0, 64: 1.0, 128: 0.87}
+
+
 def _lanes(sizes: Tensor) -> int:
-    """Lanes per cell for which the warps of all cells have the least to do (one synchronisation)."""
-    best, least = 32, math.inf
-    for lanes in (4, 8, 16, 32, 64):
-        chunks = float((-(-sizes // lanes)).sum())
-        per_lane = max(1, lanes // 32)
-        warps = chunks * min(lanes, 32) / 32
-        # some 1200 instructions for a particle, and two for each of 81 sums and each halving of the lanes
-        cost = warps * (1200 * per_lane + 162 * math.log2(min(lanes, 32)))
-        if cost < least:
-            best, least = lanes, cost
-    return best
+    """Lanes per cell for which all cells have the least to do, full lanes or not (one synchronisation)."""
+    lanes = list(_LANE_COST)
+    work = torch.stack([(-(-sizes // n)).sum() * n for n in lanes]).tolist()
+    return min(zip(lanes, work, strict=True), key=lambda pair: pair[1] * _LANE_COST[pair[0]])[0]
 
 
 __all__ = ["FusedSolver", "FusedTotal", "FusedUpdated", "unsupported"]

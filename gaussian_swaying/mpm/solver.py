@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -451,7 +452,7 @@ class MPMSolver(nn.Module):
             check_shape("drag", drag, self.points.count)
         fused = self.fused(*_tensors(state), force, drag)
         if fused is not None:
-            return fused.rollout(state, dt, 1, force=force, drag=drag)
+            return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
         advance = self._step_total if self.total_lagrangian else self._step_updated
         after = advance(state, dt, force, drag)
         return after if force is None else after.replace(work=self._work(state, after, dt, force, drag))
@@ -498,7 +499,7 @@ class MPMSolver(nn.Module):
             patches = () if load is None else (load.normal, load.area)
             fused = self.fused(*_tensors(state), *patches)
             if fused is not None:
-                return fused.rollout(state, dt, steps, load)
+                return fused.rollout(state, dt, steps, load)[0]
         winds = None if load is None else load.winds(state.time, dt, steps)
 
         def force_at(state: MPMState, k: int) -> tuple[Tensor | None, Tensor | None]:
@@ -523,6 +524,39 @@ class MPMSolver(nn.Module):
             count = min(checkpoint, steps - first)
             state = recompute(partial(advance, first=first, count=count), state)
         return state
+
+    def watched_rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        force_fn: ForceFunction | WindLoad | None = None,
+        looks: int = 8,
+    ) -> tuple[MPMState, Tensor]:
+        """Advance by several substeps and look at the Courant number on the way, as material may stiffen and slacken.
+
+        Args:
+            state: The state now.
+            dt: Substep [s].
+            steps: Number of substeps.
+            force_fn: As in :meth:`rollout`.
+            looks: How often to look, evenly, the last time at the end.
+
+        Returns:
+            The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
+        """
+        marks = sorted({math.ceil((k + 1) * steps / looks) for k in range(looks)})
+        load = force_fn if isinstance(force_fn, WindLoad) else None
+        if (force_fn is None or load is not None) and self.stiffness_damping == 0:
+            fused = self.fused(*_tensors(state), *(() if load is None else (load.normal, load.area)))
+            if fused is not None and fused.watches:
+                state, cells = fused.rollout(state, dt, steps, load, looks=marks)
+                return state, dt * cells
+        seen = []
+        for first, last in pairwise([0, *marks]):
+            state = self.rollout(state, dt, last - first, force_fn)
+            seen.append(self.cfl_number(state, dt))
+        return state, torch.stack(seen).amax()
 
     @staticmethod
     def kick(state: MPMState, dt: float) -> float:

@@ -265,7 +265,8 @@ def total_particles(
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
-    A step of index zero of a rollout takes what came before it from the schedule's row -1 (row 0 of the buffer).
+    Lanes without a particle have no volume, area or mass, so they add nothing. A step of index zero of a rollout takes
+    what came before it from row 0 of the schedule.
     """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
@@ -330,9 +331,9 @@ def total_particles(
                 for k in tl.static_range(3):
                     out = partial + (((i * 3 + j) * 3 + k) * (cells + 1) + cell) * WIDTH
                     gw = gz[k] * w
-                    s0 = tl.sum(tl.where(mask, wz[k] * a0 + gw * stress[2], 0.0), 1)
-                    s1 = tl.sum(tl.where(mask, wz[k] * a1 + gw * stress[5], 0.0), 1)
-                    s2 = tl.sum(tl.where(mask, wz[k] * a2 + gw * stress[8], 0.0), 1)
+                    s0 = tl.sum(wz[k] * a0 + gw * stress[2], 1)
+                    s1 = tl.sum(wz[k] * a1 + gw * stress[5], 1)
+                    s2 = tl.sum(wz[k] * a2 + gw * stress[8], 1)
                     if chunk > 0:
                         s0 += tl.load(out, real, 0.0)
                         s1 += tl.load(out + 1, real, 0.0)
@@ -341,13 +342,13 @@ def total_particles(
                     tl.store(out + 1, s1, real)
                     tl.store(out + 2, s2, real)
                     if IMPLICIT:
-                        s3 = tl.sum(tl.where(mask, wz[k] * (w * resistance), 0.0), 1)
+                        s3 = tl.sum(wz[k] * (w * resistance), 1)
                         if chunk > 0:
                             s3 += tl.load(out + 3, real, 0.0)
                         tl.store(out + 3, s3, real)
                     if POSITION:
                         for c in tl.static_range(3):
-                            s4 = tl.sum(tl.where(mask, wz[k] * (w * moved[c]), 0.0), 1)
+                            s4 = tl.sum(wz[k] * (w * moved[c]), 1)
                             if chunk > 0:
                                 s4 += tl.load(out + 4 + c, real, 0.0)
                             tl.store(out + 4 + c, s4, real)
@@ -538,6 +539,7 @@ def updated_particles(
             F, internal, stress = kirchhoff(F, mu, lam, internal, kind, p0, p1, p2, dt, KINDS, True)
         _store3(moving, count, index, x, mask)
         _store9(moving + 3 * count, count, index, F, mask)
+        _store3(moving + 12 * count, count, index, v, mask)
         if PLASTIC:
             _store9(moving + 35 * count, count, index, F_total, mask)
             tl.store(moving + 25 * count + index, internal, mask)
@@ -644,7 +646,6 @@ def updated_particles(
                         a4 = _sum_segments(wz[k] * (w * resistance), l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
                         tl.atomic_add(row + 4, a4, last, sem="relaxed")
     else:
-        _store3(moving + 12 * count, count, index, v, mask)
         _store9(moving + 15 * count, count, index, C, mask)
 
 
@@ -746,21 +747,65 @@ def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, s
 
 
 @triton.jit
+def _wave_speed(F, density, mu, lam, SPATIAL: tl.constexpr):
+    """Speed of a wave in a fixed corotated body [m/s], as ``timestep.wave_speed``."""
+    cof = cofactor(F)
+    area = largest_eigenvalue(matmul(transpose(cof), cof))
+    squared = (2 * mu + lam * tl.maximum(area, 1.0)) / density
+    if SPATIAL:
+        squared = squared * tl.maximum(largest_eigenvalue(matmul(transpose(F), F)), 1.0)
+    return tl.sqrt(squared)
+
+
+@triton.jit
+def _keep_largest(out, speed, mask):
+    """The largest value into ``out``; infinity for NaN, which an atomic maximum would lose."""
+    speed = tl.where(mask, tl.where(speed == speed, speed, float("inf")), 0.0)
+    tl.atomic_max(out, tl.max(speed))
+
+
+@triton.jit
 def largest_speed(F_in, density, mu_in, lam_in, velocity, out, count, SPATIAL: tl.constexpr, BLOCK: tl.constexpr):
-    """Largest speed of a wave [m/s] (and of a particle, SPATIAL) of fixed corotated bodies, into ``out``."""
+    """Largest speed of a wave [m/s] (and of its particle, SPATIAL) of fixed corotated bodies, into ``out``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     F = _load9(F_in, 1, index * 9, mask)
     mu = tl.load(mu_in + index, mask, 0.0)
     lam = tl.load(lam_in + index, mask, 0.0)
-    cof = cofactor(F)
-    area = largest_eigenvalue(matmul(transpose(cof), cof))
-    squared = (2 * mu + lam * tl.maximum(area, 1.0)) / tl.load(density + index, mask, 1.0)
-    if SPATIAL:
-        squared = squared * tl.maximum(largest_eigenvalue(matmul(transpose(F), F)), 1.0)
-    speed = tl.sqrt(squared)
+    speed = _wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, SPATIAL)
     if SPATIAL:
         v = _load3(velocity, 1, index * 3, mask)
         speed += tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    speed = tl.where(mask, speed, 0.0)
-    tl.atomic_max(out, tl.where(tl.sum((speed != speed).to(tl.int32)) > 0, float("nan"), tl.max(speed)))
+    _keep_largest(out, speed, mask)
+
+
+@triton.jit
+def total_look(
+    fraction, material, count, particle_cell, cell_node, displacement, out, sx, sy, inverse_dx, BLOCK: tl.constexpr
+):
+    """``total``: as ``largest_speed``, from the nodal displacements."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    f = _load3(fraction, count, index, mask)
+    node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
+    wz, gz = _weights(f[2], inverse_dx)
+    _u, F = _gather(displacement, node, sx, sy, f, wz, gz, inverse_dx, mask)
+    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    mu = tl.load(material + count + index, mask, 0.0)
+    lam = tl.load(material + 2 * count + index, mask, 0.0)
+    density = tl.load(material + 3 * count + index, mask, 1.0) / tl.load(material + index, mask, 1.0)
+    _keep_largest(out, _wave_speed(F, density, mu, lam, False), mask)
+
+
+@triton.jit
+def updated_look(moving, count, out, BLOCK: tl.constexpr):
+    """``updated``: as ``largest_speed``, from the rows of ``moving``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    F = _load9(moving + 3 * count, count, index, mask)
+    mu = tl.load(moving + 28 * count + index, mask, 0.0)
+    lam = tl.load(moving + 29 * count + index, mask, 0.0)
+    density = tl.load(moving + 26 * count + index, mask, 1.0) / tl.load(moving + 27 * count + index, mask, 1.0)
+    v = _load3(moving + 12 * count, count, index, mask)
+    speed = _wave_speed(F, density, mu, lam, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    _keep_largest(out, speed, mask)
