@@ -221,7 +221,7 @@ def _von_mises(a, mu, internal, yield_stress, hardening, residual):
     floor_flow = (trial - ROOT * residual) / (2 * mu)
     line_flow = (trial - ROOT * line) / tl.where(stiffness > 0, stiffness, 1.0)
     flow = tl.where(stiffness > 0, tl.minimum(line_flow, floor_flow), floor_flow)
-    yields = trial > ROOT * tl.maximum(line, residual)
+    yields = trial > tl.maximum(line, residual) * ROOT
     flow = tl.where(yields, flow, 0.0)
     return where3(yields, _drawn_back(trace, d, direction, flow), a), internal + ROOT * flow
 

@@ -273,13 +273,13 @@ class MPMSolver(nn.Module):
         """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
         return scatter(stencil, self.held_mass(k, time)[..., None, None])[..., 0] * inverse_mass
 
-    def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
+    def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0, check: bool = True) -> GridSpec:
         flat = position.detach().reshape(-1, 3)
         low, high = flat.amin(0), flat.amax(0)
         if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
             raise FloatingPointError("A particle position is NaN or infinite.")
         grid = bounding_grid(low, high, self.dx, margin)
-        if grid.node_count > self.max_nodes:
+        if check and grid.node_count > self.max_nodes:
             size = [round(v, 3) for v in (high - low).tolist()]
             what = f"The particles span {size} m"
             if 2 * margin * self.dx > max(size):
@@ -426,8 +426,15 @@ class MPMSolver(nn.Module):
             return state
         speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
         reach = (2 * speed + 0.5 * sum(g * g for g in self.gravity) ** 0.5 * horizon) * horizon
-        grid = self._bounding_grid(state.position, 3 + margin + min(int(reach / self.dx), 1000), speed)
-        return state.replace(grid=grid)
+        margin = 3 + margin + min(int(reach / self.dx), 1000)
+        grid = self._bounding_grid(state.position, margin, speed)
+        if not state.position.is_cuda:
+            return state.replace(grid=grid)
+        # CUDA graphs are recorded for one grid, so it stays as long as it serves
+        if state.grid.holds(grid) and state.grid.node_count <= 3 * grid.node_count:
+            return state
+        roomy = self._bounding_grid(state.position, margin + 4, speed, check=False)
+        return state.replace(grid=roomy if roomy.node_count <= self.max_nodes else grid)
 
     def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.

@@ -35,6 +35,14 @@ class GridSpec:
         """Number of nodes G of one scene."""
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
+    def holds(self, other: GridSpec) -> bool:
+        """Whether all nodes of another grid are among those of this one."""
+        inside = (
+            a <= b and b + m <= a + n
+            for a, n, b, m in zip(self.offset, self.resolution, other.offset, other.resolution, strict=True)
+        )
+        return self.dx == other.dx and all(inside)
+
     def node_positions(self, like: Tensor) -> Tensor:
         """Positions of the nodes [m], shape (G, 3), with the type and device of ``like``."""
         axes = [

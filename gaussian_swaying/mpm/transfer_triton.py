@@ -751,9 +751,10 @@ def _wave_speed(F, density, mu, lam, SPATIAL: tl.constexpr):
     """Speed of a wave in a fixed corotated body [m/s], as ``timestep.wave_speed``."""
     cof = cofactor(F)
     area = largest_eigenvalue(matmul(transpose(cof), cof))
-    squared = (2 * mu + lam * tl.maximum(area, 1.0)) / density
+    squared = (2 * mu + lam * tl.maximum(area, 1.0, tl.PropagateNan.ALL)) / density
     if SPATIAL:
-        squared = squared * tl.maximum(largest_eigenvalue(matmul(transpose(F), F)), 1.0)
+        stretch = largest_eigenvalue(matmul(transpose(F), F))
+        squared = squared * tl.maximum(stretch, 1.0, tl.PropagateNan.ALL)
     return tl.sqrt(squared)
 
 

@@ -168,6 +168,49 @@ def diagnose(
     Raises:
         SimulationDiverged: With ``check``, naming time, particle, cause and remedy.
     """
+    return measure(solver, state, substeps, cfl, wind_work, tearing).read(check)
+
+
+class Measurement:
+    """What :func:`measure` has computed on the device, and nobody has waited for yet."""
+
+    def __init__(self, solver: MPMSolver, substeps: int, parts: dict[str, Tensor], given: list[Tensor | float]) -> None:
+        self._solver, self._substeps, self._given = solver, substeps, given
+        self._sizes = {name: len(part) for name, part in parts.items()}
+        self._values = torch.cat(list(parts.values()))
+
+    def read(self, check: bool = False) -> FrameDiagnostics:
+        """Wait for the measurements (one GPU synchronisation); see :func:`diagnose`."""
+        values = iter(self._values.tolist())
+        found = {name: [next(values) for _ in range(size)] for name, size in self._sizes.items()}
+        if check:
+            _raise_if_bad(self._solver, found["verdict"], found["time"][0])
+        known = iter(found["given"])
+        cfl, wind_work = (next(known) if isinstance(value, Tensor) else float(value) for value in self._given)
+        axes = [f"{kind}momentum_{axis}" for kind in ("", "angular_") for axis in "xyz"]
+        return FrameDiagnostics(
+            time=found["time"][0],
+            substeps=self._substeps,
+            cfl=cfl,
+            **dict(zip(("kinetic", "elastic", "potential"), found["energy"], strict=True)),
+            wind_work=wind_work,
+            **dict(zip(axes, found["momentum"], strict=True)),
+            lost=int(found["counts"][0]),
+            torn=int(sum(found["counts"][1:])),
+            **dict(zip(("J_min", "J_max", "displacement_mean", "displacement_max"), found["extremes"], strict=True)),
+            **dict(zip(("stretch_min", "stretch_max"), found["stretch"], strict=True)),
+        )
+
+
+def measure(
+    solver: MPMSolver,
+    state: MPMState,
+    substeps: int,
+    cfl: Tensor | float,
+    wind_work: Tensor | float = 0.0,
+    tearing: TearingGauge | None = None,
+) -> Measurement:
+    """Start what :func:`diagnose` does, with the same arguments, without waiting for the device."""
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
     energy = torch.stack([energies[name] for name in ("kinetic", "elastic", "potential")]).double()
@@ -185,27 +228,9 @@ def diagnose(
         "extremes": extremes.double(),
         "stretch": stretch,
         "given": torch.cat(given) if given else stretch[:0],
-        "verdict": _verdict(solver, state, moved) if check else stretch[:0],
+        "verdict": _verdict(solver, state, moved),
     }
-    values = iter(torch.cat(list(parts.values())).tolist())
-    found = {name: [next(values) for _ in range(len(part))] for name, part in parts.items()}
-    if check:
-        _raise_if_bad(solver, found["verdict"], found["time"][0])
-    given_values = iter(found["given"])
-    cfl, wind_work = (next(given_values) if isinstance(value, Tensor) else float(value) for value in (cfl, wind_work))
-    axes = [f"{kind}momentum_{axis}" for kind in ("", "angular_") for axis in "xyz"]
-    return FrameDiagnostics(
-        time=found["time"][0],
-        substeps=substeps,
-        cfl=cfl,
-        **dict(zip(("kinetic", "elastic", "potential"), found["energy"], strict=True)),
-        wind_work=wind_work,
-        **dict(zip(axes, found["momentum"], strict=True)),
-        lost=int(found["counts"][0]),
-        torn=int(sum(found["counts"][1:])),
-        **dict(zip(("J_min", "J_max", "displacement_mean", "displacement_max"), found["extremes"], strict=True)),
-        **dict(zip(("stretch_min", "stretch_max"), found["stretch"], strict=True)),
-    )
+    return Measurement(solver, substeps, parts, [cfl, wind_work])
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

@@ -33,6 +33,7 @@ from gaussian_swaying.simulation.diagnostics import (
     TearingGauge,
     check_spacing,
     diagnose,
+    measure,
 )
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import SimulatedScene
@@ -83,6 +84,7 @@ class SimulationPipeline(nn.Module):
         self.to(device)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
         self._most_substeps = sys.maxsize
+        self.idle = self.aero.idle  # asked once, as it makes the host wait
         self._tearing: TearingGauge | None = None
 
     @property
@@ -99,6 +101,7 @@ class SimulationPipeline(nn.Module):
             ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long.
         """
         state = self.solver.init_state(self.scene.points, frame=self.scene.frame)
+        self.idle = self.aero.idle
         check_spacing(self.solver)
         self._most_substeps = MAX_GROWTH * self.solver.substeps(state, self.frame_dt)
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
@@ -131,8 +134,12 @@ class SimulationPipeline(nn.Module):
                 if steps > self._most_substeps:
                     cause = f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest"
                     self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
-                end, cfl = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
-                outrun = bool((end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any())
+                end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
+                work = (end.work - state.work).sum()
+                # everything is under way before the host waits for the first time
+                health = measure(self.solver, end, steps, courant, work, self._tearing)
+                outran = (end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any()
+                cfl, outrun = torch.stack([courant.double(), outran.double()]).tolist()
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
                 if retry == MAX_RETRIES or not (outrun or too_long):
                     break
@@ -144,12 +151,12 @@ class SimulationPipeline(nn.Module):
         except (FloatingPointError, ValueError) as error:
             # a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN
             self._give_up(state, str(error).rstrip("."))
-        health = diagnose(self.solver, end, steps, cfl, (end.work - state.work).sum(), self._tearing, check=True)
+        measured = health.read(check=True)
         if not cfl <= MAX_CFL:
             self._give_up(
                 end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
             )
-        return end, health
+        return end, measured
 
     def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, blaming the particle with the largest deformation."""
@@ -162,22 +169,22 @@ class SimulationPipeline(nn.Module):
     def _substeps(self, state: MPMState) -> int:
         return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
 
-    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, float]:
+    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
         """The state some substeps later, and the largest Courant number on the way."""
-        load = None if self.aero.idle else self.load
-        state, cfl = self.solver.watched_rollout(state, self.frame_dt / steps, steps, load, CFL_SAMPLES)
-        return state, float(cfl)
+        load = None if self.idle else self.load
+        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, load, CFL_SAMPLES)
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
-        if self.aero.idle:
+        if self.idle:
             return 1
         times = state.time + torch.linspace(0, self.frame_dt, 5, dtype=torch.float64, device=self.device)
         wind = torch.linalg.vector_norm(self.wind(times), dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
-        rate = float(self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax())
-        if not (math.isfinite(rate) and float(wind) < MAX_WIND):
-            cause = f"the wind of {float(wind):.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
+        fastest = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
+        rate, blowing = torch.stack([fastest.double(), wind.double()]).tolist()
+        if not (math.isfinite(rate) and blowing < MAX_WIND):
+            cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
             self._give_up(state, cause, "check the flow and the modulations of the wind")
         return 1 if self.aero.drag_step == "semi_implicit" else int(rate * self.frame_dt) + 1
 
