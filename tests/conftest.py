@@ -8,6 +8,9 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, and for the 
 import pytest
 import torch
 
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")  # kernels run on the CPU; read when triton is imported
+
 
 def pytest_collection_modifyitems(config, items):
     """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` tests to `-m slow`."""

@@ -1,0 +1,803 @@
+"""The fused substep against the one in torch, which is the definition.
+
+Without a GPU the kernels run in Triton's interpreter, one operation after the other in numpy: slow, so the bodies are
+small there. On a GPU what takes time is compiling, so bodies share their options, and some cases are left to the
+interpreter.
+"""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.load import WindLoad
+from gaussian_swaying.aero.wind import FlowKey, WindField
+from gaussian_swaying.gaussians.selection import Box, Everything
+from gaussian_swaying.mpm import materials
+from gaussian_swaying.mpm.boundary import (
+    EnclosingBox,
+    Handle,
+    Impulse,
+    PinnedRegion,
+    Plane,
+    SequentialRelease,
+    VelocityBox,
+)
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
+
+try:
+    from gaussian_swaying.mpm import fused
+except ImportError:
+    fused = None
+
+TOLERANCE = 2e-5
+"""Of the largest value of a field. A substep rounds some hundred times (half of 1.2e-7 each): the decomposition, and
+stresses that are differences of stretches near one; the same things are added in another order."""
+
+DX, DT = 0.1, 1e-3
+FORMULATIONS = ["total", "updated"]
+FIELDS = ["position", "velocity", "affine", "F_elastic", "F_total", "internal", "node_displacement", "node_velocity"]
+WIND = WindField([5.0, 2.0, -1.0])
+ELASTIC = {
+    "corotated": materials.FixedCorotated(),
+    "neo-hookean": materials.NeoHookean(),
+    "hencky": materials.StVKHencky(),
+}
+PLASTIC = {
+    "sand": materials.Sand(),
+    "sand that swells": materials.Sand(volume_correction=True),
+    "metal": materials.Metal(5e2, 1e3),
+    "foam": materials.Foam(2e2, 5.0),
+    "foam without viscosity": materials.Foam(2e2, 0.0),
+    "plasticine": materials.Plasticine(1e3, 2e4, 1e2),
+    "snow": materials.Snow(),
+    "fluid": materials.Fluid(),
+}
+
+
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def kernel_device(request):
+    """Where the kernels run."""
+    if request.param == "cuda":
+        pytest.importorskip("triton")
+        return torch.device("cuda")
+    if fused is None:
+        pytest.skip("needs triton, which there is for Linux only")
+    if not fused.INTERPRETED:
+        pytest.skip("on this machine the kernels are compiled")
+    return torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _one_width(monkeypatch):
+    """The number of lanes is a constant of the compiled kernel: the same for all bodies."""
+    if fused is not None:
+        monkeypatch.setattr(fused, "_lanes", lambda sizes: 4)
+
+
+def _on(*everywhere, interpreted=()):
+    """Cases for ``kernel_device``; some of them only where nothing is compiled."""
+    gpu = [pytest.param("cuda", case, marks=pytest.mark.gpu) for case in everywhere]
+    return [pytest.param("interpreted", case) for case in (*everywhere, *interpreted)] + gpu
+
+
+def _random(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def _points(device, law=None, count=24, batch=(), **more):
+    """A body of two cells to each side."""
+    place = torch.rand(*batch, count, 3, generator=torch.Generator().manual_seed(0))
+    return _body((0.06 + 0.18 * place).to(device), law, **more)
+
+
+def _body(position, law=None, youngs_modulus=1e4, **more):
+    mass = 0.5 + torch.rand(position.shape[:-1], generator=torch.Generator().manual_seed(5))
+    return MaterialPoints.create(
+        position,
+        volume=1e-4,
+        density=(100.0 * mass).to(position.device),
+        youngs_modulus=youngs_modulus,
+        poisson_ratio=0.3,
+        law=law,
+        **more,
+    )
+
+
+def _start(solver, points, strain=0.2):
+    """Deformed and in motion."""
+    device, shape = points.position.device, points.position.shape
+    state = solver.init_state(points, _random(1, *shape).to(device))
+    if solver.total_lagrangian:
+        nodes = [
+            (size * _random(seed, *state.node_velocity.shape)).to(device) for seed, size in ((2, strain * DX), (3, 1.0))
+        ]
+        massive = (solver._static["node_mass"] > 0)[..., None]  # others never move
+        return solver._read_particles(state, *(torch.where(massive, value, 0.0) for value in nodes))
+    F = (torch.eye(3) + strain * _random(2, *shape, 3)).to(device)
+    total = F.mT.contiguous() if solver.laws.plastic else F
+    state = state.replace(F_elastic=F, F_total=total, affine=_random(3, *shape, 3).to(device))
+    if state.internal is not None:
+        state = state.replace(internal=state.internal + (0.01 * _random(10, *shape[:-1]).abs()).to(device))
+    return state
+
+
+def _load(points, wind=WIND, seed=4, **settings):
+    shape, device = points.position.shape, points.position.device
+    normal = torch.nn.functional.normalize(_random(seed, *shape), dim=-1)
+    area = 0.02 * torch.rand(shape[:-1], generator=torch.Generator().manual_seed(seed))
+    area[..., ::5] = 0.0  # within the body
+    aero = AeroForce(**{"C_L": 0.3, **settings}).to(device)
+    wind = wind.to(device) if isinstance(wind, WindField) else [w.to(device) for w in wind]
+    return WindLoad(aero, wind, normal.to(device), area.to(device))
+
+
+def _solver(transfer, formulation="updated", **options):
+    return MPMSolver(**{"dx": DX, "formulation": formulation, "damping": 0.3, "transfer": transfer, **options})
+
+
+def _both(points, run, formulation="updated", start=_start, **options):
+    """What a function of solver and state gives with the torch and with the fused substep."""
+    found = []
+    for transfer in ("torch", "triton"):
+        solver = _solver(transfer, formulation, **options)
+        with torch.no_grad():
+            found.append(run(solver, start(solver, points)))
+    return found
+
+
+def _agree(ends, tolerance=TOLERANCE, names=FIELDS):
+    """The same state, and not the one that it began with."""
+    for expected, found in zip(*(end if isinstance(end, list) else [end] for end in ends), strict=True):
+        assert torch.equal(found.lost, expected.lost)
+        assert found.grid == expected.grid
+        assert found.substep == expected.substep
+        torch.testing.assert_close(found.time, expected.time)
+        assert found.work.dtype == torch.float64
+        scale = max(float(expected.work.abs().max()), 1e-9)
+        torch.testing.assert_close(found.work, expected.work, rtol=0, atol=tolerance * scale, msg=lambda m: "work " + m)
+        for name in names:
+            a, b = getattr(expected, name), getattr(found, name)
+            assert (a is None) == (b is None), name
+            if a is None:
+                continue
+            assert bool(torch.isfinite(a).all()), name
+            error = float((b - a).abs().max()) / max(float(a.abs().max()), 1e-30)
+            assert error <= tolerance, f"{name}: {error:.1e} of its largest value"
+
+
+# ---- the material
+
+
+def _wind_case(points, formulation, steps=1, aero=None, **options):
+    load = _load(points, **(aero or {}))
+    return _both(points, lambda solver, state: solver.rollout(state, DT, steps, load), formulation, **options)
+
+
+@pytest.mark.parametrize(("kernel_device", "law"), _on(*ELASTIC), indirect=["kernel_device"])
+def test_elastic_laws_in_total(kernel_device, law):
+    _agree(_wind_case(_points(kernel_device, ELASTIC[law]), "total", steps=2))
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "law"),
+    _on("corotated", "sand", interpreted=["neo-hookean", "hencky", *(name for name in PLASTIC if name != "sand")]),
+    indirect=["kernel_device"],
+)
+def test_laws_in_updated(kernel_device, law):
+    """Two substeps: the first scatters what it was given, the second what the return map has left."""
+    law = (ELASTIC | PLASTIC)[law]
+    ends = _wind_case(_points(kernel_device, law), "updated", steps=2)
+    _agree(ends)
+    if law.plastic and not isinstance(law, materials.Fluid):
+        assert float((ends[1].F_elastic - ends[1].F_total).abs().max()) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "names"),
+    _on([*ELASTIC, *PLASTIC], interpreted=[[*ELASTIC], ["neo-hookean", "fluid", "snow"], ["corotated", "sand"]]),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else f"{len(value)} laws",
+)
+def test_several_laws_in_updated(kernel_device, names):
+    laws = [(ELASTIC | PLASTIC)[name] for name in names]
+    index = torch.randint(len(laws), (24 if len(laws) < 5 else 60,), generator=torch.Generator().manual_seed(6))
+    points = _points(kernel_device, laws, count=len(index), law_index=index)
+    _agree(_wind_case(points, "updated", steps=2))
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "names"),
+    _on([*ELASTIC], interpreted=[["corotated", "neo-hookean"], ["neo-hookean", "hencky"]]),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else f"{len(value)} laws",
+)
+def test_several_laws_in_total(kernel_device, names):
+    laws = [ELASTIC[name] for name in names]
+    index = torch.randint(len(laws), (24,), generator=torch.Generator().manual_seed(6))
+    _agree(_wind_case(_points(kernel_device, laws, law_index=index), "total"))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_crushed_and_inverted_particles(kernel_device, formulation):
+    """Where the nearest rotation is not unique, as at a reflection of a ball, there is nothing to compare."""
+
+    def start(solver, points):
+        if solver.total_lagrangian:
+            state = _start(solver, points, strain=0.9)
+            assert bool((torch.linalg.det(state.F_elastic) < 0).any())
+            return state
+        state = _start(solver, points)
+        F = state.F_elastic.clone()
+        for k, stretch in enumerate(
+            [(1e-3, 1, 1), (1, 2e-4, 0.5), (-0.5, 1, 1.2), (1.1, 1, -1e-3), (0, 1, 2), (2, 2, 2), (6, 0.3, 1)]
+        ):
+            turn = torch.linalg.qr(_random(20 + k, 3, 3))[0]
+            F[k] = (turn @ torch.diag(torch.tensor(stretch, dtype=torch.float32)) @ turn.mT).to(F)
+        return state.replace(F_elastic=F, F_total=F)
+
+    _agree(_wind_case(_points(kernel_device), formulation, start=start))
+
+
+# ---- where the particles lie
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    _on(
+        *((formulation, sizes) for formulation in FORMULATIONS for sizes in ([1], [1, 3, 0, 64, 65, 130])),
+        interpreted=[("updated", [0, 70])],
+    ),
+    indirect=["kernel_device"],
+    ids=str,
+)
+def test_cells_of_any_size(kernel_device, case, monkeypatch):
+    """Several chunks of lanes, or warps, for one cell; cells without a particle between others."""
+    formulation, sizes = case
+    if len(sizes) > 2:
+        monkeypatch.setattr(fused, "_lanes", lambda sizes: 64)
+    generator = torch.Generator().manual_seed(7)
+    cells = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
+    place = 0.52 + 0.96 * torch.rand(len(cells), 3, generator=generator)  # of a cell, from the first node
+    place[:, 2] += cells
+    place = place[torch.randperm(len(place), generator=generator)]
+    _agree(_wind_case(_body((place * DX).to(kernel_device)), formulation))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("lanes", [8, 32, 128])
+def test_every_number_of_lanes(lanes, monkeypatch):
+    """The others are used elsewhere."""
+    pytest.importorskip("triton")
+    monkeypatch.setattr(fused, "_lanes", lambda sizes: lanes)
+    _agree(_wind_case(_points("cuda", count=300), "total"))
+
+
+def test_the_number_of_lanes_suits_the_cells(monkeypatch):
+    if fused is None:
+        pytest.skip("needs triton, which there is for Linux only")
+    monkeypatch.undo()
+    few, many = (fused._lanes(torch.full((100,), size)) for size in (3, 300))
+    assert few < many
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_particles_on_the_borders_of_cells(kernel_device, formulation):
+    steps = torch.tensor([0.05, 0.15, 0.1, 0.25])
+    position = torch.cartesian_prod(steps, steps, steps)[:32]
+    position = torch.cat([position, torch.nextafter(position, torch.zeros(()))[5:13]])
+    _agree(_wind_case(_body(position.to(kernel_device)), formulation))
+
+
+def test_what_leaves_the_grid_is_lost(kernel_device):
+    """It has no weight, touches nobody at the far side, and keeps its place; what comes too near the edge goes too."""
+    points = _points(kernel_device)
+    outside = torch.tensor([[0.13, 0.14, 0.5], [0.5, 0.1, 0.1], [0.13, -0.4, 0.1], [0.15, 0.12, 0.349], [90.0, 0, 0]])
+    count = len(outside)
+    position = torch.cat([points.position[:-count], outside.to(kernel_device)])
+    points = dataclasses.replace(points, position=position)
+    grid = GridSpec(DX, (0, -1, 0), (5, 6, 5))
+
+    def start(solver, points):
+        state = _start(solver, points).replace(grid=grid)
+        state.velocity[-2, 2] = 60.0  # from within the grid
+        return state
+
+    def run(solver, state):
+        states = [solver.rollout(state, DT, 1), solver.rollout(state, DT, 4)]
+        assert states[0].lost.tolist() == [False] * 19 + [True] * 3 + [False, True]
+        assert states[1].lost.tolist() == [False] * 19 + [True] * 5
+        assert float(states[1].velocity[-1].abs().max()) == 0.0
+        assert torch.equal(states[1].position[-5:-2], state.position[-5:-2])
+        return states
+
+    _agree(_both(points, run, start=start, gravity=(0, 0, 0)))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
+    points = _points(kernel_device, count=10, batch=(3,))
+    winds = [
+        WIND,
+        WindField([0.0, -8.0, 0.0]),
+        WindField(schedule=[FlowKey(0.0, [1.0, 0, 0]), FlowKey(DT, [9.0, 0, 0])]),
+    ]
+    load = _load(points, winds)
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2, load), formulation)
+    _agree(ends)
+    assert ends[1].work.shape == (2,)
+    solver = _solver("torch", formulation)
+    whole = _start(solver, points)
+    for k, wind in enumerate(winds):
+        alone = points.map(lambda value, k=k: value[k])
+        solver = _solver("triton", formulation)
+        state = solver.init_state(alone)
+        fields = {name: None if getattr(whole, name) is None else getattr(whole, name)[k] for name in FIELDS}
+        if formulation == "total":
+            nodes = state.grid.node_count
+            offset = [a - b for a, b in zip(state.grid.offset, whole.grid.offset, strict=True)]
+            index = torch.arange(whole.grid.node_count).reshape(whole.grid.resolution)
+            for axis, (start, size) in enumerate(zip(offset, state.grid.resolution, strict=True)):
+                index = index.narrow(axis, start, size)
+            index = index.reshape(-1).to(kernel_device)
+            assert len(index) == nodes
+            fields |= {name: fields[name][index] for name in ("node_displacement", "node_velocity")}
+        else:
+            state = state.replace(grid=whole.grid)
+        state = state.replace(**fields)
+        end = solver.rollout(state, DT, 2, WindLoad(load.aero, wind, load.normal[k], load.area[k]))
+        for name in ("position", "velocity", "affine", "F_elastic"):
+            error = (getattr(end, name) - getattr(ends[1], name)[k]).abs().max()
+            assert float(error) <= TOLERANCE * float(getattr(end, name).abs().max()), name
+        torch.testing.assert_close(end.work, ends[1].work[k], rtol=1e-4, atol=0)
+
+
+# ---- forces
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "settings"),
+    _on(
+        {"drag_step": "semi_implicit"},
+        {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        interpreted=[{"law": "projected"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
+    ),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_every_kind_of_wind(kernel_device, formulation, settings):
+    _agree(_wind_case(_points(kernel_device), formulation, steps=2, aero=settings))
+
+
+def test_patches_without_flow_and_flat_ones(kernel_device):
+    """Air that moves with the patch, and a patch that is pressed to nothing."""
+
+    def start(solver, points):
+        state = _start(solver, points)
+        state.velocity[:4] = torch.tensor(WIND.flows[0].tolist(), device=kernel_device)
+        F = state.F_total.clone()
+        F[2] = 0.0
+        F[5] = 0.0
+        return state.replace(F_total=F)
+
+    points = _points(kernel_device, materials.Sand())
+    _agree(_wind_case(points, "updated", start=start))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("implicit", [False, True])
+def test_forces_and_drag_of_step(kernel_device, formulation, implicit):
+    points = _points(kernel_device)
+    force = (0.3 * _random(8, *points.position.shape)).to(kernel_device)
+    drag = (0.5 * _random(9, *points.mass.shape).abs()).to(kernel_device) if implicit else None
+
+    def run(solver, state):
+        states = [solver.step(state, DT, force, drag)]
+        states.append(solver.step(states[0], DT, 2 * force, drag))
+        return states
+
+    ends = _both(points, run, formulation)
+    _agree(ends)
+    assert float(ends[1][1].work.abs()) > 0
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_drag_without_a_force(kernel_device, formulation):
+    """Nothing is added to the work."""
+    points = _points(kernel_device)
+    drag = torch.full_like(points.mass, 0.7)
+    _agree(_both(points, lambda solver, state: solver.step(state, DT, drag=drag), formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_force_function_is_called_each_substep(kernel_device, formulation):
+    points = _points(kernel_device)
+    times = []
+
+    def force(state):
+        times.append(round(float(state.time), 9))
+        return -20.0 * points.mass[:, None] * state.velocity
+
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2, force), formulation)
+    _agree(ends)
+    assert times == [0.0, DT] * 2
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_gravity_damping_and_viscosity(kernel_device, formulation):
+    options = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
+    _agree(_wind_case(_points(kernel_device), formulation, steps=2, **options))
+
+
+def test_mls(kernel_device):
+    _agree(_wind_case(_points(kernel_device), "updated", steps=2, mls=True))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_without_any_load(kernel_device, formulation):
+    """And with an infinitely long substep's worth of damping left out."""
+    points = _points(kernel_device)
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2), formulation, damping=0.0)
+    _agree(ends)
+    assert float(ends[1].work) == 0.0
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_substep_that_changes(kernel_device, formulation):
+    """Forces act for the mean of the old and the new one, at most twice the new one."""
+    points = _points(kernel_device)
+    load = _load(points)
+
+    def run(solver, state):
+        states = []
+        for dt, steps in ((1e-3, 2), (4e-4, 1), (1e-4, 1), (9e-4, 1)):
+            state = solver.rollout(state, dt, steps, load)
+            states.append(state)
+        return states
+
+    _agree(_both(points, run, formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
+    """Longer than the schedule or the order of the particles lasts; the wind goes on, and so does the work."""
+    monkeypatch.setattr(fused, "MAX_STEPS", 2)
+    monkeypatch.setattr(fused, "RESORT", 2)
+    wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
+    points = _points(kernel_device)
+    load = _load(points, wind)
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 5, load), formulation)
+    _agree(ends, names=["position", "velocity", "F_elastic"])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_many_substeps(formulation):
+    """Round-off grows in fifty substeps, though not by much where the motion is stable."""
+    pytest.importorskip("triton")
+
+    def start(solver, points):
+        return _start(solver, points, strain=0.02)
+
+    ends = _wind_case(_points("cuda", count=2000), formulation, steps=50, start=start)
+    _agree(ends, tolerance=2e-4)
+
+
+# ---- boundaries
+
+LEFT, TOP = Box([None] * 3, [0.12, None, None]), Box([None, None, 0.17], [None] * 3)
+WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}
+BOUNDARIES = {
+    "pin": lambda: [PinnedRegion(LEFT)],
+    "two pins": lambda: [PinnedRegion(LEFT), PinnedRegion(TOP, held_share=0.4)],
+    "pin for some time": lambda: [PinnedRegion(LEFT, **WINDOW)],
+    "handle": lambda: [Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], **WINDOW)],
+    "release": lambda: [SequentialRelease(LEFT, [0.0, 1.0, 0.0], start=0.5 * DT, end=1.5 * DT)],
+    "impulse": lambda: [Impulse(TOP, [0.01, 0.0, 0.02], **WINDOW)],
+    "plane": lambda: [Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.4, **WINDOW)],
+    "box": lambda: [EnclosingBox([0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)],
+    "velocity box": lambda: [VelocityBox(TOP, [0.0, 1.0, 0.0], **WINDOW)],
+    "pin and plane": lambda: [PinnedRegion(LEFT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
+    "knock and release": lambda: [SequentialRelease(LEFT, end=1.5 * DT), Impulse(Everything(), [0, 0, 0.02], end=DT)],
+}
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "name"),
+    [
+        *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
+        *(("interpreted", name) for name in ("two pins", "handle", "plane", "knock and release")),
+    ],
+    indirect=["kernel_device"],
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_boundaries(kernel_device, formulation, name):
+    """Over three substeps, of which the first and the last lie beside the window."""
+    points = _points(kernel_device, count=12)
+    load = _load(points)
+
+    def run(solver, state):
+        state = solver.rollout(state, DT, 1, load)
+        return [state, solver.rollout(state, DT, 2, load)]
+
+    ends = _both(points, run, formulation, boundaries=BOUNDARIES[name]())
+    _agree(ends)
+    free = _solver("torch", formulation)
+    with torch.no_grad():
+        velocity = run(free, _start(free, points))[1].velocity
+    assert not torch.allclose(velocity, ends[0][1].velocity, rtol=1e-3)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_boundaries_of_a_batch(kernel_device, formulation):
+    points = _points(kernel_device, count=10, batch=(2,))
+    boundaries = [SequentialRelease(LEFT, [0.0, 1.0, 0.0], end=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
+    _agree(_wind_case(points, formulation, steps=2, boundaries=boundaries))
+
+
+# ---- what is conserved
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_momentum(kernel_device, formulation):
+    """Linear and angular momentum of a free body, to float32; angular momentum about a point within the body."""
+    points = _points(kernel_device)
+    solver = _solver("triton", formulation, gravity=(0, 0, 0), damping=0.0)
+    state = _start(solver, points)
+    if formulation == "updated":  # a spin that belongs to the stretch of the nodes, as after any substep
+        state = solver.rollout(state, DT, 1)
+    end = solver.rollout(state, DT, 2)
+    scale = float((points.mass[:, None] * state.velocity).abs().sum())
+    before, after = (solver.momenta(s) for s in (state, end))
+    torch.testing.assert_close(after["linear"], before["linear"], rtol=0, atol=1e-6 * scale)
+    torch.testing.assert_close(after["angular"], before["angular"], rtol=0, atol=1e-6 * scale)
+    assert float((end.velocity - state.velocity).abs().max()) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "drag_step"),
+    _on("explicit", "semi_implicit"),
+    indirect=["kernel_device"],
+)
+def test_the_work_is_what_the_energy_grows_by(kernel_device, drag_step):
+    """In a body that is too soft to store any, and without the energies being computed by what counted the work."""
+    points = _points(kernel_device)
+    points = dataclasses.replace(points, youngs_modulus=torch.full_like(points.mass, 1e-6))
+    solver = _solver("triton", "total", gravity=(0, 0, 0), damping=0.0)
+    state = _start(solver, points)
+    end = solver.rollout(state, DT, 2, _load(points, drag_step=drag_step))
+    growth = solver.energies(end)["kinetic"] - solver.energies(state)["kinetic"]
+    assert abs(float(growth)) > 1e-4
+    # a difference of two energies in float32
+    torch.testing.assert_close(end.work.float(), growth, rtol=0, atol=2e-6 * float(solver.energies(end)["kinetic"]))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_energies(kernel_device, formulation):
+    points = _points(kernel_device)
+    ends = _both(
+        points, lambda solver, state: solver.energies(solver.rollout(state, DT, 2)), formulation, gravity=(0, 0, -9.8)
+    )
+    for name, expected in ends[0].items():
+        torch.testing.assert_close(ends[1][name], expected, rtol=1e-4, atol=0)
+
+
+@pytest.mark.gpu
+def test_total_gives_the_same_bits_twice():
+    pytest.importorskip("triton")
+    points = _points("cuda", count=2000)
+    ends = []
+    for _ in range(2):
+        solver = _solver("triton", "total", deterministic=True)
+        ends.append(solver.rollout(_start(solver, points), DT, 40, _load(points)))
+    for name in ("position", "velocity", "F_elastic", "node_velocity", "work"):
+        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))
+
+
+# ---- graphs
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "boundary"),
+    [*_on("handle"), pytest.param("cuda", None, marks=pytest.mark.gpu)],
+    indirect=["kernel_device"],
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary):
+    """Rollouts of the same kind share a recorded graph: the wind, its coefficients, patches, substep and time are new.
+
+    The second of a kind is recorded, the third replayed. Where nothing is compiled there are no graphs, but buffers.
+    """
+    count = 23 if kernel_device.type == "cuda" else 1
+    points = _points(kernel_device, count=12)
+    turning = Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 9.0, 3.0], [0.1, 0.1, 0.1], start=1e-4, end=2.5e-4 * count)
+    solvers = [
+        _solver(transfer, formulation, boundaries=[] if boundary is None else [turning])
+        for transfer in ("torch", "triton")
+    ]
+    state = _start(solvers[0], points, strain=0.02)
+    _start(solvers[1], points)
+    winds = [WIND, WIND, WIND, WindField([0.0, -40.0, 5.0]), WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])]
+    for k, wind in enumerate(winds):
+        load = _load(points, wind, seed=4 if k < 4 else 11, C_D=0.5 + k)
+        dt = [1e-4, 1e-4, 5e-5, 1e-4, 7e-5][k]
+        state = solvers[0].fit_grid(state, count * dt, margin=1)  # a copy of the other, or the errors add up
+        expected, found = (solver.rollout(state, dt, count, load) for solver in solvers)
+        _agree([expected, found], tolerance=1e-4)
+        state = expected
+    # a rollout without wind is another kind
+    _agree([solver.rollout(state, 1e-4, 2) for solver in solvers])
+    _agree([solver.rollout(state, 1e-4, 2, load) for solver in solvers])
+
+
+def test_a_grid_that_comes_back(kernel_device):
+    """A graph recorded for a grid finds the places of its nodes again, though another grid lay between."""
+    points = _points(kernel_device)
+    count = 4 if kernel_device.type == "cuda" else 1
+    boundaries = [Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
+    solvers = [_solver(transfer, boundaries=boundaries) for transfer in ("torch", "triton")]
+    state = _start(solvers[0], points)
+    _start(solvers[1], points)
+    load = _load(points)
+    near, far = GridSpec(DX, (-2, -2, -2), (8, 8, 8)), GridSpec(DX, (-4, -3, -2), (8, 8, 7))
+    for grid in (near, near, far, far, near, far):
+        filler = [torch.full((512, 3), 1e3, device=kernel_device) for _ in range(20)]  # over what was freed
+        expected, found = (solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers)
+        _agree([expected, found])
+        del filler
+    larger = GridSpec(DX, (-8, -8, -8), (20, 20, 20))  # needs other buffers
+    for grid in (larger, near):
+        _agree([solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers])
+
+
+# ---- the Courant number
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_courant_number(kernel_device, formulation):
+    """Against float64; the closed form of the eigenvalues loses digits where two are equal, unless care is taken."""
+    points = _points(kernel_device, count=48)
+    state = _start(_solver("torch", formulation), points)
+    eye = torch.eye(3)
+    stretches = torch.tensor([[2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [0.5, 2.0, 2.0], [3.0, 3.0, 3.0], [1.0, 0.0, 0.0]])
+    double = torch.linalg.qr(_random(30, 48, 3, 3))[0]
+    double = double @ stretches[torch.arange(48) % 5].diag_embed() @ double.mT
+    solver = _solver("triton", formulation)
+    solver.init_state(points)
+    exact = _solver("torch", formulation)
+    exact.init_state(points.map(torch.Tensor.double))
+    largest = []
+    for F in (eye + 1e-4 * _random(31, 48, 3, 3), 4.0 * _random(32, 48, 3, 3), double, 1e-12 * double, 0 * double):
+        at = state.replace(F_elastic=F.to(kernel_device))
+        wide = {n: getattr(at, n).double() for n in ("F_elastic", "F_total", "velocity", "position")}
+        largest.append(float(fused.largest_speed(solver, at)))
+        assert largest[-1] == pytest.approx(float(exact._cells_per_second(at.replace(**wide))), rel=1e-5)
+        # in torch and float32, where the digits are there
+        if F is not double:
+            assert float(solver.cfl_number(at, DT)) == pytest.approx(
+                float(_bound(_solver("torch", formulation), points).cfl_number(at, DT)), rel=1e-5
+            )
+    assert len(set(largest)) >= 4
+    for k in range(48):  # each particle counts
+        F = torch.eye(3).repeat(48, 1, 1)
+        F[k] *= 2
+        at = state.replace(F_elastic=F.to(kernel_device), velocity=torch.zeros_like(state.velocity))
+        if k in (0, 17, 47):
+            one = float(fused.largest_speed(solver, at))
+            assert one == pytest.approx(
+                float(_bound(_solver("torch", formulation), points)._cells_per_second(at)), rel=1e-5
+            )
+
+
+def _bound(solver, points):
+    solver.init_state(points)
+    return solver
+
+
+def test_courant_number_of_what_is_broken_is_not_finite(kernel_device):
+    points = _points(kernel_device)
+    solver = _bound(_solver("triton"), points)
+    state = _start(solver, points)
+    state.F_elastic[3, 1, 1] = math.nan
+    assert not math.isfinite(float(solver.cfl_number(state, DT)))
+
+
+# ---- where the kernels are used
+
+
+def _elastic(formulation="total", dtype=torch.float32, device="cpu", law=None):
+    return _points(device, law).map(lambda value: value.to(dtype))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_gradients_are_left_to_torch(kernel_device, formulation):
+    points = _points(kernel_device)
+    auto = _solver("auto", formulation)
+    state = _start(auto, points)
+    velocity = state.velocity.clone().requires_grad_()
+    load = _load(points)
+    name = "node_velocity" if formulation == "total" else "velocity"
+    start = state.replace(**{name: getattr(state, name).clone().requires_grad_()})
+    assert auto.rollout(start, DT, 2, load).position.requires_grad
+    assert auto.step(state, DT, force=velocity).position.requires_grad
+    area = load.area.clone().requires_grad_()
+    assert auto.rollout(state, DT, 1, WindLoad(load.aero, load.wind, load.normal, area)).position.requires_grad
+    only = _solver("triton", formulation)
+    only.init_state(points)
+    for attempt in (
+        lambda: only.rollout(start, DT, 2, load),
+        lambda: only.step(state, DT, force=velocity),
+        lambda: only.rollout(state, DT, 1, WindLoad(load.aero, load.wind, load.normal, area)),
+    ):
+        with pytest.raises(ValueError, match="`transfer: triton` has no gradients"):
+            attempt()
+    with torch.no_grad():
+        assert not only.rollout(start, DT, 1, load).position.requires_grad
+
+
+class OwnLaw(materials.FixedCorotated):
+    """A law of a user's own, which may be anything."""
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda points: (points.map(torch.Tensor.double), {}), "computes in float32, and the material is float64"),
+        (lambda points: (dataclasses.replace(points, laws=(OwnLaw(),)), {}), "the law OwnLaw has no fused form"),
+        (lambda points: (points, {"formulation": "updated", "deterministic": True}), "sums have no fixed order"),
+    ],
+    ids=["float64", "own law", "deterministic"],
+)
+def test_what_the_kernels_cannot_do(kernel_device, change, reason):
+    """``auto`` does it in torch, ``triton`` says why not."""
+    points, options = change(_points(kernel_device))
+    solver = MPMSolver(dx=DX, transfer="auto", **options)
+    state = solver.init_state(points)
+    assert solver.fused() is None
+    assert bool(torch.isfinite(solver.step(state, DT).position).all())
+    if kernel_device.type == "cuda":
+        assert reason in solver._fused_obstacle
+    with pytest.raises(ValueError, match=reason):
+        MPMSolver(dx=DX, transfer="triton", **options).init_state(points)
+
+
+def test_auto_takes_the_kernels_on_a_gpu_only(kernel_device):
+    solver = MPMSolver(dx=DX)
+    solver.init_state(_points(kernel_device))
+    assert (solver.fused() is not None) == (kernel_device.type == "cuda")
+    assert solver.deterministic is False
+    solver = MPMSolver(dx=DX, deterministic=True)
+    solver.init_state(_points(kernel_device))
+    assert (solver.fused() is not None) == (kernel_device.type == "cuda")
+
+
+def test_torch_means_torch(kernel_device):
+    solver = MPMSolver(dx=DX, transfer="torch")
+    solver.init_state(_points(kernel_device))
+    assert solver.fused() is None
+
+
+def test_another_material_needs_other_buffers(kernel_device):
+    solver = _solver("triton", "total")
+    solver.init_state(_points(kernel_device))
+    first = solver.fused()
+    assert solver.fused() is first
+    solver.init_state(_points(kernel_device, count=7))
+    assert solver.fused().count == 7
+
+
+def test_settings_that_contradict():
+    with pytest.raises(ValueError, match=r"transfer.*tritn"):
+        MPMSolver(transfer="tritn")
+    with pytest.raises(ValueError, match="leave out `compile`"):
+        MPMSolver(transfer="triton", compile=True)
+
+
+@pytest.mark.skipif(fused is not None and fused.INTERPRETED, reason="the kernels run here without one")
+def test_triton_without_a_gpu_says_so():
+    with pytest.raises(ValueError, match=r"needs a CUDA device|Triton cannot be imported"):
+        MPMSolver(dx=DX, transfer="triton").init_state(_points("cpu"))
