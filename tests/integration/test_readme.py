@@ -11,14 +11,14 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
 def test_one_example_for_each_component():
-    used = ("GaussianSurfaceModel", "MPMSolver", "AeroForce", "DiffuseShader")
-    assert len(EXAMPLES) == 4
+    used = ("GaussianSurfaceModel", "MPMSolver", "AeroForce", "WindLoad", "DiffuseShader")
+    assert len(EXAMPLES) == 5
     for name, example in zip(used, EXAMPLES, strict=True):
         assert name in example
         assert len([line for line in example.splitlines() if line.strip()]) <= 14
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["surface", "solver", "wind", "shading"])
+@pytest.mark.parametrize("example", EXAMPLES, ids=["surface", "solver", "wind", "load", "shading"])
 def test_example_runs(example, capsys):
     exec(compile(example, "README.md", "exec"), {})
     printed = capsys.readouterr().out

@@ -8,7 +8,7 @@ import torch
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 
 FORMULATIONS = ["total", "updated"]
 
@@ -222,6 +222,64 @@ def test_grid_follows_the_object_without_changing_the_motion():
     assert following.grid.node_count < 0.1 * fixed.grid.node_count
     torch.testing.assert_close(following.position, fixed.position, rtol=0, atol=1e-13)
     assert not bool(following.lost.any())
+
+
+def test_a_grid_holds_what_lies_within_it():
+    grid = GridSpec(0.1, (-2, 0, 3), (5, 4, 6))
+    assert grid.holds(grid)
+    assert grid.holds(GridSpec(0.1, (-1, 1, 3), (4, 3, 6)))
+    for other in (
+        GridSpec(0.1, (-3, 0, 3), (5, 4, 6)),
+        GridSpec(0.1, (-2, 0, 3), (5, 5, 6)),
+        GridSpec(0.2, (-2, 0, 3), (5, 4, 6)),
+    ):
+        assert not grid.holds(other)
+
+
+@pytest.mark.gpu
+def test_a_grid_on_a_gpu_stays_while_it_serves():
+    """CUDA graphs are recorded for one grid: a body that drifts slowly needs a new one now and then only."""
+    points = _block(dtype=torch.float32, device="cuda")
+    solver = MPMSolver(dx=0.05, formulation="updated", gravity=(0, 0, 0))
+    state = solver.init_state(points, torch.full_like(points.position, 0.2))
+    grids = []
+    for _ in range(40):
+        state = solver.fit_grid(state, 0.04)
+        grids.append(state.grid)
+        state = solver.rollout(state, 1e-3, 40)
+    assert not state.lost.any()
+    assert 1 < len(set(grids)) < 10
+    assert max(grid.node_count for grid in grids) < 40**3
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_watched_rollout_is_a_rollout_that_saw_the_largest_courant_number(formulation):
+    """A block that expands and contracts: its stiffness is largest on the way, not at the end."""
+    points = _block()
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    centre = points.position.mean(0)
+    start = solver.init_state(points, 40 * (points.position - centre))
+    seen, state = [], start
+    for _ in range(30):
+        state = solver.rollout(state, 2e-4, 5)
+        seen.append(float(solver.cfl_number(state, 2e-4)))
+    end, largest = solver.watched_rollout(start, 2e-4, 150, looks=30)
+    assert torch.equal(end.position, state.position)
+    assert float(largest) == max(seen)
+    assert max(seen) > 1.02 * max(seen[0], seen[-1])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_work_is_what_the_force_adds_to_the_energy(formulation):
+    """A constant force on a body that does not deform: work is force times way, and its kinetic energy."""
+    points = _block(2)
+    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    pull = torch.tensor([[[3.0, 0.0, 0.0]], [[0.0, 6.0, 0.0]]], dtype=torch.float64)
+    force = points.mass[..., None] * pull
+    state = solver.rollout(solver.init_state(points), 1e-3, 20, lambda state: force)
+    assert state.work.shape == (2,)
+    assert state.work.dtype == torch.float64
+    torch.testing.assert_close(state.work, solver.energies(state)["kinetic"], rtol=1e-9, atol=0)
 
 
 def test_particle_that_outruns_its_grid_is_marked_lost():
