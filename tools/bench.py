@@ -115,6 +115,8 @@ def speed(options: argparse.Namespace) -> None:
     """Measure rollouts of many sizes, sand, batches and frames, with memory and error."""
     device, result = _start(options)
     result["kind"], result["threads"], result["quick"] = device.type, torch.get_num_threads(), options.quick
+    if options.quick and Path(options.results).resolve() == RESULTS:
+        raise SystemExit("--quick measures nothing worth keeping: give it another folder with --results")
     name = f"speed_{device.type}"
     path = Path(options.results) / f"{name}.json"
     only = options.only.split(",") if options.only else None
@@ -286,11 +288,10 @@ def pages(options: argparse.Namespace) -> None:
         lines += [f"## `{path.name}`: {result['device']}", "", f"{stack}; seed {result['seed']}.", ""]
         lines += _substep_table(result) if "substep" in result else _run_table(result)
         goals += _goals(result)
-    for path in sorted(Path(options.results).glob("speed_*.json")):
-        result = json.loads(path.read_text())
-        lines += speed_cases.page(path.name, result, Path(options.results).parent / "pictures")
-        goals += [_goal_row(*goal) for goal in speed_cases.goals(result)]
-    lines += speed_cases.limit_lines()
+    speeds = [(path.name, json.loads(path.read_text())) for path in sorted(Path(options.results).glob("speed_*.json"))]
+    if speeds:
+        lines += speed_cases.page(speeds, Path(options.results).parent / "pictures")
+        goals += [_goal_row(*goal) for _, result in speeds for goal in speed_cases.goals(result)]
     head = ["| goal | measured | reached | stretch goal | reached |", "|---|---|---|---|---|"]
     lines += ["## Goals", "", *head, *goals, ""]
     target = Path(options.results).parent / "benchmarks.md"

@@ -34,7 +34,7 @@ FORMULATIONS = ("total", "updated")
 SECTIONS = ("substep", "sand", "batch", "frame")
 
 LIMITS: list[str] = []
-"""What limits the speed, a sentence each: text for the page, which no measurement writes."""
+"""What limits the speed, a sentence each: text of the page that is no measurement."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
     """The plan of a kind of device, with other counts (``"5000,20000"``), or all of it small enough for a test."""
     plan = PLANS[kind]
     if quick:
-        plan = replace(plan, counts=(100, 400), exact_limit=100, sand=64, scenes=2, side=8, steps=(4, 8))
+        plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
         plan = replace(plan, torch_steps=2, warm=2, repeats=(2, 2), copy_bytes=2**20)
         plan = replace(plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,))
     return plan if counts is None else replace(plan, counts=tuple(int(n) for n in counts.split(",")))
@@ -563,17 +563,38 @@ def goals(result: Row) -> list[Goal]:
     row = find("frame", main=True)
     what = "frame of a flag of 100,000 Gaussians at 1920x1080"
     found.append(goal(what, row, "median_ms", FRAME_GOAL, "ms"))
-    found.append(goal(f"device memory of that {what}", row, "memory_bytes", MEMORY_GOAL, "GiB", 2**-30))
+    found.append(goal("device memory of such a frame", row, "memory_bytes", MEMORY_GOAL, "GiB", 2**-30))
     return found
 
 
 # ---- the page
 
 
-def page(name: str, result: Row, pictures: Path) -> list[str]:
-    """Lines of the page from one recorded run; draws its plot into a folder."""
+def page(results: list[tuple[str, Row]], pictures: Path) -> list[str]:
+    """Lines of the page from the recorded runs, each with the name of its file; draws their plots into a folder."""
+    lines = [
+        "## Speed of substeps, batches and frames",
+        "",
+        "Rollouts with `WindLoad`, as a user starts them: the time of a substep is that of a whole rollout, with",
+        "sorting, wind and the fields of the particles at its end, by the number of its substeps. The slope between it",
+        "and a longer one leaves out what a rollout costs once. The sheet starts with waves of 1 m/s; `updated` has a",
+        "grid of 100³ nodes. Torch: the same with `transfer: torch`. Memory: the peak of torch's allocator. Error: the",
+        "largest difference from the torch path in float64 at the end of the rollout, of positions relative to the",
+        "largest displacement, of velocities relative to the largest velocity.",
+        "",
+        *(inspect.getdoc(fewest_bytes) or "").split("\n\nArgs:")[0].replace("``", "`").splitlines(),
+        "",
+        "What fits into the caches may be moved faster than the copy.",
+        "",
+    ]
+    for name, result in results:
+        lines += _device_lines(name, result, pictures)
+    return lines + (["### What limits it", "", *(f"- {line}" for line in LIMITS), ""] if LIMITS else [])
+
+
+def _device_lines(name: str, result: Row, pictures: Path) -> list[str]:
     stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-    lines = [f"## `{name}`: {result['device']}", "", f"{stack}; seed {result['seed']}.", ""]
+    lines = [f"### `{name}`: {result['device']}", "", f"{stack}; seed {result['seed']}.", ""]
     if result.get("partial"):
         lines += ["The run was stopped before its end: what follows is a part.", ""]
     if result.get("quick"):
@@ -586,7 +607,7 @@ def page(name: str, result: Row, pictures: Path) -> list[str]:
     ]
     rows = result.get("substep", []) + [row | {"sand": True} for row in result.get("sand", [])]
     if rows:
-        lines += _rollout_lines(rows, result)
+        lines += _rollout_lines(rows)
     if any("failed" not in row for row in rows):
         picture = f"speed_{result['kind']}.png"
         _plot(result, pictures / picture)
@@ -596,11 +617,6 @@ def page(name: str, result: Row, pictures: Path) -> list[str]:
     if result.get("frame"):
         lines += _frame_lines(result["frame"])
     return lines
-
-
-def limit_lines() -> list[str]:
-    """What limits the speed; nothing while ``LIMITS`` is empty."""
-    return ["## What limits the speed", "", *(f"- {line}" for line in LIMITS), ""] if LIMITS else []
 
 
 def _table(head: list[str], rows: list[tuple[str, Row, Callable[[Row], list[str]]]]) -> list[str]:
@@ -613,20 +629,7 @@ def _table(head: list[str], rows: list[tuple[str, Row, Callable[[Row], list[str]
     return [*lines, ""]
 
 
-def _rollout_lines(rows: list[Row], result: Row) -> list[str]:
-    good = [row for row in rows if "failed" not in row]
-    rule = (inspect.getdoc(fewest_bytes) or "").split("\n\nArgs:")[0]
-    lines = []
-    if good:
-        lines += [
-            f"Time of a substep: that of a rollout of {good[0]['substeps']} substeps of {result['dt_s']:g} s by their",
-            "number, with sorting, wind and the fields of the particles at the end. Without what a rollout costs once:",
-            "the slope between that and a rollout three times as long. Memory: the peak of torch's allocator. Error:",
-            "the largest difference from the torch path in float64, of positions by the largest displacement and of",
-            "velocities by the largest velocity. The sheet starts with waves of 1 m/s; `updated` has a grid of 100³",
-            "nodes. Torch: the same with `transfer: torch`.",
-            "",
-        ]
+def _rollout_lines(rows: list[Row]) -> list[str]:
     head = ["substep", "kernels", "nodes with mass", "median [ms]", "quartiles [ms]", "slope [ms]", "torch [ms]"]
     head += ["fewest bytes [MB]", "moved [GB/s]", "share of the copy [%]", "of the slope [%]", "memory [MiB]"]
     head += ["error of positions", "of velocities"]
@@ -646,18 +649,18 @@ def _rollout_lines(rows: list[Row], result: Row) -> list[str]:
             f"{100 * row['share']:.1f}",
             slope,
             "-" if row["memory_bytes"] is None else f"{row['memory_bytes'] / 2**20:,.0f}",
-            *(error.get("failed") or ("-" if key not in error else f"{error[key]:.1e}") for key in ERRORS),
+            *(
+                error.get("failed") or ("-" if key not in error else f"{error[key]:.1e}")
+                for key in ("position", "velocity")
+            ),
         ]
 
     def label(row: Row) -> str:
         what = "block of sand" if row.get("sand") else "sheet in wind"
-        return f"`{row['formulation']}`, {what}, {row.get('particles', row['asked']):,} particles"
+        steps = f", {row['substeps']} substeps" if "substeps" in row else ""
+        return f"`{row['formulation']}`, {what}, {row.get('particles', row['asked']):,} particles{steps}"
 
-    lines += _table(head, [(label(row), row, cells) for row in rows])
-    return [*lines, rule, "", "What fits into the caches may be moved faster than the copy.", ""]
-
-
-ERRORS = ("position", "velocity")
+    return _table(head, [(label(row), row, cells) for row in rows])
 
 
 def _batch_lines(rows: list[Row]) -> list[str]:
@@ -718,7 +721,7 @@ def _plot(result: Row, path: Path) -> None:
     sand = [row for row in result.get("sand", []) if "failed" not in row]
     with_memory = any(row["memory_bytes"] is not None for row in sheets + sand)
     figure, grid = plt.subplots(
-        1, 1 + with_memory, figsize=(6 + 5 * with_memory, 5.2), layout="constrained", squeeze=False
+        1, 1 + with_memory, figsize=(6.5 + 5 * with_memory, 5.4), layout="constrained", squeeze=False
     )
     axes = grid[0]
 
@@ -729,8 +732,9 @@ def _plot(result: Row, path: Path) -> None:
             axis.loglog(*zip(*pairs, strict=True), **style)
 
     copy = result["copy"]["bytes_per_s"]
+    star = {"color": "tab:brown", "marker": "*", "markersize": 11, "linestyle": "", "label": "updated, sand: rollout"}
     for name, color in (("total", "tab:blue"), ("updated", "tab:orange")):
-        rows = [row for row in sheets if row["formulation"] == name]
+        rows = sorted((r for r in sheets if r["formulation"] == name), key=lambda r: r["particles"])
         whole = {"color": color, "marker": "o", "label": f"{name}: rollout"}
         draw(axes[0], rows, lambda r: r["median_ms"], **whole)
         low, high = ([row[f"quartile_{end}_ms"] for row in rows] for end in ("low", "high"))
@@ -740,10 +744,10 @@ def _plot(result: Row, path: Path) -> None:
         draw(axes[0], rows, lambda r: (r["torch"] or {}).get("median_ms"), **own, label=f"{name}: transfer torch")
         floor = {"color": color, "linestyle": ":", "label": f"{name}: fewest bytes at the copy's bandwidth"}
         draw(axes[0], rows, lambda r: 1e3 * r["bytes"] / copy, **floor)
+        if name == "total":  # so that each formulation has its column of the legend
+            draw(axes[0], sand, lambda r: r["median_ms"], **star)
         if with_memory:
             draw(axes[1], rows, lambda r: (r["memory_bytes"] or 0) / 2**20, color=color, marker="o")
-    star = {"color": "tab:brown", "marker": "*", "markersize": 11, "linestyle": "", "label": "updated, sand: rollout"}
-    draw(axes[0], sand, lambda r: r["median_ms"], **star)
     axes[0].set_ylabel("time of a substep [ms]")
     if with_memory:
         draw(axes[1], sand, lambda r: (r["memory_bytes"] or 0) / 2**20, **star)
@@ -753,7 +757,7 @@ def _plot(result: Row, path: Path) -> None:
         axis.grid(True, which="major", linewidth=0.4, alpha=0.6)
     figure.suptitle(f"{result['device']}, sheet in wind", fontsize=10)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2 + with_memory, fontsize=8)
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)

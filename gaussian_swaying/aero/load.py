@@ -49,6 +49,12 @@ class WindLoad:
                 f"Expected one `wind` for each of the {tuple(normal.shape[:-2])} scenes, but got {len(self.wind)}."
             )
 
+    def tensors(self) -> list[Tensor]:
+        """All that the force depends on and that might ask for a gradient."""
+        winds = (self.wind,) if isinstance(self.wind, WindField) else self.wind
+        held = [t for module in (self.aero, *winds) for t in (*module.parameters(), *module.buffers())]
+        return [self.normal, self.area, *held]
+
     def winds(self, time: Tensor, dt: float, steps: int) -> Tensor:
         """Air velocity at the start of each of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on [m/s].
 

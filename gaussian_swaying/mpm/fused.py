@@ -217,14 +217,17 @@ class FusedSolver(ABC):
         graphs = self._graphs[key]
         if graphs is None:
             graphs = self._graphs[key] = {}
-            while len(self._graphs) > 16:  # grids that were left behind
-                del self._graphs[next(iter(self._graphs))]
         for size in GRAPHS:
             while steps >= size:
                 if size not in graphs:
                     graphs[size] = self._record(lambda size=size: several(size))  # type: ignore[misc]
                 graphs[size].replay()
                 steps -= size
+
+    def _forget_graphs(self) -> None:
+        """Drop all graphs, and with the last of them their pool."""
+        self._graphs.clear()
+        self._pool = None
 
     def _record(self, work: Callable[[], None]) -> torch.cuda.CUDAGraph:
         """A graph of what ``work`` launches; all graphs share one pool, as no two run at once."""
@@ -432,7 +435,7 @@ class FusedUpdated(FusedSolver):
         self.constants[:, 8] = area
 
     def _take_grid(self, grid: GridSpec, width: int) -> None:
-        """Make room for a grid, and forget the graphs of a smaller one."""
+        """Make room for a grid, and forget the graphs of another one."""
         nodes = grid.node_count * self.scenes
         if nodes > len(self.velocity) or width != self.momentum.shape[1]:
             room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
@@ -440,8 +443,9 @@ class FusedUpdated(FusedSolver):
             self.velocity = torch.zeros(room, 4, device=self.device)
             held = room if len(self.solver._acting) else 0
             self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
-            self._graphs.clear()
+            self._forget_graphs()
         if grid != self.grid:
+            self._forget_graphs()  # they read the node positions
             self.grid, self.node_position = grid, None
             if any(b.needs_position or b.needs_lattice for b in self.solver._acting):
                 self.node_position = grid.node_positions(self.velocity)
@@ -469,6 +473,7 @@ class FusedUpdated(FusedSolver):
 
     def _load(self, state: MPMState) -> None:
         """Sort the particles by cell and take their fields."""
+        self.momentum.zero_()  # whatever a part that was broken off has left
         grid = state.grid
         place = (state.position.reshape(-1, 3) / grid.dx - 0.5).floor_().int()
         (ox, oy, oz), (nx, ny, nz) = grid.offset, grid.resolution

@@ -252,7 +252,8 @@ class MPMSolver(nn.Module):
         if torch.is_grad_enabled():
             points = self.points
             own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
-            if any(t is not None and t.requires_grad for t in (*own, *tensors)):
+            held = [t for boundary in self._acting for t in (*boundary.parameters(), *boundary.buffers())]
+            if any(t is not None and t.requires_grad for t in (*own, *held, *tensors)):
                 if self.transfer == "triton":
                     raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
                 return None
@@ -503,8 +504,7 @@ class MPMSolver(nn.Module):
         """
         load = force_fn if isinstance(force_fn, WindLoad) else None
         if force_fn is None or load is not None:
-            patches = () if load is None else (load.normal, load.area)
-            fused = self.fused(*_tensors(state), *patches)
+            fused = self.fused(*_tensors(state), *([] if load is None else load.tensors()))
             if fused is not None:
                 return fused.rollout(state, dt, steps, load)[0]
         winds = None if load is None else load.winds(state.time, dt, steps)
@@ -555,7 +555,7 @@ class MPMSolver(nn.Module):
         marks = sorted({math.ceil((k + 1) * steps / looks) for k in range(looks)})
         load = force_fn if isinstance(force_fn, WindLoad) else None
         if (force_fn is None or load is not None) and self.stiffness_damping == 0:
-            fused = self.fused(*_tensors(state), *(() if load is None else (load.normal, load.area)))
+            fused = self.fused(*_tensors(state), *([] if load is None else load.tensors()))
             if fused is not None and fused.watches:
                 state, cells = fused.rollout(state, dt, steps, load, looks=marks)
                 return state, dt * cells

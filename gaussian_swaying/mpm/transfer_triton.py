@@ -25,6 +25,12 @@ from gaussian_swaying.mpm.materials_triton import kelvin_voigt_pk1, kirchhoff, p
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
 
+# Numbers that differ from body to body and from grid to grid. Triton would compile a kernel again for each of them that
+# becomes one or a multiple of 16, in the middle of a run, and even while a graph is recorded.
+VARIES = (
+    "count", "cells", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz", "nx", "ny", "nz",
+)  # fmt: skip
+
 
 # Loops over i and j stay loops in Triton's intermediate code: unrolled, its passes take minutes.
 
@@ -251,7 +257,7 @@ def _account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, 
     tl.store(load + index, work, mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def total_particles(
     fraction, material, law, law_table, patch, force_in, load, order, count,
     cell_start, cell_node, cell_scene, cells,
@@ -354,7 +360,7 @@ def total_particles(
                             tl.store(out + 4 + c, s4, real)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def total_nodes(
     active, source, inverse_mass, held, nodes, cells, partial, displacement, velocity, shift,
     schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z,
@@ -416,7 +422,7 @@ def total_nodes(
         tl.store(out + 2, m2 * inverse, mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def total_read(
     fraction, load, order, rest, count, particle_cell, cell_node, displacement, velocity, kick_before,
     position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
@@ -468,7 +474,7 @@ def _locate(x, dx, o, n):
     return first, lattice - base, (first >= 0) & (first <= n - 3)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def updated_particles(
     moving, order, load, count,
     momentum, velocity, schedule, winds, scenes, coefficients, first_step, step_offset, law_table, force_in,
@@ -649,7 +655,7 @@ def updated_particles(
         _store9(moving + 15 * count, count, index, C, mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
     gravity_x, gravity_y, gravity_z,
@@ -683,7 +689,7 @@ def updated_nodes(
         tl.store(row + c, zero, used)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def updated_load(
     order, position, velocity, affine, F_elastic, F_total, lost, internal, constants, moving, count,
     PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, BLOCK: tl.constexpr,
@@ -704,7 +710,7 @@ def updated_load(
         _store9(moving + 35 * count, count, index, _load9(F_total, 1, where * 9, mask), mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def updated_read(
     order, moving, count, position, velocity, affine, F_elastic, F_total, lost, internal,
     PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, BLOCK: tl.constexpr,
@@ -724,7 +730,7 @@ def updated_read(
         _store9(F_total, 1, where * 9, _load9(moving + 35 * count, count, index, mask), mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, scene_size, BLOCK: tl.constexpr):
     """``updated``: mass that the particles of a boundary bring to each node."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -765,7 +771,7 @@ def _keep_largest(out, speed, mask):
     tl.atomic_max(out, tl.max(speed))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def largest_speed(F_in, density, mu_in, lam_in, velocity, out, count, SPATIAL: tl.constexpr, BLOCK: tl.constexpr):
     """Largest speed of a wave [m/s] (and of its particle, SPATIAL) of fixed corotated bodies, into ``out``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -780,7 +786,7 @@ def largest_speed(F_in, density, mu_in, lam_in, velocity, out, count, SPATIAL: t
     _keep_largest(out, speed, mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def total_look(
     fraction, material, count, particle_cell, cell_node, displacement, out, sx, sy, inverse_dx, BLOCK: tl.constexpr
 ):
@@ -798,7 +804,7 @@ def total_look(
     _keep_largest(out, _wave_speed(F, density, mu, lam, False), mask)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def updated_look(moving, count, out, BLOCK: tl.constexpr):
     """``updated``: as ``largest_speed``, from the rows of ``moving``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -184,7 +184,7 @@ def test_elastic_laws_in_total(kernel_device, law):
 
 @pytest.mark.parametrize(
     ("kernel_device", "law"),
-    _on("corotated", "sand", interpreted=["neo-hookean", "hencky", *(name for name in PLASTIC if name != "sand")]),
+    _on("corotated", "sand", interpreted=["neo-hookean", "hencky", "sand that swells", "snow", "fluid"]),
     indirect=["kernel_device"],
 )
 def test_laws_in_updated(kernel_device, law):
@@ -198,7 +198,7 @@ def test_laws_in_updated(kernel_device, law):
 
 @pytest.mark.parametrize(
     ("kernel_device", "names"),
-    _on([*ELASTIC, *PLASTIC], interpreted=[[*ELASTIC], ["neo-hookean", "fluid", "snow"], ["corotated", "sand"]]),
+    _on([*ELASTIC, *PLASTIC], interpreted=[[*ELASTIC], ["neo-hookean", "fluid", "snow"]]),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else f"{len(value)} laws",
 )
@@ -247,10 +247,12 @@ def test_crushed_and_inverted_particles(kernel_device, formulation):
 
 @pytest.mark.parametrize(
     ("kernel_device", "case"),
-    _on(
-        *((formulation, sizes) for formulation in FORMULATIONS for sizes in ([1], [1, 3, 0, 64, 65, 130])),
-        interpreted=[("updated", [0, 70])],
-    ),
+    [
+        *_on(
+            ("total", [1]), ("updated", [1]), ("total", [1, 3, 0, 64, 65, 130]), interpreted=[("updated", [3, 0, 64])]
+        ),
+        pytest.param("cuda", ("updated", [1, 3, 0, 64, 65, 130]), marks=pytest.mark.gpu),
+    ],
     indirect=["kernel_device"],
     ids=str,
 )
@@ -319,9 +321,8 @@ def test_what_leaves_the_grid_is_lost(kernel_device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
-    points = _points(kernel_device, count=10, batch=(3,))
+    points = _points(kernel_device, count=10, batch=(2,))
     winds = [
-        WIND,
         WindField([0.0, -8.0, 0.0]),
         WindField(schedule=[FlowKey(0.0, [1.0, 0, 0]), FlowKey(DT, [9.0, 0, 0])]),
     ]
@@ -370,7 +371,7 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
 )
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_every_kind_of_wind(kernel_device, formulation, settings):
-    _agree(_wind_case(_points(kernel_device), formulation, steps=2, aero=settings))
+    _agree(_wind_case(_points(kernel_device), formulation, aero=settings))
 
 
 def test_patches_without_flow_and_flat_ones(kernel_device):
@@ -439,7 +440,7 @@ def test_mls(kernel_device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_without_any_load(kernel_device, formulation):
-    """And with an infinitely long substep's worth of damping left out."""
+    """And without damping."""
     points = _points(kernel_device)
     ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2), formulation, damping=0.0)
     _agree(ends)
@@ -454,7 +455,7 @@ def test_a_substep_that_changes(kernel_device, formulation):
 
     def run(solver, state):
         states = []
-        for dt, steps in ((1e-3, 2), (4e-4, 1), (1e-4, 1), (9e-4, 1)):
+        for dt, steps in ((1e-3, 1), (4e-4, 2), (1e-4, 1)):
             state = solver.rollout(state, dt, steps, load)
             states.append(state)
         return states
@@ -465,13 +466,28 @@ def test_a_substep_that_changes(kernel_device, formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     """Longer than the schedule or the order of the particles lasts; the wind goes on, and so does the work."""
-    monkeypatch.setattr(fused, "MAX_STEPS", 2)
+    monkeypatch.setattr(fused, "MAX_STEPS", 4)
     monkeypatch.setattr(fused, "RESORT", 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
+    points = _points(kernel_device, count=12, batch=(2,))
+    load = _load(points, [wind, WIND])
+
+    def start(solver, points):
+        state = _start(solver, points, strain=0.05)
+        return state if solver.total_lagrangian else state.replace(velocity=10 * state.velocity)  # across cells
+
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 5, load), formulation, start=start)
+    _agree(ends)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_looks_on_the_way(kernel_device, formulation, monkeypatch):
+    """The largest Courant number seen, and the same motion; some looks fall between two sorts of the particles."""
+    monkeypatch.setattr(fused, "RESORT", 2)
     points = _points(kernel_device)
-    load = _load(points, wind)
-    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 5, load), formulation)
-    _agree(ends, names=["position", "velocity", "F_elastic"])
+    found = _both(points, lambda solver, state: solver.watched_rollout(state, DT, 3, _load(points), 3), formulation)
+    _agree([state for state, _ in found])
+    assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=TOLERANCE)
 
 
 @pytest.mark.gpu
@@ -510,7 +526,7 @@ BOUNDARIES = {
     ("kernel_device", "name"),
     [
         *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
-        *(("interpreted", name) for name in ("two pins", "handle", "plane", "knock and release")),
+        *(("interpreted", name) for name in ("two pins", "handle", "knock and release")),
     ],
     indirect=["kernel_device"],
 )
@@ -576,16 +592,6 @@ def test_the_work_is_what_the_energy_grows_by(kernel_device, drag_step):
     torch.testing.assert_close(end.work.float(), growth, rtol=0, atol=2e-6 * float(solver.energies(end)["kinetic"]))
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_energies(kernel_device, formulation):
-    points = _points(kernel_device)
-    ends = _both(
-        points, lambda solver, state: solver.energies(solver.rollout(state, DT, 2)), formulation, gravity=(0, 0, -9.8)
-    )
-    for name, expected in ends[0].items():
-        torch.testing.assert_close(ends[1][name], expected, rtol=1e-4, atol=0)
-
-
 @pytest.mark.gpu
 def test_total_gives_the_same_bits_twice():
     pytest.importorskip("triton")
@@ -623,12 +629,17 @@ def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary
     _start(solvers[1], points)
     winds = [WIND, WIND, WIND, WindField([0.0, -40.0, 5.0]), WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])]
     for k, wind in enumerate(winds):
+        if k in (1, 2) and kernel_device.type == "cpu":
+            continue
         load = _load(points, wind, seed=4 if k < 4 else 11, C_D=0.5 + k)
         dt = [1e-4, 1e-4, 5e-5, 1e-4, 7e-5][k]
-        state = solvers[0].fit_grid(state, count * dt, margin=1)  # a copy of the other, or the errors add up
+        if formulation == "updated":
+            state = state.replace(grid=GridSpec(DX, (-2, -2, -2), (8, 8, 8 if k < 4 else 9)))
         expected, found = (solver.rollout(state, dt, count, load) for solver in solvers)
         _agree([expected, found], tolerance=1e-4)
-        state = expected
+        state = expected  # or the errors add up
+        if k == 3 and kernel_device.type == "cuda":
+            assert any(solvers[1].fused()._graphs.values())
     # a rollout without wind is another kind
     _agree([solver.rollout(state, 1e-4, 2) for solver in solvers])
     _agree([solver.rollout(state, 1e-4, 2, load) for solver in solvers])
@@ -644,7 +655,7 @@ def test_a_grid_that_comes_back(kernel_device):
     _start(solvers[1], points)
     load = _load(points)
     near, far = GridSpec(DX, (-2, -2, -2), (8, 8, 8)), GridSpec(DX, (-4, -3, -2), (8, 8, 7))
-    for grid in (near, near, far, far, near, far):
+    for grid in (near, near, far, far, near, far) if kernel_device.type == "cuda" else (near, far):
         filler = [torch.full((512, 3), 1e3, device=kernel_device) for _ in range(20)]  # over what was freed
         expected, found = (solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers)
         _agree([expected, found])
@@ -709,10 +720,6 @@ def test_courant_number_of_what_is_broken_is_not_finite(kernel_device):
 # ---- where the kernels are used
 
 
-def _elastic(formulation="total", dtype=torch.float32, device="cpu", law=None):
-    return _points(device, law).map(lambda value: value.to(dtype))
-
-
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_gradients_are_left_to_torch(kernel_device, formulation):
     points = _points(kernel_device)
@@ -726,6 +733,10 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
     assert auto.step(state, DT, force=velocity).position.requires_grad
     area = load.area.clone().requires_grad_()
     assert auto.rollout(state, DT, 1, WindLoad(load.aero, load.wind, load.normal, area)).position.requires_grad
+    knock = Impulse(Everything(), [0.0, 0.0, 0.1], end=DT)
+    knock.impulse.requires_grad_()
+    pushed = _bound(_solver("auto", formulation, boundaries=[knock]), points)
+    assert pushed.rollout(state, DT, 1).position.requires_grad
     only = _solver("triton", formulation)
     only.init_state(points)
     for attempt in (

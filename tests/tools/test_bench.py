@@ -1,6 +1,5 @@
 """The pages are what the recorded JSON says, and the measurements run."""
 
-import importlib.util
 import json
 import math
 import shutil
@@ -10,19 +9,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def bench():
-    """tools/bench.py with the two modules beside it."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    try:
-        spec = importlib.util.spec_from_file_location("bench", ROOT / "tools/bench.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        yield module
-    finally:
-        sys.path.remove(str(ROOT / "tools"))
 
 
 def _run(bench, monkeypatch, *arguments):

@@ -1,0 +1,126 @@
+"""The wind as a load: what it gives at each substep, and that a rollout in it is the one with its forces."""
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.load import WindLoad
+from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
+from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+DT = 1e-3
+GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
+RISING = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(4 * DT, [0.0, 20.0, 0.0])], interpolation="linear")
+
+
+def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
+    generator = torch.Generator().manual_seed(0)
+    position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
+    area = 0.02 * torch.rand(*batch, 20, dtype=torch.float64, generator=generator)
+    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch")
+    velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    state = solver.init_state(points, velocity)
+    return solver, solver.rollout(state, DT, 2), WindLoad(AeroForce(**settings), wind, normal, area)
+
+
+def test_winds_are_those_of_the_start_of_each_substep():
+    *_, load = _setting()
+    time = torch.tensor(0.01, dtype=torch.float64)
+    winds = load.winds(time, DT, 5)
+    assert winds.shape == (5, 3)
+    assert winds.dtype == torch.float64
+    for k in range(5):
+        assert torch.equal(winds[k], GUSTS(time + k * DT))
+    assert len(set(winds[:, 0].tolist())) > 1
+
+
+def test_each_scene_has_its_own_wind():
+    *_, load = _setting(batch=(2,), wind=[GUSTS, RISING])
+    time = torch.tensor(DT, dtype=torch.float64)
+    winds = load.winds(time, DT, 3)
+    assert winds.shape == (3, 2, 1, 3)
+    assert torch.equal(winds[:, 1, 0], torch.stack([RISING(time + k * DT) for k in range(3)]))
+
+
+@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
+def test_force_is_that_on_the_deformed_patches(drag_step):
+    _, state, load = _setting(drag_step=drag_step, C_L=0.4)
+    wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
+    force, resistance = load.force(state, wind)
+    normal, area = deform_patch(state.F_total, load.normal, load.area)
+    assert float((area / load.area - 1).abs().max()) > 1e-4
+    assert torch.equal(force, load.aero(wind, state.velocity, normal, area))
+    if drag_step == "explicit":
+        assert resistance is None
+    else:
+        assert torch.equal(resistance, load.aero.resistance(wind, state.velocity, area))
+    now, _ = load(state)
+    assert torch.equal(now, load.force(state, GUSTS(state.time))[0])
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
+def test_a_rollout_in_the_wind_is_the_one_with_its_forces(formulation, drag_step):
+    solver, state, load = _setting(wind=RISING, formulation=formulation, drag_step=drag_step)
+    whole = solver.rollout(state, DT, 5, load)
+    step = state
+    for _ in range(5):
+        force, drag = load(step)
+        step = solver.step(step, DT, force, drag)
+    called = solver.rollout(state, DT, 5, lambda s: load(s))
+    calm = solver.rollout(state, DT, 5)
+    for other in (step, called):
+        torch.testing.assert_close(whole.position, other.position, rtol=0, atol=1e-12)
+        torch.testing.assert_close(whole.work, other.work)
+    assert float((whole.position - calm.position).abs().max()) > 1e-6
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_batch_is_each_scene_by_itself(formulation):
+    solver, state, load = _setting(batch=(2,), wind=[GUSTS, RISING], formulation=formulation)
+    force, _ = load(state)
+    for k, wind in enumerate(load.wind):
+        normal, area = deform_patch(state.F_total[k], load.normal[k], load.area[k])
+        expected = load.aero(wind(state.time), state.velocity[k], normal, area)
+        torch.testing.assert_close(force[k], expected)
+    assert solver.rollout(state, DT, 2, load).work.shape == (2,)
+
+
+def test_gradients_reach_the_patches_and_the_coefficients():
+    solver, state, load = _setting()
+    load.area.requires_grad_()
+    load.aero.C_D.requires_grad_()
+    end = solver.rollout(state, DT, 3, load).position.square().sum()
+    for found in torch.autograd.grad(end, [load.area, load.aero.C_D]):
+        assert float(found.abs().max()) > 0
+
+
+@pytest.mark.parametrize("name", ["area", "normal", "C_D", "flows"])
+def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
+    """The rollout as a whole is asked about it, before any substep."""
+    solver, state, load = _setting(wind=WindField([3.0, 0.0, 0.0]))
+    owner = {"C_D": load.aero, "flows": load.wind}.get(name, load)
+    getattr(owner, name).requires_grad_()
+    asked = []
+    monkeypatch.setattr(solver, "fused", lambda *tensors: asked.append(tensors))
+    solver.rollout(state, DT, 1, load)
+    assert any(tensor.requires_grad for tensor in asked[0])
+    asked.clear()
+    solver.watched_rollout(state, DT, 1, load)
+    assert any(tensor.requires_grad for tensor in asked[0])
+
+
+def test_shapes_are_checked():
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
+    with pytest.raises(ValueError, match="normal"):
+        WindLoad(AeroForce(), GUSTS, torch.zeros(4), torch.ones(4))
+    with pytest.raises(ValueError, match="area"):
+        WindLoad(AeroForce(), GUSTS, up, torch.ones(3))
+    with pytest.raises(ValueError, match=r"one `wind` for each of the \(2,\) scenes, but got 3"):
+        WindLoad(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
+    with pytest.raises(ValueError, match=r"one `wind` for each of the \(\) scenes, but got 1"):
+        WindLoad(AeroForce(), [GUSTS], up, torch.ones(4))

@@ -1,0 +1,226 @@
+"""The decompositions and materials of the kernels, one function at a time, against float64.
+
+A test of many matrices at once, singular, inverted, tiny and with repeated stretches among them, costs next to nothing
+here, in the interpreter too.
+"""
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="needs triton, which there is for Linux only")
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.mpm import fused, linalg, materials, materials_triton
+from gaussian_swaying.mpm.linalg_triton import polar_rotation, svd3
+from gaussian_swaying.mpm.materials_triton import kirchhoff, law_row, pk1
+
+MU, LAM, DT = 4e3, 6e3, 1e-3
+
+
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def kernel_device(request):
+    """Where the functions run."""
+    if request.param == "interpreted" and not fused.INTERPRETED:
+        pytest.skip("on this machine the kernels are compiled")
+    return torch.device("cuda" if request.param == "cuda" else "cpu")
+
+
+@triton.jit
+def _matrix(pointer, index, mask):
+    return (
+        tl.load(pointer + index, mask, 0.0), tl.load(pointer + index + 1, mask, 0.0),
+        tl.load(pointer + index + 2, mask, 0.0), tl.load(pointer + index + 3, mask, 0.0),
+        tl.load(pointer + index + 4, mask, 0.0), tl.load(pointer + index + 5, mask, 0.0),
+        tl.load(pointer + index + 6, mask, 0.0), tl.load(pointer + index + 7, mask, 0.0),
+        tl.load(pointer + index + 8, mask, 0.0),
+    )  # fmt: skip
+
+
+@triton.jit
+def _decompose(F_in, rotation, left, stretch, axes, count, BLOCK: tl.constexpr):
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < count
+    F = _matrix(F_in, place * 9, mask)
+    R = polar_rotation(F)
+    u, a, v = svd3(F)
+    for k in tl.static_range(9):
+        tl.store(rotation + place * 9 + k, R[k], mask)
+        tl.store(left + place * 9 + k, u[k], mask)
+        tl.store(axes + place * 9 + k, v[k], mask)
+    for k in tl.static_range(3):
+        tl.store(stretch + place * 3 + k, a[k], mask)
+
+
+@triton.jit
+def _elastic(F_in, out, mu, lam, count, KINDS: tl.constexpr, BLOCK: tl.constexpr):
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < count
+    F = _matrix(F_in, place * 9, mask)
+    stress = pk1(F, F[0] * 0 + mu, F[0] * 0 + lam, KINDS, KINDS)
+    for k in tl.static_range(9):
+        tl.store(out + place * 9 + k, stress[k], mask)
+
+
+@triton.jit
+def _plastic(F_in, internal_in, F_out, internal_out, out, mu, lam, dt, row, count, KINDS: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip # noqa: E501
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < count
+    F = _matrix(F_in, place * 9, mask)
+    mu = F[0] * 0 + mu
+    lam = F[0] * 0 + lam
+    internal = tl.load(internal_in + place, mask, 0.0)
+    p0 = tl.load(row)
+    p1 = tl.load(row + 1)
+    p2 = tl.load(row + 2)
+    F, internal, stress = kirchhoff(F, mu, lam, internal, KINDS, p0, p1, p2, dt, KINDS, True)
+    tl.store(internal_out + place, internal, mask)
+    for k in tl.static_range(9):
+        tl.store(out + place * 9 + k, stress[k], mask)
+        tl.store(F_out + place * 9 + k, F[k], mask)
+
+
+def _matrices(device, unique=False):
+    """Deformation gradients; with ``unique`` only those with one nearest rotation, well away from others."""
+    generator = torch.Generator().manual_seed(0)
+    turns = torch.linalg.qr(torch.randn(2, 900, 3, 3, dtype=torch.float64, generator=generator))[0]
+    turns = turns * torch.linalg.det(turns)[..., None, None]
+    special = torch.tensor(
+        [
+            [1.0, 1.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0 - 1e-6, 1.0 - 2e-6], [1.5, 0.7, 1e-3],
+            [1.5, 0.7, 1e-6], [3.0, 1e-2, 5e-3], [1.2, 1.0, -0.3], [1.2, 1.1, -0.02], [20.0, 1.0, 0.4],
+            [1.0001, 1.0, 0.9999], [0.051, 0.05, 0.049], [3.0, 0.9, -0.5], [1.5, 0.7, 0.0],
+        ],
+        dtype=torch.float64,
+    )  # fmt: skip
+    if not unique:
+        more = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e-8, 1e-9, 1e-9], [1e4, 1e3, 1.0], [1.0, 1.0, -1.0]]
+        special = torch.cat([special, torch.tensor(more, dtype=torch.float64)])
+    stretch = special[torch.arange(900) % len(special)]
+    F = turns[0] @ stretch.diag_embed() @ turns[1].mT
+    random = torch.eye(3, dtype=torch.float64) + 0.4 * torch.randn(900, 3, 3, dtype=torch.float64, generator=generator)
+    if unique:
+        values = torch.linalg.svdvals(random) * torch.tensor([1, 1, 1.0])
+        values[:, 2] *= torch.linalg.det(random).sign()
+        random = random[values[:, 1] + values[:, 2] > 0.05]
+    return torch.cat([F, random]).float().to(device)
+
+
+def _launch(kernel, count, *arguments, **options):
+    block = 128 if arguments[0].is_cuda else 2048  # the interpreter is quick with long vectors
+    kernel[(-(-count // block),)](*arguments, count, **options, BLOCK=block)
+
+
+def _decomposed(F):
+    rotation, left, axes = (torch.empty_like(F) for _ in range(3))
+    stretch = F.new_empty(len(F), 3)
+    _launch(_decompose, len(F), F, rotation, left, stretch, axes)
+    return rotation, left, stretch, axes
+
+
+def test_decomposition(kernel_device):
+    """U and V are rotations for any F, and the product is F, to some units in the last place of its size."""
+    F = _matrices(kernel_device)
+    _, left, stretch, axes = _decomposed(F)
+    eye = torch.eye(3, device=kernel_device).expand_as(F)
+    for turn in (left, axes):
+        torch.testing.assert_close(turn @ turn.mT, eye, rtol=0, atol=3e-6)
+        torch.testing.assert_close(torch.linalg.det(turn), torch.ones_like(stretch[:, 0]), rtol=0, atol=3e-6)
+    size = torch.linalg.matrix_norm(F)
+    product = left @ stretch.diag_embed() @ axes.mT
+    assert bool((torch.linalg.matrix_norm(product - F) <= 3e-6 * size + 1e-14).all())
+    exact = linalg.svd3(F.double())[1]
+    assert bool(((stretch - exact).abs().amax(-1) <= 2e-6 * size + 1e-14).all())
+    assert bool((stretch[:, 0] >= stretch[:, 1]).all() & (stretch[:, 1] >= stretch[:, 2].abs() - 1e-6 * size).all())
+
+
+def test_nearest_rotation(kernel_device):
+    """Five iterations serve stretches that differ by a factor of fifty; beyond, as in torch."""
+    F = _matrices(kernel_device, unique=True)
+    rotation = _decomposed(F)[0]
+    exact = linalg.polar_rotation(F.double()).float()
+    values = linalg.svd3(F.double())[1]
+    easy = values[:, 2].abs() * 50 > values[:, 0]
+    assert int(easy.sum()) > 900
+    torch.testing.assert_close(rotation[easy], exact[easy], rtol=0, atol=1e-5)
+    assert bool(torch.isfinite(_decomposed(_matrices(kernel_device))[0]).all())
+
+
+LAWS = [
+    materials.FixedCorotated(),
+    materials.NeoHookean(),
+    materials.StVKHencky(),
+    materials.Sand(),
+    materials.Sand(35.0, volume_correction=True),
+    materials.Metal(2e2),
+    materials.Metal(2e2, 5e3),
+    materials.Plasticine(1e3, 2e3, 1e2),
+    materials.Plasticine(1e3, 5e4, 1e2),
+    materials.Foam(1e2, 4.0),
+    materials.Foam(1e2, 1e4),
+    materials.Foam(0.0, 0.0),
+    materials.Snow(),
+    materials.Fluid(),
+]
+
+
+def _close(found, exact, what):
+    """To 2e-5 of the size of each matrix, or of the stress at a strain of one."""
+    error = (found.double() - exact).flatten(1).abs().amax(-1)
+    size = exact.flatten(1).abs().amax(-1)
+    assert bool((error <= 2e-5 * (size + what)).all()), f"{float((error / (size + what)).max()):.1e}"
+
+
+@pytest.mark.parametrize("law", LAWS[:3], ids=lambda law: type(law).__name__)
+def test_elastic_stress(kernel_device, law):
+    F = _matrices(kernel_device, unique=True)
+    out = torch.empty_like(F)
+    _launch(_elastic, len(F), F, out, MU, LAM, KINDS=law_row(law)[0])
+    wide = F.double()
+    mu, lam = (torch.full_like(wide[:, 0, 0], value) for value in (MU, LAM))
+    exact = law.pk1(wide, mu, lam)
+    values = linalg.svd3(wide)[1]
+    easy = values[:, 2].abs() * 50 > values[:, 0]
+    _close(out[easy], exact[easy], MU + LAM)
+    assert bool(torch.isfinite(out).all())
+
+
+@pytest.mark.parametrize("k", range(3, len(LAWS)), ids=lambda k: f"{type(LAWS[k]).__name__} {k}")
+def test_flow_and_stress(kernel_device, k):
+    """Stretches, internal variable and Kirchhoff stress after the return map; all plastic kinds at once on a GPU."""
+    law = LAWS[k]
+    F = _matrices(kernel_device, unique=True)
+    kind, values = law_row(law)
+    generator = torch.Generator().manual_seed(1)
+    start = 0.0 if law.internal is None else law.internal
+    internal = (start + 0.02 * torch.rand(len(F), generator=generator)).to(kernel_device)
+    F_out, stress, inner = torch.empty_like(F), torch.empty_like(F), torch.empty_like(internal)
+    row = torch.tensor(values, device=kernel_device)
+    _launch(_plastic, len(F), F, internal, F_out, inner, stress, MU, LAM, DT, row, KINDS=kind)
+    mu, lam = (torch.full(F.shape[:1], value, dtype=torch.float64, device=kernel_device) for value in (MU, LAM))
+    given = None if law.internal is None else internal.double()
+    exact, memory = law.return_map(F.double(), mu, lam, given, DT)
+    _close(F_out, exact, 1.0)
+    if memory is not None:
+        _close(inner[:, None], memory[:, None], 1.0)
+    else:
+        assert torch.equal(inner, internal)
+    _close(stress, law.kirchhoff(exact, mu, lam, memory), MU + LAM)
+    assert float((F_out - F).abs().max()) > 1e-2
+
+
+def test_every_law_of_the_package_has_a_form():
+    """A new one must be added to the kernels, or here."""
+    laws = {
+        law for law in vars(materials).values() if isinstance(law, type) and issubclass(law, materials.ConstitutiveLaw)
+    }
+    concrete = {law for law in laws if not law.__name__.startswith("_") and law is not materials.ConstitutiveLaw}
+    assert {type(law) for law in LAWS} == concrete
+    kinds = [law_row(law)[0] for law in LAWS]
+    assert all(kind & (materials_triton.ELASTIC_KINDS.value | materials_triton.PLASTIC_KINDS.value) for kind in kinds)
+
+    class Own(materials.NeoHookean):
+        pass
+
+    assert law_row(Own()) is None

@@ -1,0 +1,213 @@
+"""``bench.py speed`` measures all it should, keeps what it has, and its page and goals say what was recorded."""
+
+import json
+import sys
+
+import pytest
+import torch
+
+SPREAD = {"median_ms", "quartile_low_ms", "quartile_high_ms", "repeats"}
+ROLLOUT = SPREAD | {"formulation", "asked", "particles", "grid_nodes", "nodes", "substeps", "path", "graph_ms", "bytes"}
+ROLLOUT |= {"bytes_per_s", "share", "share_graph", "memory_bytes", "error", "torch"}
+BATCH = {
+    "formulation",
+    "gusts",
+    "scenes",
+    "particles",
+    "substeps",
+    "together",
+    "apart",
+    "together_per_s",
+    "apart_per_s",
+}
+BATCH |= {"ratio", "difference"}
+FRAME = SPREAD | {"dx_m", "main", "simulation_ms", "shading_ms", "rendering_ms", "particles", "width", "height"}
+FRAME |= {"substeps", "renderer", "memory_bytes", "build_memory_bytes"}
+
+
+def _run(bench, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["bench.py", *map(str, arguments)])
+    bench.main()
+
+
+def _speed(bench, monkeypatch, results, *arguments):
+    _run(bench, monkeypatch, "speed", "--device", "cpu", "--quick", "--results", results, *arguments)
+    return json.loads((results / "speed_cpu.json").read_text())
+
+
+def test_everything_is_measured_and_shown(bench, monkeypatch, tmp_path):
+    results = tmp_path / "docs/results"
+    found = _speed(bench, monkeypatch, results)
+    assert found["device"].endswith("threads")
+    assert found["versions"]["torch"]
+    assert (found["seed"], found["kind"], found["quick"], found["dt_s"]) == (0, "cpu", True, 1e-4)
+    assert "partial" not in found
+    assert found["copy"]["bytes_per_s"] > 0
+    for section, keys in (("substep", ROLLOUT), ("sand", ROLLOUT), ("batch", BATCH), ("frame", FRAME)):
+        for row in found[section]:
+            assert set(row) == keys
+    assert [(r["formulation"], r["asked"]) for r in found["substep"]] == [
+        (name, count) for count in (64, 400) for name in ("total", "updated")
+    ]
+    for row in found["substep"] + found["sand"]:
+        assert 0 < row["quartile_low_ms"] <= row["median_ms"] <= row["quartile_high_ms"]
+        assert row["bytes_per_s"] == pytest.approx(1e3 * row["bytes"] / row["median_ms"])
+        assert row["share"] == pytest.approx(row["bytes_per_s"] / found["copy"]["bytes_per_s"])
+        assert (row["error"] is None) == (row["particles"] == 400)
+        if row["error"]:
+            assert max(row["error"].values()) < 2e-3
+    for row in found["batch"]:
+        assert row["ratio"] == pytest.approx(row["apart"]["median_ms"] / row["together"]["median_ms"])
+        assert row["difference"] < 1e-5
+    (frame,) = found["frame"]
+    assert (frame["particles"], frame["width"], frame["height"], frame["main"]) == (1536, 64, 36, True)
+
+    _run(bench, monkeypatch, "pages", "--results", results)
+    text = (tmp_path / "docs/benchmarks.md").read_text()
+    assert text.count("| `total`, sheet in wind, ") == 2
+    assert "| `updated`, block of sand, 64 particles, 4 substeps |" in text
+    assert "| 2 of 64 particles, `updated`, gusts, 4 substeps |" in text
+    assert "| dx = 0.1 m, 1,536 Gaussians, 64x36 |" in text
+    assert "per particle, position and deformation gradient (12) are read and written" in text
+    assert "(pictures/speed_cpu.png)" in text
+    assert (tmp_path / "docs/pictures/speed_cpu.png").stat().st_size > 10_000
+    assert "failed" not in text
+
+
+def test_a_run_that_is_killed_keeps_what_it_has(bench, monkeypatch, tmp_path):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench.speed_cases, "bench_frame", killed)
+    with pytest.raises(KeyboardInterrupt):
+        _speed(bench, monkeypatch, tmp_path / "d/r", "--only", "sand,frame")
+    found = json.loads((tmp_path / "d/r/speed_cpu.json").read_text())
+    assert found["partial"] is True
+    assert len(found["sand"]) == 1
+    assert found["frame"] == []
+    _run(bench, monkeypatch, "pages", "--results", tmp_path / "d/r")
+    assert "The run was stopped before its end" in (tmp_path / "d/benchmarks.md").read_text()
+
+
+def test_a_case_without_memory_is_recorded_and_the_others_are_measured(bench, monkeypatch, tmp_path):
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(bench.speed_cases, "bench_rollout", full)
+    found = _speed(bench, monkeypatch, tmp_path / "d/r", "--only", "sand,batch")
+    assert found["sand"] == [{"formulation": "updated", "asked": 64, "failed": "out of memory"}]
+    assert all("ratio" in row for row in found["batch"])
+    _run(bench, monkeypatch, "pages", "--results", tmp_path / "d/r")
+    assert (
+        "| `updated`, block of sand, 64 particles | failed: out of memory |"
+        in (tmp_path / "d/benchmarks.md").read_text()
+    )
+
+
+def test_an_error_that_cannot_be_measured_does_not_cost_the_time(bench, monkeypatch, tmp_path):
+    def full(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes")
+
+    monkeypatch.setattr(bench.speed_cases, "error_of", full)
+    (row,) = _speed(bench, monkeypatch, tmp_path / "d/r", "--only", "sand")["sand"]
+    assert row["error"] == {"failed": "out of memory"}
+    assert row["median_ms"] > 0
+
+
+def test_only_keeps_the_other_sections(bench, monkeypatch, tmp_path):
+    results = tmp_path / "d/r"
+    first = _speed(bench, monkeypatch, results, "--only", "substep", "--counts", "36")
+    assert [row["particles"] for row in first["substep"]] == [36, 36]
+    both = _speed(bench, monkeypatch, results, "--only", "sand")
+    assert both["substep"] == first["substep"]
+    assert len(both["sand"]) == 1
+    with pytest.raises(SystemExit, match="not sandd"):
+        _speed(bench, monkeypatch, results, "--only", "sandd")
+
+
+def test_the_fewest_bytes(bench):
+    """Ten particles and four nodes, by hand: four bytes times the numbers that go in and out."""
+    count = bench.speed_cases.fewest_bytes
+    # rest position 3, volume, mu, lambda; of a node u and v in and out, and its mass
+    assert count("total", 10, 4) == 4 * (10 * (3 + 3) + 4 * (6 + 6 + 1))
+    assert count("total", 10, 4, wind=True) - count("total", 10, 4) == 4 * 10 * (3 + 1)
+    # x and F in and out, mass, volume, mu, lambda; of a node mass and momentum, and velocity, in and out
+    assert count("updated", 10, 4) == 4 * (10 * (3 + 9 + 3 + 9 + 4) + 4 * (8 + 6))
+    assert count("updated", 10, 4, plastic=True) - count("updated", 10, 4) == 4 * 10 * (9 + 9)
+    assert count("updated", 1000, 0, wind=True) == 128_000
+
+
+def test_nodes_in_reach(bench):
+    count = bench.speed_cases.nodes_in_reach
+    position = torch.tensor([[0.5, 0.5, 0.5], [0.51, 0.49, 0.52], [0.61, 0.5, 0.5], [0.91, 0.5, 0.5]])
+    assert count(position[:1], 0.1) == 27
+    assert count(position[:2], 0.1) == 27  # the same cell
+    assert count(position[:3], 0.1) == 36  # and the next
+    assert count(position, 0.1) == 63  # those from 4 to 7 along x, and from 8 to 10
+
+
+def test_the_error_is_that_of_the_end(bench):
+    """One hundredth of the largest displacement beside the truth is an error of one hundredth."""
+    speed = bench.speed_cases
+    with torch.inference_mode():
+        points = speed.sheet(64, torch.device("cpu"))
+        load = speed.wind_load(points, speed.wind(0, True, torch.device("cpu")))
+        solver = bench.MPMSolver(dx=0.05)
+        start = solver.init_state(points, speed.waves(points.position))
+        end = solver.rollout(start, 1e-4, 32, load)
+        assert max(speed.error_of(end, solver, start, 32, load).values()) < 1e-4
+        moved = (end.position - start.position).abs().amax()
+        off = end.replace(position=end.position + 0.01 * moved, velocity=1.02 * end.velocity)
+        error = speed.error_of(off, solver, start, 32, load)
+    assert error["position"] == pytest.approx(0.01, rel=0.01)
+    assert error["velocity"] == pytest.approx(0.02, rel=0.01)
+
+
+def _recorded(speed, factor):
+    """A run on a GPU that needs so many times what the goals ask for."""
+    rows = [
+        {"formulation": name, "asked": asked, "median_ms": factor * limit}
+        for (name, asked), (limit, _) in speed.SUBSTEP_GOALS.items()
+    ]
+    rows += [
+        {"formulation": name, "asked": 10_000_000, "median_ms": factor**2 * 11 * speed.SUBSTEP_GOALS[name, 10**6][0]}
+        for name in ("total", "updated")
+    ]
+    frame = {"main": True, "median_ms": factor * 8.0, "memory_bytes": int(factor * 0.3 * 2**30)}
+    batch = [{"formulation": f, "gusts": g, "ratio": 20 / factor} for f in ("total", "updated") for g in (False, True)]
+    sand = [{"asked": 1_000_000, "median_ms": 0.6 * factor}]
+    return {"kind": "cuda", "substep": rows, "sand": sand, "batch": batch, "frame": [frame]}
+
+
+@pytest.mark.parametrize(
+    ("factor", "reached", "stretched"), [(0.4, True, True), (0.99, True, False), (2, False, False)]
+)
+def test_goals_are_reached_or_not(bench, factor, reached, stretched):
+    found = bench.speed_cases.goals(_recorded(bench.speed_cases, factor))
+    assert len(found) == 13
+    assert {goal[2] for goal in found} == {reached}
+    assert {goal[4] for goal in found} - {None} == {stretched}
+    lines = [bench._goal_row(*goal) for goal in found]
+    assert all(line.split(" | ")[2] == ("yes" if reached else "no") for line in lines)
+    assert all(line.count(" | ") == 4 for line in lines)
+
+
+def test_goals_of_what_is_missing_or_failed(bench):
+    speed = bench.speed_cases
+    assert {goal[1:3] for goal in speed.goals({"kind": "cuda"})} == {("not measured", None)}
+    failed = _recorded(speed, 0.5)
+    for section in ("substep", "sand", "batch", "frame"):
+        failed[section] = [row | {"failed": "out of memory"} for row in failed[section]]
+    assert {goal[1:3] for goal in speed.goals(failed)} == {("out of memory", False)}
+    assert speed.goals({"kind": "cpu"}) == []
+
+
+def test_goals_of_the_other_runs(bench):
+    """The substep on a CPU, and the captured object on a GPU."""
+    slow = {"device": "a CPU", "substep": [{"particles": 19_881, "formulation": "updated", "median_ms": 41.0}]}
+    assert bench._goals(slow)[0].endswith("within 40 ms | 41.0 ms (`updated`) | no | - | - |")
+    wall = {"simulation": 3.0, "shading": 1.0, "rendering": 1.0}
+    run = {"name": "guitar, 1920x1080", "frames": 250, "wall_s": wall, "peak_memory_bytes": {"device": 10**8}}
+    run |= {"lost_particles": 0, "stretch_min": 0.9, "stretch_max": 1.1}
+    rows = [row for row in bench._goals({"device": "NVIDIA H200", "runs": [run]}) if "within 6 s" in row]
+    assert [row.split(" | ", 1)[1] for row in rows] == ["5.0 s | yes | 3 s | no |"]
