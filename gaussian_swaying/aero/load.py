@@ -55,7 +55,30 @@ class WindLoad:
         held = [t for module in (self.aero, *winds) for t in (*module.parameters(), *module.buffers())]
         return [self.normal, self.area, *held]
 
-    def winds(self, time: Tensor, dt: float, steps: int) -> Tensor:
+    @property
+    def device(self) -> torch.device | None:
+        """Where the wind is; None if its parts are on several devices."""
+        found = {buffer.device for wind in self._fields for buffer in wind.buffers()}
+        return found.pop() if len(found) == 1 else None
+
+    @property
+    def _fields(self) -> tuple[WindField, ...]:
+        return (self.wind,) if isinstance(self.wind, WindField) else self.wind
+
+    def fingerprint(self) -> tuple[tuple[object, ...], ...]:
+        """What the winds depend on besides the contents of buffers: the same as long as none of it has changed."""
+        plain = (bool, int, float, str, type(None))
+        return tuple(
+            (
+                id(part),
+                *(value for value in vars(part).values() if isinstance(value, plain)),
+                *(buffer.data_ptr() for buffer in part.buffers(recurse=False)),
+            )
+            for wind in self._fields
+            for part in wind.modules()
+        )
+
+    def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         """Air velocity at the start of each of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on [m/s].
 
         Returns:

@@ -43,7 +43,9 @@ def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tens
     Returns:
         float64, shape (..., lanes).
     """
-    key = _mix(torch.tensor(_signed(seed * 0x9E3779B97F4A7C15 + stream + 1), device=counter.device))
+    # filled on the device: nothing is copied to it, so that a CUDA graph can record it
+    start = _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
+    key = _mix(torch.full((), start, dtype=torch.int64, device=counter.device))
     lane = torch.arange(lanes, device=counter.device)
     bits = _mix(_mix(key + counter[..., None] * _signed(0x9E3779B97F4A7C15)) + lane * _signed(0xD1B54A32D192ED03))
     return (((bits >> 11) & ((1 << 53) - 1)).double() + 0.5) / float(1 << 53)

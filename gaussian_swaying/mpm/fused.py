@@ -87,6 +87,11 @@ class FusedSolver(ABC):
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in solver.gravity]
         self._patch_of: tuple[Tensor, Tensor] | None = None
+        self._winds_out = torch.zeros(MAX_STEPS, self.scenes, 3, dtype=torch.float64, device=self.device)
+        self._wind_key: Any = None
+        self._wind_of: Any = None  # kept, so that no other object gets its id
+        self._wind_graph: torch.cuda.CUDAGraph | None = None
+        self._recordable = False
         self._graphs: dict[Any, dict[int, torch.cuda.CUDAGraph] | None] = {}
         self._pool: Any = None
 
@@ -157,7 +162,7 @@ class FusedSolver(ABC):
             "UNIT": False,
         }
         if load is not None:
-            self._take_wind(load, load.winds(state.time, dt, steps))
+            self._take_wind(load, self._winds(load, dt, steps))
             options["IMPLICIT"] = load.aero.drag_step == "semi_implicit"
             options["PROJECTED"] = load.aero.law == "projected"
             options["LIFT"] = load.aero.lift_direction == "lift"
@@ -174,6 +179,26 @@ class FusedSolver(ABC):
         if load is not None or force is not None:
             changes["work"] = state.work + self._work().reshape(state.work.shape)
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
+
+    def _winds(self, load: WindLoad, dt: float, steps: int) -> Tensor:
+        """``load.winds`` from now on; from the second call on by a graph, as gusts take many small kernels."""
+        key = load.fingerprint()
+        if self._wind_key != key:
+            self._wind_key, self._wind_graph, self._wind_of = key, None, load.wind
+            self._recordable = self.device.type == "cuda" and load.device == self.device
+            return load.winds(self.time, dt, steps)
+        if self._wind_graph is None and self._recordable:
+            try:
+                self._wind_graph = self._record(lambda: self._winds_out.copy_(self._all_winds(load)), pool=None)
+            except RuntimeError:  # a modulation that makes the host wait, say
+                self._recordable = False
+        if self._wind_graph is None:
+            return load.winds(self.time, dt, steps)
+        self._wind_graph.replay()
+        return self._winds_out[:steps]
+
+    def _all_winds(self, load: WindLoad) -> Tensor:
+        return load.winds(self.time, self.dt, MAX_STEPS).reshape(MAX_STEPS, -1, 3).expand(-1, self.scenes, -1)
 
     def _take_wind(self, load: WindLoad, winds: Tensor) -> None:
         aero = load.aero
@@ -220,7 +245,9 @@ class FusedSolver(ABC):
         for size in GRAPHS:
             while steps >= size:
                 if size not in graphs:
-                    graphs[size] = self._record(lambda size=size: several(size))  # type: ignore[misc]
+                    if self._pool is None:  # one for all graphs, as no two run at once
+                        self._pool = torch.cuda.graph_pool_handle()
+                    graphs[size] = self._record(lambda size=size: several(size), self._pool)  # type: ignore[misc]
                 graphs[size].replay()
                 steps -= size
 
@@ -229,18 +256,16 @@ class FusedSolver(ABC):
         self._graphs.clear()
         self._pool = None
 
-    def _record(self, work: Callable[[], None]) -> torch.cuda.CUDAGraph:
-        """A graph of what ``work`` launches; all graphs share one pool, as no two run at once."""
+    def _record(self, work: Callable[[], Any], pool: Any) -> torch.cuda.CUDAGraph:
+        """A graph of what ``work`` launches, with its memory in a pool, or in one of its own."""
         graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(self.device)
         stream.wait_stream(torch.cuda.current_stream(self.device))
-        if self._pool is None:
-            self._pool = torch.cuda.graph_pool_handle()
         collecting = gc.isenabled()
         gc.disable()  # a graph that is freed meanwhile would break the recording
         try:
             with torch.cuda.stream(stream):
                 # other threads, that of the recorder say, may go on
-                graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+                graph.capture_begin(pool=pool, capture_error_mode="thread_local")
                 try:
                     work()
                 finally:
@@ -598,6 +623,19 @@ def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
         state.velocity.contiguous(), out, count, SPATIAL=spatial, BLOCK=block, num_warps=4,
     )  # fmt: skip
     return out[0] / solver.dx
+
+
+def elastic_energy(solver: MPMSolver, F: Tensor) -> Tensor | None:
+    """Energy density [J/m³] of a body of one fixed corotated law, shape (..., P); None for other laws."""
+    if [type(law) for law in solver.points.laws] != [FixedCorotated]:
+        return None
+    out = torch.empty(F.shape[:-2], device=F.device)
+    block = 128
+    kernels.elastic_energy[(-(-out.numel() // block),)](
+        F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), BLOCK=block,
+        num_warps=4,
+    )  # fmt: skip
+    return out
 
 
 def _nothing() -> None:

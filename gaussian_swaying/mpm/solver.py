@@ -720,7 +720,14 @@ class MPMSolver(nn.Module):
             # lumped APIC kinetic energy: the affine part carries D = dx²/4 per particle (Jiang et al. 2015)
             spread = 0.25 * self.dx**2 * state.affine.square().sum((-1, -2))
             kinetic = 0.5 * (points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
-        density = self.laws.energy(state.F_elastic, state.internal)
+        density = None
+        wanted = torch.is_grad_enabled() and (state.F_elastic.requires_grad or self.laws.mu.requires_grad)
+        if self._fused_obstacle is None and not wanted:
+            from gaussian_swaying.mpm.fused import elastic_energy
+
+            density = elastic_energy(self, state.F_elastic)
+        if density is None:
+            density = self.laws.energy(state.F_elastic, state.internal)
         height = (state.position * self._gravity.to(state.position)).sum(-1)
         return {
             "kinetic": kinetic,

@@ -19,7 +19,16 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.aero.force_triton import aero_force, deform_patch
-from gaussian_swaying.mpm.linalg_triton import axpy9, cofactor, largest_eigenvalue, matmul, scale9, transpose
+from gaussian_swaying.mpm.linalg_triton import (
+    axpy9,
+    cofactor,
+    largest_eigenvalue,
+    matmul,
+    polar_rotation,
+    scale9,
+    square9,
+    transpose,
+)
 from gaussian_swaying.mpm.materials_triton import kelvin_voigt_pk1, kirchhoff, pk1
 
 SCHEDULE = 4
@@ -289,7 +298,12 @@ def total_particles(
     for chunk in range(0, longest, LANES):
         index = start[:, None] + chunk + lane
         mask = index < end[:, None]
-        f = _load3(fraction, count, index, mask)
+        # a lane without a particle stands in the middle of the cell: outside it F might be inverted, which takes long
+        f = (
+            tl.load(fraction + index, mask, 1.0),
+            tl.load(fraction + count + index, mask, 1.0),
+            tl.load(fraction + 2 * count + index, mask, 1.0),
+        )
         volume = tl.load(material + index, mask, 0.0)
         mu = tl.load(material + count + index, mask, 0.0)
         lam = tl.load(material + 2 * count + index, mask, 0.0)
@@ -762,6 +776,20 @@ def _wave_speed(F, density, mu, lam, SPATIAL: tl.constexpr):
         stretch = largest_eigenvalue(matmul(transpose(F), F))
         squared = squared * tl.maximum(stretch, 1.0, tl.PropagateNan.ALL)
     return tl.sqrt(squared)
+
+
+@triton.jit
+def elastic_energy(F_in, mu_in, lam_in, out, count, BLOCK: tl.constexpr):
+    """Energy density of fixed corotated particles [J/m³], as ``constitutive.fixed_corotated_energy``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    F = _load9(F_in, 1, index * 9, mask)
+    mu = tl.load(mu_in + index, mask, 0.0)
+    lam = tl.load(lam_in + index, mask, 0.0)
+    cof = cofactor(F)
+    change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
+    stretch = square9(axpy9(1.0, F, -1.0, polar_rotation(F)))
+    tl.store(out + index, mu * stretch + 0.5 * lam * change * change, mask)
 
 
 @triton.jit
