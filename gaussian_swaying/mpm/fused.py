@@ -310,8 +310,8 @@ class FusedTotal(FusedSolver):
         shifts = [(i * ny + j) * nz + k for i in range(3) for j in range(3) for k in range(3)]
         below = [active - shift for shift in shifts]
         self.source = torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below])
-        self.displacement = torch.zeros(len(inverse), 4, device=self.device)
-        self.velocity = torch.zeros(len(inverse), 4, device=self.device)
+        self.fields = torch.zeros(len(inverse), 8, device=self.device)
+        self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = _lanes(sizes)
         acting = solver._acting
         self.plain = all(type(b) is PinnedRegion and b.start <= 0 and b.end == math.inf for b in acting)
@@ -358,7 +358,7 @@ class FusedTotal(FusedSolver):
         _, ny, nz = self.grid.resolution
         block = 128
         kernels.total_look[(-(-self.count // block),)](
-            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.displacement, self.speed,
+            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
             ny * nz, nz, 1 / self.grid.dx, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
@@ -371,7 +371,7 @@ class FusedTotal(FusedSolver):
         kernels.total_particles[(-(-self.cells // per_program),)](
             self.fraction, self.material, self.law, self.law_table, self.patch, self.force_in, self.load, self.order,
             self.count, self.cell_start, self.cell_node, self.cell_scene, self.cells,
-            self.displacement, self.velocity, partial,
+            self.fields, partial,
             self.schedule, self.winds, self.scenes, self.coefficients, self.first_step, offset,
             ny * nz, nz, 1 / self.grid.dx, solver.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
@@ -381,7 +381,7 @@ class FusedTotal(FusedSolver):
         nodes = len(self.active)
         kernels.total_nodes[(-(-nodes // block),)](
             self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
-            self.displacement, self.velocity, self.shift, self.schedule, self.first_step, offset, *self.gravity,
+            self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
             HELD=self.plain and len(solver._acting) > 0, MOVE=self.plain, BLOCK=block, num_warps=2,
         )  # fmt: skip
@@ -415,7 +415,7 @@ class FusedTotal(FusedSolver):
         block = 128
         kernels.total_read[(-(-self.count // block),)](
             self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
-            self.displacement, self.velocity, self.schedule[steps], position, velocity, affine, F,
+            self.fields, self.schedule[steps], position, velocity, affine, F,
             ny * nz, nz, 1 / self.grid.dx,
             WORK=options["WIND"] or options["FORCE"], IMPLICIT=options["IMPLICIT"], BLOCK=block, num_warps=4,
         )  # fmt: skip

@@ -11,8 +11,9 @@ sums of its 27 cells. No atomics: the result is the same in every run.
 written once. Particles are sorted by cell now and then; neighbours in that order that share a cell are summed by a
 segmented scan, and only the last of each segment goes to the grid, atomically.
 
-Rows of node arrays: three components (and in ``updated`` the mass) in four columns; with implicit drag, and where
-boundaries ask for positions in ``total``, there are eight.
+Rows of node arrays: in ``total`` displacement and velocity, each in four columns of eight, a sector of memory; in
+``updated`` velocity, or momentum and mass, in four. What is summed has four columns too, or eight with implicit drag in
+``updated`` and where boundaries ask for positions in ``total``.
 """
 
 import triton
@@ -62,33 +63,54 @@ def _weights(f, inverse_dx):
 
 
 @triton.jit
-def _gather_value(field, node, sx, sy, f, wz, mask):
-    """Interpolated vector."""
-    v0 = wz[0] * 0
-    v1 = v0
-    v2 = v0
+def _gather_two(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
+    """Derivatives of columns 0 to 2 [component, axis], and columns 0 to 2 and 4 to 6 interpolated; rows of eight."""
+    zero = wz[0] * 0
+    u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
+    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for i in range(3):
-        wx, _gx = _weight(f[0], i, 1.0)
+        wx, gx = _weight(f[0], i, inverse_dx)
         for j in range(3):
-            wy, _gy = _weight(f[1], j, 1.0)
-            row = field + (node + i * sx + j * sy) * 4
+            wy, gy = _weight(f[1], j, inverse_dx)
+            row = field + (node + i * sx + j * sy) * 8
+            s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            for k in tl.static_range(3):
+                q0 = tl.load(row + k * 8, mask, 0.0)
+                q1 = tl.load(row + k * 8 + 1, mask, 0.0)
+                q2 = tl.load(row + k * 8 + 2, mask, 0.0)
+                s0 += wz[k] * q0
+                s1 += wz[k] * q1
+                s2 += wz[k] * q2
+                t0 += gz[k] * q0
+                t1 += gz[k] * q1
+                t2 += gz[k] * q2
+                r0 += wz[k] * tl.load(row + k * 8 + 4, mask, 0.0)
+                r1 += wz[k] * tl.load(row + k * 8 + 5, mask, 0.0)
+                r2 += wz[k] * tl.load(row + k * 8 + 6, mask, 0.0)
             w = wx * wy
-            s0 = wz[0] * tl.load(row, mask, 0.0)
-            s1 = wz[0] * tl.load(row + 1, mask, 0.0)
-            s2 = wz[0] * tl.load(row + 2, mask, 0.0)
-            for k in tl.static_range(1, 3):
-                s0 += wz[k] * tl.load(row + k * 4, mask, 0.0)
-                s1 += wz[k] * tl.load(row + k * 4 + 1, mask, 0.0)
-                s2 += wz[k] * tl.load(row + k * 4 + 2, mask, 0.0)
-            v0 += w * s0
-            v1 += w * s1
-            v2 += w * s2
-    return (v0, v1, v2)
+            dx = gx * wy
+            dy = wx * gy
+            u0 += w * s0
+            u1 += w * s1
+            u2 += w * s2
+            v0 += w * r0
+            v1 += w * r1
+            v2 += w * r2
+            g00 += dx * s0
+            g01 += dy * s0
+            g02 += w * t0
+            g10 += dx * s1
+            g11 += dy * s1
+            g12 += w * t1
+            g20 += dx * s2
+            g21 += dy * s2
+            g22 += w * t2
+    return (u0, u1, u2), (g00, g01, g02, g10, g11, g12, g20, g21, g22), (v0, v1, v2)
 
 
 @triton.jit
 def _gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
-    """Interpolated vector and its derivatives [component, axis]."""
+    """Interpolated vector and its derivatives [component, axis]; rows of eight."""
     zero = wz[0] * 0
     v0, v1, v2 = zero, zero, zero
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -96,12 +118,12 @@ def _gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
         wx, gx = _weight(f[0], i, inverse_dx)
         for j in range(3):
             wy, gy = _weight(f[1], j, inverse_dx)
-            row = field + (node + i * sx + j * sy) * 4
+            row = field + (node + i * sx + j * sy) * 8
             s0, s1, s2, t0, t1, t2 = zero, zero, zero, zero, zero, zero
             for k in tl.static_range(3):
-                q0 = tl.load(row + k * 4, mask, 0.0)
-                q1 = tl.load(row + k * 4 + 1, mask, 0.0)
-                q2 = tl.load(row + k * 4 + 2, mask, 0.0)
+                q0 = tl.load(row + k * 8, mask, 0.0)
+                q1 = tl.load(row + k * 8 + 1, mask, 0.0)
+                q2 = tl.load(row + k * 8 + 2, mask, 0.0)
                 s0 += wz[k] * q0
                 s1 += wz[k] * q1
                 s2 += wz[k] * q2
@@ -270,7 +292,7 @@ def _account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, 
 def total_particles(
     fraction, material, law, law_table, patch, force_in, load, order, count,
     cell_start, cell_node, cell_scene, cells,
-    displacement, velocity, partial,
+    fields, partial,
     schedule, winds, scenes, coefficients, first_step, step_offset,
     sx, sy, inverse_dx, viscous_time,
     KINDS: tl.constexpr, MULTI: tl.constexpr, WIND: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr,
@@ -308,12 +330,14 @@ def total_particles(
         mu = tl.load(material + count + index, mask, 0.0)
         lam = tl.load(material + 2 * count + index, mask, 0.0)
         wz, gz = _weights(f[2], inverse_dx)
-        u, F = _gather(displacement, node, sx, sy, f, wz, gz, inverse_dx, known)
-        F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
         if VISCOUS:
-            v, rate = _gather(velocity, node, sx, sy, f, wz, gz, inverse_dx, known)
+            u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known)
+            v, rate = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known)
         elif WIND or FORCE:
-            v = _gather_value(velocity, node, sx, sy, f, wz, known)
+            u, F, v = _gather_two(fields, node, sx, sy, f, wz, gz, inverse_dx, known)
+        else:
+            u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known)
+        F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
         if MULTI:
             kind = tl.load(law_table + 5 * tl.load(law + index, mask, 0)).to(tl.int32)
         else:
@@ -376,7 +400,7 @@ def total_particles(
 
 @triton.jit(do_not_specialize=VARIES)
 def total_nodes(
-    active, source, inverse_mass, held, nodes, cells, partial, displacement, velocity, shift,
+    active, source, inverse_mass, held, nodes, cells, partial, fields, shift,
     schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z,
     IMPLICIT: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, HELD: tl.constexpr, MOVE: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -412,7 +436,7 @@ def total_nodes(
         push = kick / (1 + kick * drag * inverse)
     else:
         push = kick
-    place = velocity + node * 4
+    place = fields + node * 8 + 4
     v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
     v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay
     v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
@@ -425,7 +449,7 @@ def total_nodes(
     tl.store(place + 1, v1, mask)
     tl.store(place + 2, v2, mask)
     if MOVE:
-        to = displacement + node * 4
+        to = fields + node * 8
         tl.store(to, tl.load(to, mask, 0.0) + dt * v0, mask)
         tl.store(to + 1, tl.load(to + 1, mask, 0.0) + dt * v1, mask)
         tl.store(to + 2, tl.load(to + 2, mask, 0.0) + dt * v2, mask)
@@ -438,7 +462,7 @@ def total_nodes(
 
 @triton.jit(do_not_specialize=VARIES)
 def total_read(
-    fraction, load, order, rest, count, particle_cell, cell_node, displacement, velocity, kick_before,
+    fraction, load, order, rest, count, particle_cell, cell_node, fields, kick_before,
     position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
     WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -449,8 +473,8 @@ def total_read(
     node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
     where = tl.load(order + index, mask, 0)
     wz, gz = _weights(f[2], inverse_dx)
-    u, F = _gather(displacement, node, sx, sy, f, wz, gz, inverse_dx, mask)
-    v, rate = _gather(velocity, node, sx, sy, f, wz, gz, inverse_dx, mask)
+    u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask)
+    v, rate = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask)
     if WORK:
         zero = f[0] * 0
         _account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
@@ -816,7 +840,7 @@ def largest_speed(F_in, density, mu_in, lam_in, velocity, out, count, SPATIAL: t
 
 @triton.jit(do_not_specialize=VARIES)
 def total_look(
-    fraction, material, count, particle_cell, cell_node, displacement, out, sx, sy, inverse_dx, BLOCK: tl.constexpr
+    fraction, material, count, particle_cell, cell_node, fields, out, sx, sy, inverse_dx, BLOCK: tl.constexpr
 ):
     """``total``: as ``largest_speed``, from the nodal displacements."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -824,7 +848,7 @@ def total_look(
     f = _load3(fraction, count, index, mask)
     node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
     wz, gz = _weights(f[2], inverse_dx)
-    _u, F = _gather(displacement, node, sx, sy, f, wz, gz, inverse_dx, mask)
+    _u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask)
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)

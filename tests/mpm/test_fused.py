@@ -184,7 +184,7 @@ def test_elastic_laws_in_total(kernel_device, law):
 
 @pytest.mark.parametrize(
     ("kernel_device", "law"),
-    _on("corotated", "sand", interpreted=["neo-hookean", "hencky", "sand that swells", "snow", "fluid"]),
+    _on("corotated", interpreted=["neo-hookean", "hencky", "sand", "sand that swells", "snow", "fluid"]),
     indirect=["kernel_device"],
 )
 def test_laws_in_updated(kernel_device, law):
@@ -270,7 +270,7 @@ def test_cells_of_any_size(kernel_device, case, monkeypatch):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("lanes", [8, 32, 128])
+@pytest.mark.parametrize("lanes", [32, 128])
 def test_every_number_of_lanes(lanes, monkeypatch):
     """The others are used elsewhere."""
     pytest.importorskip("triton")
@@ -314,6 +314,8 @@ def test_what_leaves_the_grid_is_lost(kernel_device):
         assert states[1].lost.tolist() == [False] * 19 + [True] * 5
         assert float(states[1].velocity[-1].abs().max()) == 0.0
         assert torch.equal(states[1].position[-5:-2], state.position[-5:-2])
+        states.append(solver.rollout(states[1].replace(grid=GridSpec(DX, (-1, -6, -1), (9, 12, 9))), DT, 1))
+        assert torch.equal(states[2].lost, states[1].lost)  # though most are back
         return states
 
     _agree(_both(points, run, start=start, gravity=(0, 0, 0)))
@@ -374,6 +376,7 @@ def test_every_kind_of_wind(kernel_device, formulation, settings):
     _agree(_wind_case(_points(kernel_device), formulation, aero=settings))
 
 
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
 def test_patches_without_flow_and_flat_ones(kernel_device):
     """Air that moves with the patch, and a patch that is pressed to nothing."""
 
@@ -428,14 +431,22 @@ def test_a_force_function_is_called_each_substep(kernel_device, formulation):
     assert times == [0.0, DT] * 2
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_gravity_damping_and_viscosity(kernel_device, formulation):
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    _on(("total", False), ("updated", True), interpreted=[("updated", False)]),
+    indirect=["kernel_device"],
+    ids=str,
+)
+def test_gravity_damping_and_viscosity(kernel_device, case):
+    """And MLS-MPM."""
+    formulation, mls = case
     options = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
-    _agree(_wind_case(_points(kernel_device), formulation, steps=2, **options))
+    _agree(_wind_case(_points(kernel_device), formulation, steps=2, mls=mls, **options))
 
 
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
 def test_mls(kernel_device):
-    _agree(_wind_case(_points(kernel_device), "updated", steps=2, mls=True))
+    _agree(_wind_case(_points(kernel_device), "updated", mls=True))
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -550,7 +561,7 @@ def test_boundaries(kernel_device, formulation, name):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_boundaries_of_a_batch(kernel_device, formulation):
-    points = _points(kernel_device, count=10, batch=(2,))
+    points = _points(kernel_device, count=40, batch=(2,))
     boundaries = [SequentialRelease(LEFT, [0.0, 1.0, 0.0], end=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
     _agree(_wind_case(points, formulation, steps=2, boundaries=boundaries))
 
