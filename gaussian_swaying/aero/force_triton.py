@@ -39,7 +39,12 @@ def aero_force(
         pressure = drag * speed * speed * sign
     shear = friction * speed
     if UNIT:
-        shear = shear * speed / tl.maximum(tl.sqrt(tx * tx + ty * ty + tz * tz), 1.2e-38)
+        # the direction first: it is zero in a wind along the normal, where the rest would overflow
+        size = tl.maximum(tl.sqrt(tx * tx + ty * ty + tz * tz), 1.2e-38)
+        tx = tx / size
+        ty = ty / size
+        tz = tz / size
+        shear = shear * speed
     across = cross3(relative, n)
     if LIFT:
         side = cross3(across, relative)

@@ -9,12 +9,17 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._graphs import fingerprint, record
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.surface import deform_patch
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.state import MPMState
+
+
+RECORDED = 256
+"""Substeps for which a recorded wind gives its velocity."""
 
 
 class WindLoad:
@@ -48,42 +53,70 @@ class WindLoad:
             raise ValueError(
                 f"Expected one `wind` for each of the {tuple(normal.shape[:-2])} scenes, but got {len(self.wind)}."
             )
+        self._key: tuple[tuple[object, ...], ...] = ()
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without the graph, which nothing can copy."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
+        return kept | {"_key": (), "_graph": None}
 
     def tensors(self) -> list[Tensor]:
         """All that the force depends on and that might ask for a gradient."""
-        winds = (self.wind,) if isinstance(self.wind, WindField) else self.wind
-        held = [t for module in (self.aero, *winds) for t in (*module.parameters(), *module.buffers())]
-        return [self.normal, self.area, *held]
+        return [self.normal, self.area, *self.aero.parameters(), *self.aero.buffers(), *self._wind_tensors()]
+
+    def _wind_tensors(self) -> list[Tensor]:
+        return [t for wind in self._fields for t in (*wind.parameters(), *wind.buffers())]
 
     @property
     def device(self) -> torch.device | None:
         """Where the wind is; None if its parts are on several devices."""
-        found = {buffer.device for wind in self._fields for buffer in wind.buffers()}
+        found = {tensor.device for tensor in self._wind_tensors()}
         return found.pop() if len(found) == 1 else None
 
     @property
     def _fields(self) -> tuple[WindField, ...]:
         return (self.wind,) if isinstance(self.wind, WindField) else self.wind
 
-    def fingerprint(self) -> tuple[tuple[object, ...], ...]:
-        """What the winds depend on besides the contents of buffers: the same as long as none of it has changed."""
-        plain = (bool, int, float, str, type(None))
-        return tuple(
-            (
-                id(part),
-                *(value for value in vars(part).values() if isinstance(value, plain)),
-                *(buffer.data_ptr() for buffer in part.buffers(recurse=False)),
-            )
-            for wind in self._fields
-            for part in wind.modules()
-        )
-
     def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         """Air velocity at the start of each of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on [m/s].
 
+        Gusts take some seventy small kernels. On a GPU they are recorded in a CUDA graph at the second call if all
+        modulations are ``recordable``, and again when a number or a buffer of the wind was replaced.
+
+        Args:
+            time: Scalar float64 tensor.
+            dt: Number, or scalar float64 tensor on the same device.
+            steps: How many.
+
         Returns:
-            Shape (steps, 3), or (steps, B, 1, 3) with a wind for each scene; float64.
+            Shape (steps, 3), or (steps, B, 1, 3) with a wind for each scene; float64, on the device of ``time``.
         """
+        known = all(type(wind) is WindField for wind in self._fields) and all(
+            getattr(part, "recordable", False) for wind in self._fields for part in wind.modulations
+        )
+        on_gpu = time.is_cuda and self.device == time.device
+        if not (on_gpu and known and steps <= RECORDED) or (
+            torch.is_grad_enabled() and any(t.requires_grad for t in self._wind_tensors())
+        ):
+            return self._winds(time, dt, steps)
+        key = fingerprint(self._fields)
+        if self._key != key:  # the first time everything is compiled and loaded
+            self._key, self._graph = key, None
+            return self._winds(time, dt, steps)
+        if self._graph is None:
+            with torch.inference_mode(False):  # they may be written within inference mode and without
+                self._now, self._dt = (torch.zeros((), dtype=torch.float64, device=time.device) for _ in range(2))
+            self._graph = record(time.device, self._tabulate)
+        self._now.copy_(time)
+        self._dt.copy_(dt) if isinstance(dt, Tensor) else self._dt.fill_(dt)
+        self._graph.replay()
+        return self._table[:steps].clone()
+
+    def _tabulate(self) -> None:
+        self._table = self._winds(self._now, self._dt, RECORDED)
+
+    def _winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
         if isinstance(self.wind, WindField):
             return self.wind(times).to(time.device)

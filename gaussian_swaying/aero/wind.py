@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._graphs import Recordable
 
 
 def _signed(value: int) -> int:
@@ -62,7 +63,7 @@ def sample_index(time: Tensor, interval: float) -> Tensor:
     return torch.floor(time / interval + 1e-6).long()
 
 
-class Modulation(nn.Module, ABC):
+class Modulation(Recordable, nn.Module, ABC):
     """Base of all modulations: turns the velocity at a time into another one."""
 
     @abstractmethod
@@ -86,6 +87,8 @@ class SineSway(Modulation):
         phase: Phase at time zero [rad].
     """
 
+    recordable = True
+
     def __init__(self, amplitude: float = 0.5, period: float = 2.0, phase: float = 0.0) -> None:
         super().__init__()
         check_positive("amplitude", amplitude, allow_zero=True)
@@ -107,6 +110,8 @@ class UniformGust(Modulation):
         interval: Time between samples [s]; each holds until the next.
     """
 
+    recordable = True
+
     def __init__(self, delta: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
         check_positive("delta", delta, allow_zero=True)
@@ -127,6 +132,8 @@ class GaussianGust(Modulation):
         interval: Time between samples [s]; each holds until the next. The paper gives none. Drawn once per substep,
             white noise would fade as the substep shrinks, so the samples are tied to time instead.
     """
+
+    recordable = True
 
     def __init__(self, std: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()

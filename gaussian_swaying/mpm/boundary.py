@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.gaussians.selection import Region
 
 
@@ -121,11 +122,8 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
     return tangential + (along - removed) * normal
 
 
-class Boundary(nn.Module, ABC):
+class Boundary(Recordable, nn.Module, ABC):
     """Base of all conditions.
-
-    What :meth:`forward` does can be recorded in a CUDA graph and replayed at other times and with other substeps: it
-    copies nothing from or to the host, after a first call at most.
 
     Args:
         start: Time from which it acts [s].
@@ -223,6 +221,8 @@ class PinnedRegion(_OfParticles):
         end: Time from which it no longer acts [s]; None for never.
     """
 
+    recordable = True
+
     def __init__(self, region: Region, held_share: float = 0.07, start: float = 0.0, end: float | None = None) -> None:
         super().__init__(region, start, end)
         if not 0 <= held_share < 1:
@@ -251,6 +251,7 @@ class Handle(PinnedRegion):
     """
 
     needs_lattice = True
+    recordable = True
 
     def __init__(
         self,
@@ -313,6 +314,8 @@ class SequentialRelease(PinnedRegion):
         held_share: Share of the nodal mass in ``total``, between 0 and 1.
     """
 
+    recordable = True
+
     def __init__(
         self,
         region: Region,
@@ -362,6 +365,8 @@ class Impulse(_OfParticles):
         end: Time from which it no longer acts [s].
     """
 
+    recordable = True
+
     def __init__(self, region: Region, impulse: Sequence[float], start: float = 0.0, end: float = 0.04) -> None:
         super().__init__(region, start, end)
         if not math.isfinite(self.end):
@@ -393,6 +398,7 @@ class Plane(Boundary):
     """
 
     needs_position = True
+    recordable = True
 
     def __init__(
         self,
@@ -443,6 +449,7 @@ class EnclosingBox(Boundary):
     """
 
     needs_position = True
+    recordable = True
 
     def __init__(
         self,
@@ -489,6 +496,7 @@ class VelocityBox(Boundary):
     """
 
     needs_position = True
+    recordable = True
 
     def __init__(self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)

@@ -5,27 +5,29 @@ Used by ``MPMSolver`` in place of its torch substep where no gradient is asked f
 
 from __future__ import annotations
 
-import gc
 import math
 import os
+import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.load import WindLoad
+from gaussian_swaying._graphs import fingerprint, record
+from gaussian_swaying.aero.load import RECORDED, WindLoad
 from gaussian_swaying.mpm import transfer_triton as kernels
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.materials import FixedCorotated
 from gaussian_swaying.mpm.materials_triton import PLASTIC_KINDS, law_row
-from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.solver import MPMSolver
 
-MAX_STEPS = 256
+MAX_STEPS = RECORDED
 """Substeps whose schedule the buffers hold; longer rollouts are run in parts."""
 
 RESORT = 32
@@ -33,6 +35,9 @@ RESORT = 32
 
 GRAPHS = (16, 4, 1)
 """Numbers of substeps for which a graph is kept; a rollout is put together from them."""
+
+MAX_INDEX = 2**31
+"""Entries that the kernels, which count with 32 bits, can reach in a buffer."""
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
@@ -52,6 +57,11 @@ def unsupported(solver: MPMSolver) -> str | None:
     return None
 
 
+def made_from(solver: MPMSolver) -> tuple[object, ...]:
+    """What the buffers and graphs of a solver rest on besides its points: they hold as long as it is the same."""
+    return (solver.stiffness_damping, solver.mls, *fingerprint([*solver._acting, *solver.points.laws]))
+
+
 class FusedSolver(ABC):
     """Substeps of one solver with its material.
 
@@ -61,7 +71,8 @@ class FusedSolver(ABC):
 
     def __init__(self, solver: MPMSolver) -> None:
         points = solver.points
-        self.solver, self.device = solver, points.position.device
+        self.solver = cast("MPMSolver", weakref.proxy(solver))  # or they would keep each other, and the memory, alive
+        self.device, self.made_from = points.position.device, made_from(solver)
         self.particles = points.count
         self.count = points.mass.numel()
         self.scenes = self.count // max(self.particles, 1)
@@ -80,18 +91,13 @@ class FusedSolver(ABC):
         self.coefficients = torch.zeros(4, device=self.device)
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
-        self.watches = [type(law) for law in points.laws] == [FixedCorotated]
+        self.watches = _corotated(points)
         """Whether rollouts can look at the speed of waves."""
         self.speed = torch.zeros(1, device=self.device)
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in solver.gravity]
-        self._patch_of: tuple[Tensor, Tensor] | None = None
-        self._winds_out = torch.zeros(MAX_STEPS, self.scenes, 3, dtype=torch.float64, device=self.device)
-        self._wind_key: Any = None
-        self._wind_of: Any = None  # kept, so that no other object gets its id
-        self._wind_graph: torch.cuda.CUDAGraph | None = None
-        self._recordable = False
+        self._patch_of: list[tuple[Tensor, int | None]] = []
         self._graphs: dict[Any, dict[int, torch.cuda.CUDAGraph] | None] = {}
         self._pool: Any = None
 
@@ -123,12 +129,13 @@ class FusedSolver(ABC):
         Returns:
             The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
         """
-        self.speed.zero_()
-        for first in range(0, steps, MAX_STEPS):
-            part = min(steps - first, MAX_STEPS)
-            marks = [look - first for look in looks if first < look <= first + part]
-            state = self._advance(state, dt, part, load, force, drag, marks)
-        return state, self.speed[0] / self.solver.dx
+        with _at_home(self.speed):
+            self.speed.zero_()
+            for first in range(0, steps, MAX_STEPS):
+                part = min(steps - first, MAX_STEPS)
+                marks = [look - first for look in looks if first < look <= first + part]
+                state = self._advance(state, dt, part, load, force, drag, marks)
+            return state, self.speed[0] / self.solver.dx
 
     def _advance(
         self,
@@ -162,7 +169,7 @@ class FusedSolver(ABC):
             "UNIT": False,
         }
         if load is not None:
-            self._take_wind(load, self._winds(load, dt, steps))
+            self._take_wind(load, load.winds(self.time, self.dt, steps))
             options["IMPLICIT"] = load.aero.drag_step == "semi_implicit"
             options["PROJECTED"] = load.aero.law == "projected"
             options["LIFT"] = load.aero.lift_direction == "lift"
@@ -180,33 +187,15 @@ class FusedSolver(ABC):
             changes["work"] = state.work + self._work().reshape(state.work.shape)
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _winds(self, load: WindLoad, dt: float, steps: int) -> Tensor:
-        """``load.winds`` from now on; from the second call on by a graph, as gusts take many small kernels."""
-        key = load.fingerprint()
-        if self._wind_key != key:
-            self._wind_key, self._wind_graph, self._wind_of = key, None, load.wind
-            self._recordable = self.device.type == "cuda" and load.device == self.device
-            return load.winds(self.time, dt, steps)
-        if self._wind_graph is None and self._recordable:
-            try:
-                self._wind_graph = self._record(lambda: self._winds_out.copy_(self._all_winds(load)), pool=None)
-            except RuntimeError:  # a modulation that makes the host wait, say
-                self._recordable = False
-        if self._wind_graph is None:
-            return load.winds(self.time, dt, steps)
-        self._wind_graph.replay()
-        return self._winds_out[:steps]
-
-    def _all_winds(self, load: WindLoad) -> Tensor:
-        return load.winds(self.time, self.dt, MAX_STEPS).reshape(MAX_STEPS, -1, 3).expand(-1, self.scenes, -1)
-
     def _take_wind(self, load: WindLoad, winds: Tensor) -> None:
         aero = load.aero
         half = torch.full_like(aero.C_D, 0.5 * aero.air_density)
         self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half]))
         self.winds[: len(winds)].copy_(winds.reshape(len(winds), -1, 3).expand(-1, self.scenes, -1))
-        if self._patch_of is None or self._patch_of[0] is not load.normal or self._patch_of[1] is not load.area:
-            self._patch_of = (load.normal, load.area)
+        patches = [(t, None if t.is_inference() else t._version) for t in (load.normal, load.area)]
+        known = zip(self._patch_of, patches, strict=False)
+        if not self._patch_of or any(a is not b or v is None or v != w for (a, v), (b, w) in known):
+            self._patch_of = patches
             shape = self.solver.points.mass.shape
             self._take_patches(load.normal.expand(*shape, 3).reshape(-1, 3), load.area.expand(shape).reshape(-1))
 
@@ -234,7 +223,10 @@ class FusedSolver(ABC):
                 body(offset)
             self.first_step.add_(count)
 
-        if self.device.type != "cuda" or key not in self._graphs:
+        if steps == 0:  # nothing runs, so nothing is compiled
+            return
+        recordable = all(boundary.recordable for boundary in self.solver._acting)
+        if self.device.type != "cuda" or not recordable or key not in self._graphs:
             self._graphs[key] = None
             for _ in range(steps):
                 several(1)
@@ -247,7 +239,7 @@ class FusedSolver(ABC):
                 if size not in graphs:
                     if self._pool is None:  # one for all graphs, as no two run at once
                         self._pool = torch.cuda.graph_pool_handle()
-                    graphs[size] = self._record(lambda size=size: several(size), self._pool)  # type: ignore[misc]
+                    graphs[size] = record(self.device, lambda size=size: several(size), self._pool)  # type: ignore[misc]
                 graphs[size].replay()
                 steps -= size
 
@@ -255,26 +247,6 @@ class FusedSolver(ABC):
         """Drop all graphs, and with the last of them their pool."""
         self._graphs.clear()
         self._pool = None
-
-    def _record(self, work: Callable[[], Any], pool: Any) -> torch.cuda.CUDAGraph:
-        """A graph of what ``work`` launches, with its memory in a pool, or in one of its own."""
-        graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(self.device)
-        stream.wait_stream(torch.cuda.current_stream(self.device))
-        collecting = gc.isenabled()
-        gc.disable()  # a graph that is freed meanwhile would break the recording
-        try:
-            with torch.cuda.stream(stream):
-                # other threads, that of the recorder say, may go on
-                graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-                try:
-                    work()
-                finally:
-                    graph.capture_end()
-        finally:
-            if collecting:
-                gc.enable()
-        torch.cuda.current_stream(self.device).wait_stream(stream)
-        return graph
 
 
 class FusedTotal(FusedSolver):
@@ -324,6 +296,8 @@ class FusedTotal(FusedSolver):
         self.held = held[active].to(torch.int8)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
         self._partial: dict[int, Tensor] = {}
+        width = 8 if self.position else 4
+        _check_indices(max(8 * len(inverse), 27 * (self.cells + 1) * width, 27 * len(active)))
 
     def _take_patches(self, normal: Tensor, area: Tensor) -> None:
         order = self.order.long()
@@ -342,15 +316,15 @@ class FusedTotal(FusedSolver):
         self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
         self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
         done = 0
-        for look in [*looks, steps]:
+        for mark in sorted({*looks, steps}):
             if options["FORCE"]:  # its buffer is another one each time
-                for _ in range(look - done):
+                for _ in range(mark - done):
                     self._substep(0, options)
                     self.first_step.add_(1)
             else:
-                self._repeat(look - done, tuple(options.values()), lambda offset: self._substep(offset, options))
-            done = look
-            if look in looks:
+                self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
+            done = mark
+            if mark in looks:
                 self._look()
         return self._read(state, steps, options)
 
@@ -392,13 +366,14 @@ class FusedTotal(FusedSolver):
         """Boundary conditions that the kernels do not know, and the displacements after them."""
         solver, static = self.solver, self.solver._static
         shape = (*static["node_inverse_mass"].shape, 3)
-        velocity = self.velocity[:, :3].reshape(shape)
+        inverse = static["node_inverse_mass"]
+        # nodes without mass forget what a boundary gave them
+        velocity = torch.where(inverse[..., None] > 0, self.velocity[:, :3].reshape(shape), 0.0)
         position = lattice = None
         if self.position:
             position = static["node_rest"] + self.shift[:, :3].reshape(shape)
         if self.lattice is not None:
             lattice = self.lattice + self.displacement[:, :3].reshape(shape)
-        inverse = static["node_inverse_mass"]
         velocity = solver._constrain(
             velocity, lambda k: solver._share(k, solver.stencil, inverse, self.time), position, lattice, self.time,
             self.dt,
@@ -442,6 +417,7 @@ class FusedUpdated(FusedSolver):
         super().__init__(solver)
         points = solver.points
         self.plastic = bool(self.kinds & PLASTIC_KINDS.value)
+        _check_indices(44 * self.count)
         self.moving = torch.zeros(44 if self.plastic else 35, self.count, device=self.device)
         self.constants = torch.zeros(self.count, 9, device=self.device)
         rows = [points.mass, points.volume, solver.laws.mu, solver.laws.lam, self.law]
@@ -462,12 +438,14 @@ class FusedUpdated(FusedSolver):
     def _take_grid(self, grid: GridSpec, width: int) -> None:
         """Make room for a grid, and forget the graphs of another one."""
         nodes = grid.node_count * self.scenes
+        _check_indices(nodes * width)
         if nodes > len(self.velocity) or width != self.momentum.shape[1]:
             room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
-            self.momentum = torch.zeros(room, width, device=self.device)
-            self.velocity = torch.zeros(room, 4, device=self.device)
             held = room if len(self.solver._acting) else 0
-            self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
+            with torch.inference_mode(False):  # they may be written within inference mode and without
+                self.momentum = torch.zeros(room, width, device=self.device)
+                self.velocity = torch.zeros(room, 4, device=self.device)
+                self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
             self._forget_graphs()
         if grid != self.grid:
             self._forget_graphs()  # they read the node positions
@@ -612,30 +590,51 @@ class FusedUpdated(FusedSolver):
 
 def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     """Cells per second as ``MPMSolver`` needs them for the Courant number, in one kernel; None for other laws."""
-    points, spatial = solver.points, not solver.total_lagrangian
-    if len(points.laws) > 1 or type(points.laws[0]) is not FixedCorotated:
+    points, laws, spatial = solver.points, solver.laws, not solver.total_lagrangian
+    if not _corotated(points):
         return None
     out = torch.zeros(1, device=points.position.device)
     count, block = points.mass.numel(), 128
     density = points.mass / points.volume
-    kernels.largest_speed[(-(-count // block),)](
-        state.F_elastic.contiguous(), density.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(),
-        state.velocity.contiguous(), out, count, SPATIAL=spatial, BLOCK=block, num_warps=4,
-    )  # fmt: skip
+    with torch.cuda.device_of(out):
+        kernels.largest_speed[(-(-count // block),)](
+            state.F_elastic.contiguous(), density.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(),
+            state.velocity.contiguous(), out, count, SPATIAL=spatial, BLOCK=block, num_warps=4,
+        )  # fmt: skip
     return out[0] / solver.dx
 
 
 def elastic_energy(solver: MPMSolver, F: Tensor) -> Tensor | None:
     """Energy density [J/m³] of a body of one fixed corotated law, shape (..., P); None for other laws."""
-    if [type(law) for law in solver.points.laws] != [FixedCorotated]:
+    if not _corotated(solver.points):
         return None
     out = torch.empty(F.shape[:-2], device=F.device)
     block = 128
-    kernels.elastic_energy[(-(-out.numel() // block),)](
-        F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), BLOCK=block,
-        num_warps=4,
-    )  # fmt: skip
+    with torch.cuda.device_of(out):
+        kernels.elastic_energy[(-(-out.numel() // block),)](
+            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), BLOCK=block,
+            num_warps=4,
+        )  # fmt: skip
     return out
+
+
+def _corotated(points: MaterialPoints) -> bool:
+    return [type(law) for law in points.laws] == [FixedCorotated]
+
+
+@contextmanager
+def _at_home(buffer: Tensor) -> Iterator[None]:
+    """The device of a buffer, where Triton is to launch, and ordinary tensors, which may be written in any mode."""
+    with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
+        yield
+
+
+def _check_indices(entries: int) -> None:
+    if entries > MAX_INDEX:
+        raise ValueError(
+            f"The Triton kernels reach {MAX_INDEX:,} entries of a buffer, and this body or grid takes {entries:,}: set "
+            "`solver.transfer` to torch."
+        )
 
 
 def _nothing() -> None:
@@ -663,4 +662,4 @@ def _lanes(sizes: Tensor) -> int:
     return min(zip(lanes, work, strict=True), key=lambda pair: pair[1] * _LANE_COST[pair[0]])[0]
 
 
-__all__ = ["FusedSolver", "FusedTotal", "FusedUpdated", "unsupported"]
+__all__ = ["FusedSolver", "FusedTotal", "FusedUpdated", "elastic_energy", "largest_speed", "unsupported"]

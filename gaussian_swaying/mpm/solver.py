@@ -257,10 +257,12 @@ class MPMSolver(nn.Module):
                 if self.transfer == "triton":
                     raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
                 return None
-        if self._fused is None:
-            from gaussian_swaying.mpm.fused import FusedTotal, FusedUpdated
+        from gaussian_swaying.mpm.fused import FusedTotal, FusedUpdated, made_from
 
-            self._fused = (FusedTotal if self.total_lagrangian else FusedUpdated)(self)
+        if self._fused is None or self._fused.made_from != made_from(self):
+            # ordinary tensors, which may be written within inference mode and without
+            with torch.inference_mode(False), torch.no_grad():
+                self._fused = (FusedTotal if self.total_lagrangian else FusedUpdated)(self)
         return self._fused
 
     def held_mass(self, k: int, time: Tensor | None) -> Tensor:

@@ -802,7 +802,7 @@ def _wave_speed(F, density, mu, lam, SPATIAL: tl.constexpr):
     return tl.sqrt(squared)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=VARIES)
 def elastic_energy(F_in, mu_in, lam_in, out, count, BLOCK: tl.constexpr):
     """Energy density of fixed corotated particles [J/m³], as ``constitutive.fixed_corotated_energy``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -1,11 +1,13 @@
 """The wind as a load: what it gives at each substep, and that a rollout in it is the one with its forces."""
 
+import copy
+
 import pytest
 import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.load import WindLoad
-from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
+from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
 from gaussian_swaying.gaussians.surface import deform_patch
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -114,6 +116,15 @@ def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
     assert any(tensor.requires_grad for tensor in asked[0])
 
 
+def test_a_copy_leaves_the_graph_behind():
+    _, state, load = _setting()
+    load._graph = (value for value in ())  # like a graph, it cannot be copied
+    expected = load.winds(state.time, DT, 3)
+    for found in (copy.deepcopy(load), copy.copy(load)):
+        assert found._graph is None
+        assert torch.equal(found.winds(state.time, DT, 3), expected)
+
+
 def test_shapes_are_checked():
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
     with pytest.raises(ValueError, match="normal"):
@@ -124,3 +135,54 @@ def test_shapes_are_checked():
         WindLoad(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
     with pytest.raises(ValueError, match=r"one `wind` for each of the \(\) scenes, but got 1"):
         WindLoad(AeroForce(), [GUSTS], up, torch.ones(4))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("scenes", [0, 3])
+def test_a_recorded_wind_blows_as_the_plain_one(scenes):
+    """From the second call on a graph is replayed: another time, substep, seed, amplitude or flow still counts."""
+
+    def field(seed):
+        gusts = [SineSway(period=0.7), UniformGust(0.2), GaussianGust(0.4)]
+        return WindField([3.0, 1.0, 0.0], modulations=gusts, seed=seed).cuda()
+
+    wind = [field(seed) for seed in range(scenes)] if scenes else field(0)
+    first = wind[0] if scenes else wind
+    shape = (*((scenes,) if scenes else ()), 5, 3)
+    normal = torch.nn.functional.normalize(torch.ones(shape, device="cuda"), dim=-1)
+    load = WindLoad(AeroForce().cuda(), wind, normal, torch.ones(shape[:-1], device="cuda"))
+    changes = [
+        lambda: None,
+        lambda: None,
+        lambda: setattr(first, "seed", 7),
+        lambda: None,
+        lambda: setattr(first.modulations[0], "amplitude", 0.1),
+        lambda: None,
+        lambda: first.flows.fill_(2.0),
+        lambda: setattr(first, "flows", torch.full((1, 3), 4.0, dtype=torch.float64, device="cuda")),
+        lambda: None,
+    ]
+    for k, change in enumerate(changes):
+        change()
+        time = torch.full((), 0.13 * k, dtype=torch.float64, device="cuda")
+        dt = 1e-3 * (k + 1)
+        given = dt if k % 2 else torch.full((), dt, dtype=torch.float64, device="cuda")
+        found = load.winds(time, given, 20 + k)
+        torch.testing.assert_close(found, load._winds(time, dt, 20 + k), rtol=1e-12, atol=0)
+    assert load._graph is not None
+
+
+@pytest.mark.gpu
+def test_a_wind_that_cannot_be_recorded_is_asked_each_time():
+    class Waiting(Modulation):
+        """Makes the host wait."""
+
+        def forward(self, velocity, time, seed, stream):
+            return velocity * (1.0 if float(time.max()) < 1 else 2.0)
+
+    wind = WindField([1.0, 0.0, 0.0], modulations=[Waiting()]).cuda()
+    normal = torch.tensor([[1.0, 0.0, 0.0]], device="cuda")
+    load = WindLoad(AeroForce().cuda(), wind, normal, torch.ones(1, device="cuda"))
+    for time in (0.0, 0.5, 2.0, 0.5):
+        found = load.winds(torch.full((), time, dtype=torch.float64, device="cuda"), 1e-3, 4)
+        assert found[0, 0] == (2.0 if time > 1 else 1.0)

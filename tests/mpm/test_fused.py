@@ -6,7 +6,9 @@ interpreter.
 """
 
 import dataclasses
+import gc
 import math
+import weakref
 
 import pytest
 import torch
@@ -17,6 +19,7 @@ from gaussian_swaying.aero.wind import FlowKey, WindField
 from gaussian_swaying.gaussians.selection import Box, Everything
 from gaussian_swaying.mpm import materials
 from gaussian_swaying.mpm.boundary import (
+    Boundary,
     EnclosingBox,
     Handle,
     Impulse,
@@ -393,6 +396,21 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_wind_along_the_normal(kernel_device, formulation):
+    """Nothing of it is tangential, and the direction of nothing is nothing."""
+    points = _points(kernel_device)
+    up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
+    wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
+    load = WindLoad(AeroForce(unit_tangent=True).to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
+
+    def start(solver, points):
+        return solver.init_state(points)
+
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 1, load), formulation, start=start)
+    _agree(ends, names=["position", "velocity", "affine", "F_elastic"])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("implicit", [False, True])
 def test_forces_and_drag_of_step(kernel_device, formulation, implicit):
     points = _points(kernel_device)
@@ -557,6 +575,13 @@ def test_boundaries(kernel_device, formulation, name):
     with torch.no_grad():
         velocity = run(free, _start(free, points))[1].velocity
     assert not torch.allclose(velocity, ends[0][1].velocity, rtol=1e-3)
+
+
+def test_nodes_without_mass_are_let_go(kernel_device):
+    """They lie at the origin, as far as a boundary is told, and so in a region around it."""
+    points = _points(kernel_device, count=12)
+    boundaries = [VelocityBox(Box([-0.1] * 3, [0.1] * 3), [0.0, 1.0, 0.0], end=0.5 * DT)]
+    _agree(_both(points, lambda solver, state: solver.rollout(state, DT, 3), "total", boundaries=boundaries))
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -728,6 +753,111 @@ def test_courant_number_of_what_is_broken_is_not_finite(kernel_device):
     assert not math.isfinite(float(solver.cfl_number(state, DT)))
 
 
+# ---- buffers
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_one_solver_within_inference_mode_and_without(kernel_device, formulation):
+    points = _points(kernel_device, count=12)
+    solvers = [_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    load = _load(points)
+    with torch.inference_mode():
+        ends = [solver.rollout(_start(solver, points), DT, 1, load) for solver in solvers]
+    _agree([solver.rollout(end, DT, 2, load) for solver, end in zip(solvers, ends, strict=True)])
+
+
+def test_nothing_is_recorded_that_has_not_run(kernel_device):
+    """A single substep of ``updated`` has no kernel that ends one and starts another; recording would compile it."""
+    points = _points(kernel_device, count=12)
+    solver = _solver("triton")
+    state = solver.rollout(_start(solver, points), DT, 1)
+    assert not solver.fused()._graphs
+    solver.rollout(state, DT, 2)
+    assert solver.fused()._graphs
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_patches_that_change_in_place(kernel_device, formulation):
+    points = _points(kernel_device, count=12)
+    load = _load(points)
+    solvers = [_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    states = [_start(solver, points) for solver in solvers]
+    _agree([solver.rollout(state, DT, 1, load) for solver, state in zip(solvers, states, strict=True)])
+    load.area.mul_(3.0)
+    _agree([solver.rollout(state, DT, 1, load) for solver, state in zip(solvers, states, strict=True)])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_boundaries_that_change(kernel_device, formulation):
+    """Another window, another buffer and another object in it, without ``init_state``."""
+    points = _points(kernel_device, count=12)
+    ends = []
+    for transfer in ("torch", "triton"):
+        pin, plane = PinnedRegion(LEFT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
+        box = VelocityBox(Box([0.0, 0.0, 0.2], [1.0] * 3), [0.0, 1.0, 0.0])
+        solver = _solver(transfer, formulation, boundaries=[pin, plane, box])
+        state = _start(solver, points)
+        found = [solver.rollout(state, DT, 1)]
+        pin.end = 0.5 * DT
+        found.append(solver.rollout(found[-1], DT, 1))
+        plane.point = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64, device=kernel_device)
+        found.append(solver.rollout(found[-1], DT, 1))
+        box.region = TOP
+        found.append(solver.rollout(found[-1], DT, 1))
+        ends.append(found)
+    _agree(ends)
+    assert not torch.allclose(ends[0][1].velocity, ends[0][2].velocity, rtol=1e-2)
+
+
+def test_laws_that_change(kernel_device):
+    ends = []
+    for transfer in ("torch", "triton"):
+        law = materials.Metal(5e2, 1e3)
+        points, solver = _points(kernel_device, law, count=12), _solver(transfer)
+        state = _start(solver, points)
+        solver.rollout(state, DT, 1)
+        law.yield_stress = 2e3
+        ends.append(solver.rollout(state, DT, 1))
+    _agree(ends)
+
+
+def test_a_pin_that_opens(kernel_device):
+    """Alone it is held by the kernels themselves, as long as it has no window."""
+    ends = []
+    for transfer in ("torch", "triton"):
+        pin = PinnedRegion(LEFT)
+        solver, points = _solver(transfer, "total", boundaries=[pin]), _points(kernel_device, count=12)
+        state = solver.rollout(_start(solver, points), DT, 1)
+        pin.end = 0.5 * DT
+        ends.append(solver.rollout(state, DT, 1))
+    _agree(ends)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_buffers_end_with_their_solver(kernel_device, formulation):
+    """At once: a GPU may need their memory for the next one before Python looks for cycles."""
+    points = _points(kernel_device, count=12)
+    solver = _solver("triton", formulation)
+    solver.rollout(_start(solver, points), DT, 1)
+    buffer = weakref.ref(solver.fused().load)
+    gc.disable()
+    try:
+        del solver
+        assert buffer() is None
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_what_is_too_large_for_the_indices_is_refused(kernel_device, formulation, monkeypatch):
+    points = _points(kernel_device, count=12)
+    monkeypatch.setattr(fused, "MAX_INDEX", 700)
+    solver = _solver("triton", formulation)
+    state = solver.init_state(points)
+    with pytest.raises(ValueError, match=r"set `solver\.transfer` to torch"):
+        solver.rollout(state, DT, 1)
+
+
 # ---- where the kernels are used
 
 
@@ -823,3 +953,40 @@ def test_settings_that_contradict():
 def test_triton_without_a_gpu_says_so():
     with pytest.raises(ValueError, match=r"needs a CUDA device|Triton cannot be imported"):
         MPMSolver(dx=DX, transfer="triton").init_state(_points("cpu"))
+
+
+class _Waiting(Boundary):
+    """A condition of a user's own, which makes the host wait: it cannot be recorded."""
+
+    def forward(self, velocity, nodes):
+        return velocity * (0.5 if float(nodes.time) > 2.5 * DT else 1.0)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_condition_that_waits_is_asked_each_time(formulation):
+    pytest.importorskip("triton")
+    points = _points(torch.device("cuda"))
+    ends = []
+    for transfer in ("torch", "triton"):
+        solver = MPMSolver(dx=DX, formulation=formulation, transfer=transfer, boundaries=[_Waiting()])
+        state = _start(solver, points)
+        for _ in range(3):
+            state = solver.rollout(state, DT, 2)
+        ends.append(state.velocity)
+    assert float((ends[1] - ends[0]).abs().max()) < 6 * TOLERANCE * float(ends[0].abs().max())
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_buffers_serve_within_inference_mode_and_without(kernel_device, formulation):
+    """Tensors made in inference mode must not be written outside it."""
+    solver = MPMSolver(dx=DX, formulation=formulation, transfer="triton")
+    points = _points(kernel_device)
+    load = WindLoad(AeroForce(), WIND, points.position, points.mass)
+    with torch.inference_mode():
+        state = solver.rollout(_start(solver, points), DT, 1, load)
+    state = solver.rollout(
+        state.replace(**{f: getattr(state, f).clone() for f in ("position", "velocity")}), DT, 2, load
+    )
+    with torch.inference_mode():
+        assert torch.isfinite(solver.rollout(state, DT, 1, load).position).all()

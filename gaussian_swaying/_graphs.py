@@ -1,0 +1,87 @@
+"""Recording of CUDA graphs, and whether a recorded one still holds."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from torch import nn
+
+
+class Recordable:
+    """Base of modules of which some can be recorded in a CUDA graph.
+
+    Attributes:
+        recordable: Whether ``forward`` depends on nothing but its arguments, numbers and buffers of the module, never
+            makes the host wait, and after a first call copies nothing from or to it, so that a graph may be replayed
+            at other times and substeps. A class with a ``forward`` of its own has to say so itself.
+    """
+
+    recordable = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "forward" in vars(cls):
+            cls.recordable = vars(cls).get("recordable", False)
+
+
+def fingerprint(modules: Iterable[nn.Module]) -> tuple[tuple[object, ...], ...]:
+    """What modules depend on besides the contents of their tensors: the same as long as none of it was replaced.
+
+    Their types, numbers and strings, where their tensors lie and which objects they hold; what was changed within an
+    object that is no module, a region say, is not seen.
+    """
+    plain = (bool, int, float, str, type(None))
+    return tuple(
+        (
+            type(part),
+            *(
+                (name, value if isinstance(value, plain) else id(value))
+                for name, value in vars(part).items()
+                if not name.startswith("_")
+            ),
+            *((t.data_ptr(), t.shape) for t in (*part.parameters(recurse=False), *part.buffers(recurse=False))),
+        )
+        for module in modules
+        for part in module.modules()
+    )
+
+
+def record(device: torch.device, work: Callable[[], Any], pool: Any = None) -> torch.cuda.CUDAGraph:
+    """Record what a function launches, without running it.
+
+    Everything it launches must have run before, so that nothing is compiled or loaded meanwhile, and it must not make
+    the host wait. What it reads and writes must live as long as the graph.
+
+    Args:
+        device: A CUDA device.
+        work: The function.
+        pool: Memory pool of what it allocates, shared by graphs of which no two run at once; one of its own if None.
+
+    Returns:
+        The graph; ``replay()`` runs it.
+
+    Raises:
+        RuntimeError: If the function does what cannot be recorded.
+    """
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device)
+    stream.wait_stream(torch.cuda.current_stream(device))
+    collecting = gc.isenabled()
+    gc.disable()  # a graph that is freed meanwhile would break the recording
+    try:
+        # numbers that all graphs share are tensors of the mode of the first, and could not be written outside inference
+        # mode if that was it
+        with torch.cuda.stream(stream), torch.inference_mode(False), torch.no_grad():
+            # other threads, that of the recorder say, may go on
+            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+            try:
+                work()
+            finally:
+                graph.capture_end()
+    finally:
+        if collecting:
+            gc.enable()
+    torch.cuda.current_stream(device).wait_stream(stream)
+    return graph
