@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -78,10 +79,75 @@ def record(device: torch.device, work: Callable[[], Any], pool: Any = None) -> t
             graph.capture_begin(pool=pool, capture_error_mode="thread_local")
             try:
                 work()
-            finally:
-                graph.capture_end()
+            except BaseException:
+                with suppress(RuntimeError):  # what broke the recording matters more
+                    graph.capture_end()
+                raise
+            graph.capture_end()
     finally:
         if collecting:
             gc.enable()
     torch.cuda.current_stream(device).wait_stream(stream)
     return graph
+
+
+class Repeater:
+    """Repeats pieces of work from CUDA graphs of 16, 4 and 1 repetitions, which share one pool of memory.
+
+    Args:
+        device: Where the work runs; without CUDA it just runs.
+    """
+
+    SIZES = (16, 4, 1)
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._graphs: dict[Hashable, dict[int, torch.cuda.CUDAGraph]] = {}
+        self._pool: Any = None
+
+    def run(self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True) -> None:
+        """Run the work ``times`` times.
+
+        The first time a key is seen it runs as it is, which compiles what is not yet compiled; after that it is
+        recorded.
+
+        Args:
+            times: How often.
+            key: Names the work.
+            several: ``several(n)`` runs it n times.
+            recordable: Whether it may be recorded.
+
+        Raises:
+            RuntimeError: If it was said to be recordable and is not.
+        """
+        if times == 0:  # nothing runs, so nothing is compiled
+            return
+        if self.device.type != "cuda" or not recordable or key not in self._graphs:
+            self._graphs[key] = {}
+            for _ in range(times):
+                several(1)
+            return
+        graphs = self._graphs[key]
+        for size in self.SIZES:
+            while times >= size:
+                if size not in graphs:
+                    graphs[size] = self._recorded(several, size)
+                graphs[size].replay()
+                times -= size
+
+    def _recorded(self, several: Callable[[int], None], size: int) -> torch.cuda.CUDAGraph:
+        if self._pool is None:
+            # a pool lives as long as a graph in it: this one stays, whatever else is forgotten
+            self._pool, spare = torch.cuda.graph_pool_handle(), torch.zeros(1, device=self.device)
+            self._keeper = record(self.device, lambda: spare.add_(1), self._pool)
+        try:
+            return record(self.device, lambda: several(size), self._pool)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"A substep cannot be recorded in a CUDA graph ({error}): set `recordable` of the boundary that makes "
+                "the host wait to False, or `transfer` to torch."
+            ) from error
+
+    def forget(self) -> None:
+        """Drop the graphs."""
+        self._graphs.clear()

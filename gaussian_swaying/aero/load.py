@@ -82,7 +82,8 @@ class WindLoad:
         """Air velocity at the start of each of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on [m/s].
 
         Gusts take some seventy small kernels. On a GPU they are recorded in a CUDA graph at the second call if all
-        modulations are ``recordable``, and again when a number or a buffer of the wind was replaced.
+        modulations are ``recordable``, and again when a number or a buffer of the wind was replaced; one load must then
+        not be asked by two threads at once.
 
         Args:
             time: Scalar float64 tensor.
@@ -101,16 +102,19 @@ class WindLoad:
         ):
             return self._winds(time, dt, steps)
         key = fingerprint(self._fields)
-        if self._key != key:  # the first time everything is compiled and loaded
+        new = self._key != key
+        if new:
             self._key, self._graph = key, None
-            return self._winds(time, dt, steps)
-        if self._graph is None:
             with torch.inference_mode(False):  # they may be written within inference mode and without
                 self._now, self._dt = (torch.zeros((), dtype=torch.float64, device=time.device) for _ in range(2))
+        elif self._graph is None:
             self._graph = record(time.device, self._tabulate)
         self._now.copy_(time)
         self._dt.copy_(dt) if isinstance(dt, Tensor) else self._dt.fill_(dt)
-        self._graph.replay()
+        if self._graph is None:  # the first time as it is, so that all is loaded before it is recorded
+            self._tabulate()
+        else:
+            self._graph.replay()
         return self._table[:steps].clone()
 
     def _tabulate(self) -> None:

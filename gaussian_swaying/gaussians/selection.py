@@ -12,7 +12,23 @@ from gaussian_swaying._checks import check_positive, check_shape, check_vector
 
 
 class Region(ABC):
-    """A part of space. Subclasses can be named in a configuration."""
+    """A part of space. Subclasses can be named in a configuration.
+
+    Attributes:
+        recordable: Whether :meth:`contains` copies nothing from or to the host after a first call (see :meth:`on`), so
+            that a CUDA graph may record it. A class with a ``contains`` of its own has to say so itself.
+    """
+
+    recordable: bool = False
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        if "contains" in vars(cls) and "recordable" not in vars(cls):
+            cls.recordable = False
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without what is kept on devices, which another machine may not have."""
+        return {name: value for name, value in vars(self).items() if name != "_known"}
 
     def on(self, points: Tensor, values: Sequence[float]) -> Tensor:
         """Numbers of the region with the type and device of some points.
@@ -35,6 +51,8 @@ class Region(ABC):
 class Everything(Region):
     """All of space."""
 
+    recordable = True
+
     def __repr__(self) -> str:
         return "Everything()"
 
@@ -55,6 +73,8 @@ class Box(Region):
         ValueError: If a corner has not 3 finite numbers, or ``min`` is not below ``max`` along an axis.
         TypeError: If a corner is not a list.
     """
+
+    recordable = True
 
     def __init__(self, min: Sequence[float | None], max: Sequence[float | None]) -> None:
         self.min = _corner("min", min, -float("inf"))
@@ -84,6 +104,8 @@ class Sphere(Region):
         TypeError: If ``center`` is not a list.
     """
 
+    recordable = True
+
     def __init__(self, center: Sequence[float], radius: float) -> None:
         self.center = check_vector("center", center)
         check_positive("radius", radius)
@@ -111,6 +133,8 @@ class Cylinder(Region):
         ValueError: If a vector has not 3 finite numbers, ``axis`` is zero, or a size is not positive.
         TypeError: If a vector is not a list.
     """
+
+    recordable = True
 
     def __init__(self, center: Sequence[float], axis: Sequence[float], radius: float, height: float) -> None:
         self.center = check_vector("center", center)
@@ -157,6 +181,7 @@ class Union(Region):
         for region in regions:
             _check_region("regions", region)
         self.regions = list(regions)
+        self.recordable = all(region.recordable for region in self.regions)
 
     def __repr__(self) -> str:
         return f"Union(regions={self.regions})"
@@ -181,7 +206,7 @@ class Not(Region):
 
     def __init__(self, region: Region) -> None:
         _check_region("region", region)
-        self.region = region
+        self.region, self.recordable = region, region.recordable
 
     def __repr__(self) -> str:
         return f"Not(region={self.region})"

@@ -78,6 +78,7 @@ class RegionInFrame(Region):
 
     def __init__(self, region: Region, frame: FrameLike) -> None:
         self.region, self.frame = region, frame
+        self.recordable = region.recordable
 
     def contains(self, points: Tensor) -> Tensor:
         """Whether each point (..., 3) [m, z up] lies inside; bool, shape (...)."""
@@ -496,11 +497,10 @@ class VelocityBox(Boundary):
     """
 
     needs_position = True
-    recordable = True
 
     def __init__(self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
-        self.region = region
+        self.region, self.recordable = region, region.recordable
         self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
         self.velocity: Tensor
 

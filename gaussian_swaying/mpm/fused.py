@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import fingerprint, record
+from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.aero.load import RECORDED, WindLoad
 from gaussian_swaying.mpm import transfer_triton as kernels
 from gaussian_swaying.mpm.boundary import PinnedRegion
@@ -32,9 +32,6 @@ MAX_STEPS = RECORDED
 
 RESORT = 32
 """Substeps of ``updated`` after which the particles are sorted by cell again."""
-
-GRAPHS = (16, 4, 1)
-"""Numbers of substeps for which a graph is kept; a rollout is put together from them."""
 
 MAX_INDEX = 2**31
 """Entries that the kernels, which count with 32 bits, can reach in a buffer."""
@@ -98,8 +95,7 @@ class FusedSolver(ABC):
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in solver.gravity]
         self._patch_of: list[tuple[Tensor, int | None]] = []
-        self._graphs: dict[Any, dict[int, torch.cuda.CUDAGraph] | None] = {}
-        self._pool: Any = None
+        self.repeater = Repeater(self.device)
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
         """Nothing to copy or pickle: a solver makes its buffers and graphs anew."""
@@ -184,7 +180,7 @@ class FusedSolver(ABC):
             self.load.zero_()
         changes = self._run(state, steps, options, looks)
         if load is not None or force is not None:
-            changes["work"] = state.work + self._work().reshape(state.work.shape)
+            changes["work"] = state.work + self._work().reshape(self.solver.points.mass.shape[:-1])
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
     def _take_wind(self, load: WindLoad, winds: Tensor) -> None:
@@ -223,30 +219,8 @@ class FusedSolver(ABC):
                 body(offset)
             self.first_step.add_(count)
 
-        if steps == 0:  # nothing runs, so nothing is compiled
-            return
         recordable = all(boundary.recordable for boundary in self.solver._acting)
-        if self.device.type != "cuda" or not recordable or key not in self._graphs:
-            self._graphs[key] = None
-            for _ in range(steps):
-                several(1)
-            return
-        graphs = self._graphs[key]
-        if graphs is None:
-            graphs = self._graphs[key] = {}
-        for size in GRAPHS:
-            while steps >= size:
-                if size not in graphs:
-                    if self._pool is None:  # one for all graphs, as no two run at once
-                        self._pool = torch.cuda.graph_pool_handle()
-                    graphs[size] = record(self.device, lambda size=size: several(size), self._pool)  # type: ignore[misc]
-                graphs[size].replay()
-                steps -= size
-
-    def _forget_graphs(self) -> None:
-        """Drop all graphs, and with the last of them their pool."""
-        self._graphs.clear()
-        self._pool = None
+        self.repeater.run(steps, key, several, recordable)
 
 
 class FusedTotal(FusedSolver):
@@ -446,9 +420,9 @@ class FusedUpdated(FusedSolver):
                 self.momentum = torch.zeros(room, width, device=self.device)
                 self.velocity = torch.zeros(room, 4, device=self.device)
                 self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
-            self._forget_graphs()
+            self.repeater.forget()
         if grid != self.grid:
-            self._forget_graphs()  # they read the node positions
+            self.repeater.forget()  # they read the node positions
             self.grid, self.node_position = grid, None
             if any(b.needs_position or b.needs_lattice for b in self.solver._acting):
                 self.node_position = grid.node_positions(self.velocity)

@@ -429,14 +429,15 @@ class MPMSolver(nn.Module):
             return state
         speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
         reach = (2 * speed + 0.5 * sum(g * g for g in self.gravity) ** 0.5 * horizon) * horizon
-        margin = 3 + margin + min(int(reach / self.dx), 1000)
-        grid = self._bounding_grid(state.position, margin, speed)
+        cells = 3 + margin + min(int(reach / self.dx), 1000)
+        grid = self._bounding_grid(state.position, cells, speed)
         if not state.position.is_cuda:
             return state.replace(grid=grid)
         # CUDA graphs are recorded for one grid, so it stays as long as it serves
-        if state.grid.holds(grid) and state.grid.node_count <= 3 * grid.node_count:
+        serves = state.grid.holds(grid) and state.grid.node_count <= 3 * grid.node_count
+        if serves and not margin:  # a margin is asked for where the grid did not serve
             return state
-        roomy = self._bounding_grid(state.position, margin + 4, speed, check=False)
+        roomy = self._bounding_grid(state.position, cells + 4, speed, check=False)
         return state.replace(grid=roomy if roomy.node_count <= self.max_nodes else grid)
 
     def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:

@@ -105,6 +105,7 @@ class SimulationPipeline(nn.Module):
         state = self.solver.init_state(self.scene.points, frame=self.scene.frame)
         self.idle = self.aero.idle
         check_spacing(self.solver)
+        self.solver.fused()  # what its kernels refuse is refused here
         self._most_substeps = MAX_GROWTH * self.solver.substeps(state, self.frame_dt)
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
