@@ -63,8 +63,8 @@ def _weights(f, inverse_dx):
 
 
 @triton.jit
-def _gather_two(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
-    """Derivatives of columns 0 to 2 [component, axis], and columns 0 to 2 and 4 to 6 interpolated; rows of eight."""
+def _gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr):
+    """Columns 0 to 2 of rows of eight interpolated, their derivatives [component, axis], and (BOTH) columns 4 to 6."""
     zero = wz[0] * 0
     u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -84,18 +84,20 @@ def _gather_two(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
                 t0 += gz[k] * q0
                 t1 += gz[k] * q1
                 t2 += gz[k] * q2
-                r0 += wz[k] * tl.load(row + k * 8 + 4, mask, 0.0)
-                r1 += wz[k] * tl.load(row + k * 8 + 5, mask, 0.0)
-                r2 += wz[k] * tl.load(row + k * 8 + 6, mask, 0.0)
+                if BOTH:
+                    r0 += wz[k] * tl.load(row + k * 8 + 4, mask, 0.0)
+                    r1 += wz[k] * tl.load(row + k * 8 + 5, mask, 0.0)
+                    r2 += wz[k] * tl.load(row + k * 8 + 6, mask, 0.0)
             w = wx * wy
             dx = gx * wy
             dy = wx * gy
             u0 += w * s0
             u1 += w * s1
             u2 += w * s2
-            v0 += w * r0
-            v1 += w * r1
-            v2 += w * r2
+            if BOTH:
+                v0 += w * r0
+                v1 += w * r1
+                v2 += w * r2
             g00 += dx * s0
             g01 += dy * s0
             g02 += w * t0
@@ -106,46 +108,6 @@ def _gather_two(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
             g21 += dy * s2
             g22 += w * t2
     return (u0, u1, u2), (g00, g01, g02, g10, g11, g12, g20, g21, g22), (v0, v1, v2)
-
-
-@triton.jit
-def _gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask):
-    """Interpolated vector and its derivatives [component, axis]; rows of eight."""
-    zero = wz[0] * 0
-    v0, v1, v2 = zero, zero, zero
-    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for i in range(3):
-        wx, gx = _weight(f[0], i, inverse_dx)
-        for j in range(3):
-            wy, gy = _weight(f[1], j, inverse_dx)
-            row = field + (node + i * sx + j * sy) * 8
-            s0, s1, s2, t0, t1, t2 = zero, zero, zero, zero, zero, zero
-            for k in tl.static_range(3):
-                q0 = tl.load(row + k * 8, mask, 0.0)
-                q1 = tl.load(row + k * 8 + 1, mask, 0.0)
-                q2 = tl.load(row + k * 8 + 2, mask, 0.0)
-                s0 += wz[k] * q0
-                s1 += wz[k] * q1
-                s2 += wz[k] * q2
-                t0 += gz[k] * q0
-                t1 += gz[k] * q1
-                t2 += gz[k] * q2
-            w = wx * wy
-            dx = gx * wy
-            dy = wx * gy
-            v0 += w * s0
-            v1 += w * s1
-            v2 += w * s2
-            g00 += dx * s0
-            g01 += dy * s0
-            g02 += w * t0
-            g10 += dx * s1
-            g11 += dy * s1
-            g12 += w * t1
-            g20 += dx * s2
-            g21 += dy * s2
-            g22 += w * t2
-    return (v0, v1, v2), (g00, g01, g02, g10, g11, g12, g20, g21, g22)
 
 
 @triton.jit
@@ -331,12 +293,12 @@ def total_particles(
         lam = tl.load(material + 2 * count + index, mask, 0.0)
         wz, gz = _weights(f[2], inverse_dx)
         if VISCOUS:
-            u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known)
-            v, rate = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known)
+            u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+            v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
         elif WIND or FORCE:
-            u, F, v = _gather_two(fields, node, sx, sy, f, wz, gz, inverse_dx, known)
+            u, F, v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
         else:
-            u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known)
+            u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
         F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
         if MULTI:
             kind = tl.load(law_table + 5 * tl.load(law + index, mask, 0)).to(tl.int32)
@@ -473,8 +435,8 @@ def total_read(
     node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
     where = tl.load(order + index, mask, 0)
     wz, gz = _weights(f[2], inverse_dx)
-    u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask)
-    v, rate = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask)
+    u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
     if WORK:
         zero = f[0] * 0
         _account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
@@ -848,7 +810,7 @@ def total_look(
     f = _load3(fraction, count, index, mask)
     node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
     wz, gz = _weights(f[2], inverse_dx)
-    _u, F = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask)
+    _u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)
