@@ -294,19 +294,12 @@ def camera_from_transforms(
     for name, size in (("width", width), ("height", height)):
         if size is not None:
             _check_pixels(name, size)
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the camera file {where} ({error.strerror}): check `path`.") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"The camera file {where} is not valid JSON ({error}): export it again.") from error
-    frames = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
-        raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")
+    data = load_transforms(path)
+    frames = data["frames"]
     if not 0 <= frame < len(frames):
         raise ValueError(f"The camera file {where} has no frame {frame}: set `frame` between 0 and {len(frames) - 1}.")
     fields = {**data, **frames[frame]}
-    pixels = _read_intrinsics(where, fields, width, height)
+    pixels = read_intrinsics(where, fields, width, height)
     native_width, native_height, fx, fy, cx, cy = pixels
     if width is None and height is None:
         width, height = round(native_width), round(native_height)
@@ -320,12 +313,37 @@ def camera_from_transforms(
     intrinsics = torch.tensor(
         [[fx * scale_x, 0.0, cx * scale_x], [0.0, fy * scale_y, cy * scale_y], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
-    camera_to_world = _read_matrix(where, frame, frames[frame])
+    camera_to_world = read_pose(where, frame, frames[frame])
     world_to_camera = torch.linalg.inv(camera_to_world)
     return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
 
 
-def _read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
+def load_transforms(path: str | Path) -> dict[str, Any]:
+    """Read a ``transforms.json`` of NeRF, Blender or instant-ngp.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its fields; ``frames`` is a list of at least one dictionary.
+
+    Raises:
+        ValueError: If the file is missing, is not JSON or has no list ``frames``.
+    """
+    where = f"`{path}`"
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"Cannot read the camera file {where} ({error.strerror}): check `path`.") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"The camera file {where} is not valid JSON ({error}): export it again.") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
+        raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")
+    return data
+
+
+def read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
     """Return a finite number of a transforms.json, or None if the field is missing."""
     value = fields.get(name)
     if value is None:
@@ -335,12 +353,12 @@ def _read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
     return float(value)
 
 
-def _read_intrinsics(
+def read_intrinsics(
     where: str, fields: dict[str, Any], width: int | None, height: int | None
 ) -> tuple[float, float, float, float, float, float]:
     """Return width, height, fx, fy, cx, cy [pixels] at the resolution of a transforms.json."""
     names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
-    w, h, fx, fy, cx, cy, angle_x, angle_y = (_read_number(where, fields, name) for name in names)
+    w, h, fx, fy, cx, cy, angle_x, angle_y = (read_number(where, fields, name) for name in names)
     if fx is not None and (w is None or h is None):
         raise ValueError(f"The camera file {where} has `fl_x` but no `w` and `h`: add the size of its images [pixels].")
     w = float(width) if w is None and width is not None else w
@@ -367,7 +385,7 @@ def _read_intrinsics(
     return w, h, fx, fy, 0.5 * w if cx is None else cx, 0.5 * h if cy is None else cy
 
 
-def _read_matrix(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
+def read_pose(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
     """Return the camera-to-world matrix of a frame with OpenCV axes, in float64, shape (4, 4)."""
     name = f"frames[{frame}].transform_matrix"
     if "transform_matrix" not in fields:

@@ -1,0 +1,77 @@
+"""A capture made in code as training data, so that a training runs with nothing downloaded."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+
+from gaussian_swaying.data.datamodule import CaptureDataModule
+from gaussian_swaying.data.generated_capture import GeneratedCapture
+
+
+class GeneratedDataModule(CaptureDataModule):
+    """Images of a :class:`~gaussian_swaying.data.generated_capture.GeneratedCapture`, drawn at the first run.
+
+    They are kept in a folder, which later runs with the same settings use again, and which
+    :class:`~gaussian_swaying.data.datamodule.CaptureDataModule` reads as any other capture.
+
+    Args:
+        path: Folder of the images; made if it is missing.
+        capture: What is drawn.
+        test_every: Every how many-th image is for testing.
+        workers: Threads that draw and read the images.
+        points: What the Gaussians start from: ``random`` in the space that the cameras see, or a file.
+        point_count: Number of points, where they are drawn at random.
+        seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
+
+    Raises:
+        ValueError: In ``setup``, if the folder holds something else, or images of another flag.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        capture: GeneratedCapture,
+        test_every: int = 8,
+        workers: int = 4,
+        points: str = "random",
+        point_count: int = 100_000,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(
+            path, "transforms", 1, test_every, workers=workers, points=points, point_count=point_count, seed=seed
+        )
+        self.generated = capture
+
+    def setup(self, stage: str | None = None) -> None:
+        """Draw the images if they are not there, then read them.
+
+        Args:
+            stage: ``fit``, ``validate``, ``test``, or None for all.
+
+        Raises:
+            ValueError: If the folder holds something else.
+        """
+        self._make()
+        super().setup(stage)
+
+    def _make(self) -> None:
+        folder = Path(self.path)
+        settings = {name: value for name, value in vars(self.generated).items() if not name.startswith("_")}
+        marker = folder / "generated.json"
+        if marker.is_file():
+            held = json.loads(marker.read_text())
+            if held == settings:
+                return
+            other = ", ".join(name for name in settings if held.get(name) != settings[name])
+            raise ValueError(f"{folder} holds images that were made with another {other}: remove it or set `path`.")
+        if folder.exists():
+            raise ValueError(f"{folder} exists and holds no generated capture: set another `path`.")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
+            made = Path(temporary) / "capture"
+            self.generated.write(made, max(self.workers, 1))
+            (made / marker.name).write_text(json.dumps(settings))
+            made.rename(folder)

@@ -1,0 +1,41 @@
+"""The order in which a training sees its images."""
+
+from collections.abc import Iterator
+
+import torch
+from torch.utils.data import Sampler
+
+
+class EndlessShuffle(Sampler[int]):
+    """Indices of ``count`` images without end: each round is a permutation that follows from the seed and its number.
+
+    A training that goes on after ``start`` images sees exactly the images that it would have seen.
+
+    Args:
+        count: Number of images.
+        seed: Seed of the permutations.
+        start: Number of images already seen.
+
+    Raises:
+        ValueError: If there is no image, or ``start`` is negative.
+
+    Example:
+        >>> from itertools import islice
+        >>> list(islice(EndlessShuffle(3, seed=0), 2, 7)) == list(islice(EndlessShuffle(3, seed=0, start=2), 5))
+        True
+    """
+
+    def __init__(self, count: int, seed: int = 0, start: int = 0) -> None:
+        if count < 1:
+            raise ValueError("Expected at least one image to train on, but got none.")
+        if start < 0:
+            raise ValueError(f"Expected `start` not to be negative, but got {start}.")
+        self.count, self.seed, self.start = count, seed, start
+
+    def __iter__(self) -> Iterator[int]:
+        """Indices from ``start`` on."""
+        number, skip = divmod(self.start, self.count)
+        while True:
+            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + number)
+            yield from torch.randperm(self.count, generator=generator)[skip:].tolist()
+            number, skip = number + 1, 0

@@ -1,0 +1,162 @@
+"""Coloured points, and how they are read from .ply and .obj files or drawn from a mesh."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_shape
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Coloured points.
+
+    Attributes:
+        points: Positions [scene units], float32, shape (P, 3).
+        colors: Colours in 0 to 1, float32, shape (P, 3).
+        normals: Unit normals, float32, shape (P, 3), where the source has a surface, else None.
+
+    Raises:
+        ValueError: If a tensor has another shape.
+    """
+
+    points: Tensor
+    colors: Tensor
+    normals: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_shape("points", self.points, None, 3)
+        check_shape("colors", self.colors, len(self.points), 3)
+        if self.normals is not None:
+            check_shape("normals", self.normals, len(self.points), 3)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def sample_mesh(vertices: PointCloud, faces: Tensor, count: int, seed: int = 0) -> PointCloud:
+    """Points uniform on the surface of a mesh, with the normals of its faces.
+
+    Args:
+        vertices: Vertices with their colours.
+        faces: Indices of vertices, shape (T, 3).
+        count: Number of points.
+        seed: Of the random numbers.
+
+    Raises:
+        ValueError: If the mesh has no area or a face names a vertex that does not exist.
+    """
+    if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        raise ValueError(f"Expected faces with indices from 0 to {len(vertices) - 1}: export the mesh again.")
+    generator = torch.Generator().manual_seed(seed)
+    corners = vertices.points.double()[faces]
+    cross = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = cross.norm(dim=-1).cumsum(0)
+    if not float(total[-1]) > 0:
+        raise ValueError("Expected a mesh with area, but all its faces are degenerate: export the mesh again.")
+    draw = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    picked = torch.searchsorted(total, draw[:, 0] * total[-1], right=True).clamp_max(len(faces) - 1)
+    root = draw[:, 1].sqrt()
+    weights = torch.stack([1 - root, root * (1 - draw[:, 2]), root * draw[:, 2]], -1)[..., None]
+    points = (weights * corners[picked]).sum(1).float()
+    shade = (weights * vertices.colors.double()[faces[picked]]).sum(1).float()
+    normals = torch.nn.functional.normalize(cross[picked], dim=-1).float()
+    return PointCloud(points, shade, normals)
+
+
+def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
+    """Read the vertices of a .ply file, ASCII or binary, and its faces.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The vertices, grey if they have no colours, and triangles (T, 3) as indices, or None if there are none.
+
+    Raises:
+        ValueError: If the file cannot be read or holds no usable points.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    try:
+        ply = PlyData.read(str(path))
+        table = ply["vertex"].data
+        points = np.stack([np.asarray(table[axis], dtype=np.float32) for axis in ("x", "y", "z")], -1)
+    except OSError as error:
+        raise ValueError(f"Cannot read the points {path} ({error.strerror}): check the path.") from error
+    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not a .ply with vertices x, y, z ({error}): export it again.") from error
+    names = table.dtype.names or ()
+    colors = np.full_like(points, 0.5)
+    if all(name in names for name in ("red", "green", "blue")):
+        colors = np.stack([np.asarray(table[name], dtype=np.float32) for name in ("red", "green", "blue")], -1)
+        colors /= 255 if table["red"].dtype.kind in "ui" else 1
+    _check_points(path, points, colors)
+    triangles: list[list[int]] = []
+    if "face" in ply and ply["face"].count:
+        element = ply["face"]
+        lists = [item.name for item in element.properties if item.name in ("vertex_indices", "vertex_index")]
+        if not lists:
+            raise ValueError(f"{path} has faces without `vertex_indices`: export the mesh again.")
+        triangles = _triangles(element.data[lists[0]])
+    faces = torch.tensor(triangles, dtype=torch.int64) if triangles else None
+    return PointCloud(torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(colors))), faces
+
+
+def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
+    """Read a mesh from a Wavefront .obj file.
+
+    Args:
+        path: The file. Polygons are cut into triangles; textures are not read, colours behind the vertices are.
+
+    Returns:
+        The vertices, grey if they have no colours, and triangles (T, 3) as indices.
+
+    Raises:
+        ValueError: If the file cannot be read or holds no usable mesh.
+    """
+    vertices: list[list[float]] = []
+    colors: list[list[float]] = []
+    polygons: list[list[int]] = []
+    try:
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+            words = line.split()
+            if words[:1] == ["v"]:
+                numbers = [float(word) for word in words[1:]]
+                vertices.append(numbers[:3])
+                colors.append(numbers[3:6] if len(numbers) >= 6 else [0.5, 0.5, 0.5])
+            elif words[:1] == ["f"]:
+                corners = [int(word.split("/")[0]) for word in words[1:]]
+                polygons.append([item - 1 if item > 0 else len(vertices) + item for item in corners])
+        points = np.array(vertices, dtype=np.float32).reshape(len(vertices), 3)
+    except OSError as error:
+        raise ValueError(f"Cannot read the mesh {path} ({error.strerror}): check the path.") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is not a Wavefront .obj ({error}): export the mesh again.") from error
+    _check_points(path, points, np.array(colors, dtype=np.float32))
+    faces = torch.tensor(_triangles(polygons), dtype=torch.int64).reshape(-1, 3)
+    if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(points):
+        raise ValueError(f"{path} has no faces, or faces of vertices that do not exist: export the mesh again.")
+    return PointCloud(torch.from_numpy(points), torch.tensor(colors)), faces
+
+
+def _triangles(polygons: object) -> list[list[int]]:
+    """Fans of triangles."""
+    result: list[list[int]] = []
+    for polygon in polygons:  # type: ignore[attr-defined]
+        first, *rest = (int(item) for item in polygon)
+        result += [[first, b, c] for b, c in itertools.pairwise(rest)]
+    return result
+
+
+def _check_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    if len(points) == 0:
+        raise ValueError(f"{path} holds no points: export it again, or set the initial points to random.")
+    if not np.isfinite(points).all() or not np.isfinite(colors).all():
+        raise ValueError(f"{path} has points or colours that are NaN or infinite: remove them.")

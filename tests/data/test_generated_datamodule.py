@@ -1,0 +1,40 @@
+"""A generated capture as training data: drawn once, never over something else."""
+
+import pytest
+import torch
+
+from gaussian_swaying.data.generated_capture import GeneratedCapture
+from gaussian_swaying.data.generated_datamodule import GeneratedDataModule
+
+
+def _data(path, **options):
+    return GeneratedDataModule(
+        path, GeneratedCapture(**({"views": 8, "size": 16} | options)), workers=1, point_count=50
+    )
+
+
+def test_images_are_drawn_once(tmp_path):
+    data = _data(tmp_path / "a/flag")
+    data.setup("fit")
+    assert len(data.capture.split("train")) == 7
+    assert len(data.capture.split("test")) == 1
+    assert data.scene_scale > 1.0
+    cloud = data.initial_cloud(1)
+    assert cloud.sh.shape == (50, 4, 3)
+    batch = next(iter(data.train_dataloader()))
+    assert batch["image"].shape == (16, 16, 3)
+    assert torch.is_tensor(batch["alpha"])
+    file = tmp_path / "a/flag/transforms.json"
+    changed = file.stat().st_mtime_ns
+    _data(tmp_path / "a/flag").setup("test")
+    assert file.stat().st_mtime_ns == changed
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["flag"]
+
+
+def test_other_things_are_left_alone(tmp_path):
+    _data(tmp_path / "flag").setup("test")
+    with pytest.raises(ValueError, match="made with another ripple: remove it or set `path`"):
+        _data(tmp_path / "flag", ripple=0.1).setup("fit")
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(ValueError, match="holds no generated capture"):
+        _data(tmp_path / "mine").setup("fit")
