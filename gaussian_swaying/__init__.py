@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from gaussian_swaying.aero.force import AeroForce, aero_force
     from gaussian_swaying.aero.load import WindLoad
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
+    from gaussian_swaying.data.capture import Capture, View, read_capture
+    from gaussian_swaying.data.datamodule import CaptureDataModule
+    from gaussian_swaying.data.generated_capture import GeneratedCapture
+    from gaussian_swaying.data.initial_points import initial_points
+    from gaussian_swaying.data.point_cloud import PointCloud
     from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
     from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
     from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
@@ -50,11 +55,19 @@ if TYPE_CHECKING:
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
     from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+    from gaussian_swaying.training.densification import DefaultDensification, MCMCDensification
+    from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
+    from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
     "aero.force": ("AeroForce", "aero_force"),
     "aero.load": ("WindLoad",),
     "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "UniformGust", "WindField"),
+    "data.capture": ("Capture", "View", "read_capture"),
+    "data.datamodule": ("CaptureDataModule",),
+    "data.generated_capture": ("GeneratedCapture",),
+    "data.initial_points": ("initial_points",),
+    "data.point_cloud": ("PointCloud",),
     "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
     "gaussians.selection": ("Box", "Cylinder", "Sphere"),
     "gaussians.surface": ("GaussianSurfaceModel",),
@@ -91,6 +104,9 @@ _HOMES = {
     "simulation.pipeline": ("SimulationPipeline",),
     "simulation.recorder": ("Recorder", "load_trajectory"),
     "simulation.scene": ("Material", "Scene", "SimulatedScene"),
+    "training.densification": ("DefaultDensification", "MCMCDensification"),
+    "training.losses": ("LossInputs", "LossTerm", "TotalLoss"),
+    "training.module": ("SplatTrainer",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -99,8 +115,11 @@ __all__ = [
     "Boundary",
     "Box",
     "Camera",
+    "Capture",
+    "CaptureDataModule",
     "ConstitutiveLaw",
     "Cylinder",
+    "DefaultDensification",
     "DiffuseShader",
     "EnclosingBox",
     "FixedCorotated",
@@ -110,11 +129,15 @@ __all__ = [
     "GaussianCloud",
     "GaussianGust",
     "GaussianSurfaceModel",
+    "GeneratedCapture",
     "GridSpec",
     "GsplatRenderer",
     "Handle",
     "Impulse",
     "LookAtCamera",
+    "LossInputs",
+    "LossTerm",
+    "MCMCDensification",
     "MPMSolver",
     "MPMState",
     "Material",
@@ -126,6 +149,7 @@ __all__ = [
     "PinnedRegion",
     "Plane",
     "Plasticine",
+    "PointCloud",
     "Recorder",
     "Sand",
     "Scene",
@@ -137,16 +161,21 @@ __all__ = [
     "SineSway",
     "Snow",
     "Sphere",
+    "SplatTrainer",
     "StVKHencky",
     "TearingGauge",
     "TorchRenderer",
+    "TotalLoss",
     "TransformsCamera",
     "UniformGust",
     "VelocityBox",
+    "View",
     "WindField",
     "WindLoad",
     "aero_force",
+    "initial_points",
     "load_trajectory",
+    "read_capture",
     "read_ply",
     "write_ply",
 ]

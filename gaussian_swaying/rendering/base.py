@@ -3,7 +3,7 @@
 import math
 import warnings
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -57,7 +57,88 @@ class Renderer(Protocol):
         ...
 
 
-def make_renderer(device: torch.device | str) -> Renderer:
+@dataclass(frozen=True, slots=True, eq=False)
+class ScreenGaussians:
+    """Where Gaussians are on the screen: what decides in training which of them to split, copy or remove.
+
+    Attributes:
+        means2d: Centres [pixels], in the graph of the picture, shape (V, 2), or (1, N, 2) without ``index``.
+        radii: Half width and height [pixels] of each, 0 for one that is not drawn, shape of ``means2d``.
+        index: Index of each among the N Gaussians, shape (V,), or None if all are there.
+        width: Image width [pixels].
+        height: Image height [pixels].
+    """
+
+    means2d: Tensor
+    radii: Tensor
+    index: Tensor | None
+    width: int
+    height: int
+
+    def info(self) -> dict[str, Any]:
+        """The same under the names that the strategies of gsplat 1.5 look for."""
+        return {
+            "means2d": self.means2d,
+            "radii": self.radii,
+            "gaussian_ids": self.index,
+            "width": self.width,
+            "height": self.height,
+            "n_cameras": 1,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplatOutput:
+    """Picture of a splat in training.
+
+    Attributes:
+        color: As :attr:`RenderOutput.color`, shape (H, W, 3).
+        alpha: As :attr:`RenderOutput.alpha`, shape (H, W, 1).
+        screen: Where the Gaussians are on the screen.
+    """
+
+    color: Tensor
+    alpha: Tensor
+    screen: ScreenGaussians
+
+
+class SplatRenderer(Renderer, Protocol):
+    """Renderer that also draws Gaussians as they are stored, for training."""
+
+    def render_splat(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+        absgrad: bool = False,
+    ) -> SplatOutput:
+        """Render one picture, differentiable with respect to every tensor of the splat.
+
+        Args:
+            means: Centres [scene units], shape (N, 3).
+            quats: Quaternions wxyz of any length above zero, shape (N, 4).
+            log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
+            opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
+            sh: Spherical harmonics coefficients, shape (N, K, 3) with K = 1, 4, 9 or 16.
+            camera: The camera, on any device and in any precision.
+            background: Colour behind the Gaussians, shape (3,); black when None.
+            absgrad: Whether the backward pass is to leave sums of absolute gradients in ``screen.means2d.absgrad``
+                (Ye et al. 2024, "AbsGS").
+
+        Returns:
+            The picture, on the device and in the precision of ``means``.
+
+        Raises:
+            ValueError: If ``absgrad`` is asked of a renderer that has none.
+        """
+        ...
+
+
+def make_renderer(device: torch.device | str) -> SplatRenderer:
     """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
 
     Where gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.

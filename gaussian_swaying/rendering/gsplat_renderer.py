@@ -4,7 +4,14 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.rendering.base import RenderOutput, check_gaussians, finite_gaussians
+from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
+from gaussian_swaying.rendering.base import (
+    RenderOutput,
+    ScreenGaussians,
+    SplatOutput,
+    check_gaussians,
+    finite_gaussians,
+)
 from gaussian_swaying.rendering.camera import Camera
 
 
@@ -123,3 +130,45 @@ class GsplatRenderer(nn.Module):
     ) -> RenderOutput:
         """Render one picture, see :class:`~gaussian_swaying.rendering.base.Renderer`."""
         return render_gsplat(means, covariances, opacities, colors, camera, background, self.eps2d)
+
+    def render_splat(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+        absgrad: bool = False,
+    ) -> SplatOutput:
+        """Render one picture in training, see :class:`~gaussian_swaying.rendering.base.SplatRenderer`.
+
+        In float32. Harmonics and covariances are left to gsplat's kernels, which differentiate them too; Gaussians
+        that are not finite are not looked for.
+        """
+        if means.device.type != "cuda":
+            raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
+        from gsplat import rasterization
+
+        view = camera.to(means.device, torch.float32)
+        pixels, alpha, meta = rasterization(
+            means=means,
+            quats=quats,
+            scales=log_scales.exp(),
+            opacities=opacities,
+            colors=sh,
+            viewmats=view.world_to_camera[None],
+            Ks=view.intrinsics[None],
+            width=camera.width,
+            height=camera.height,
+            near_plane=camera.near,
+            eps2d=self.eps2d,
+            sh_degree=sh_degree(sh.shape[1]),
+            packed=False,
+            backgrounds=None if background is None else background.to(means)[None],
+            absgrad=absgrad,
+            rasterize_mode="classic",
+        )
+        screen = ScreenGaussians(meta["means2d"], meta["radii"], None, camera.width, camera.height)
+        return SplatOutput(pixels[0], alpha[0], screen)

@@ -14,7 +14,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.rendering.base import RenderOutput, check_gaussians, finite_gaussians
+from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
+from gaussian_swaying.gaussians.surface import covariance
+from gaussian_swaying.rendering.base import (
+    RenderOutput,
+    ScreenGaussians,
+    SplatOutput,
+    check_gaussians,
+    finite_gaussians,
+)
 from gaussian_swaying.rendering.camera import Camera
 
 MIN_ALPHA = 1.0 / 255.0
@@ -327,3 +335,31 @@ class TorchRenderer(nn.Module):
     ) -> RenderOutput:
         """Render one picture, see :class:`~gaussian_swaying.rendering.base.Renderer`."""
         return render_torch(means, covariances, opacities, colors, camera, background, self.eps2d, self.max_pairs)
+
+    def render_splat(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+        absgrad: bool = False,
+    ) -> SplatOutput:
+        """Render one picture in training, see :class:`~gaussian_swaying.rendering.base.SplatRenderer`."""
+        if absgrad:
+            raise ValueError("TorchRenderer has no absolute gradients: leave `absgrad` off, or train on a GPU.")
+        camera = camera.to(means.device, means.dtype)
+        # along with the projection, so that only what is drawn gets a colour
+        covariances = covariance(quats, log_scales)
+        finite = finite_gaussians(means, covariances, opacities, sh.flatten(1))
+        projected = project_gaussians(means, covariances, torch.where(finite, opacities, 0.0), camera, self.eps2d)
+        colors = sh_to_color(sh[projected.index], means[projected.index] - camera.position)
+        color, alpha = composite_gaussians(projected, colors, camera.width, camera.height, self.max_pairs)
+        if background is not None:
+            color = color + (1.0 - alpha) * background.to(color)
+        with torch.no_grad():
+            radii = _extent(projected.covariances2d, projected.log_opacities)
+        screen = ScreenGaussians(projected.means2d, radii, projected.index, camera.width, camera.height)
+        return SplatOutput(color, alpha, screen)

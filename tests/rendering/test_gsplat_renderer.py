@@ -8,7 +8,7 @@ import torch
 from gaussian_swaying.rendering.base import make_renderer
 from gaussian_swaying.rendering.camera import look_at_camera
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, render_gsplat
-from gaussian_swaying.rendering.torch_renderer import render_torch
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 
 
 def _camera():
@@ -80,3 +80,35 @@ def test_missing_cuda_is_named():
         GsplatRenderer()
     with pytest.raises(RuntimeError, match="needs CUDA"):
         render_gsplat(*_scene(5, "cpu"), _camera())
+
+
+@pytest.mark.gpu
+def test_a_splat_as_it_is_stored_matches_the_torch_renderer():
+    """Picture, and the gradients that training and densification use."""
+    generator = torch.Generator().manual_seed(1)
+    count = 500
+    means = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([3.0, 8.0, 2.0])
+    parts = (
+        means,
+        torch.randn(count, 4, generator=generator),
+        torch.rand(count, 3, generator=generator) - 4.0,
+        torch.rand(count, generator=generator),
+        torch.randn(count, 16, 3, generator=generator) * 0.2,
+    )
+    background = torch.tensor([0.3, 0.6, 0.9], device="cuda")
+    results, gradients = [], []
+    for renderer in (GsplatRenderer(), TorchRenderer()):
+        splat = [part.cuda().requires_grad_() for part in parts]
+        output = renderer.render_splat(*splat, _camera(), background)
+        output.screen.means2d.retain_grad()
+        output.color.square().sum().backward()
+        screen = torch.zeros(count, 2, device="cuda")
+        index = slice(None) if output.screen.index is None else output.screen.index
+        screen[index] = output.screen.means2d.grad.reshape(-1, 2)
+        results.append(output)
+        gradients.append([*(part.grad for part in splat), screen])
+    for name in ("color", "alpha"):
+        difference = (getattr(results[0], name) - getattr(results[1], name)).abs().flatten()
+        assert float(difference.mean()) <= 1e-3
+    for actual, expected in zip(*gradients, strict=True):
+        assert float((actual - expected).norm() / expected.norm()) < 0.02

@@ -5,6 +5,8 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying.gaussians import surface
+from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.rendering.base import finite_gaussians, make_renderer
 from gaussian_swaying.rendering.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
@@ -270,3 +272,38 @@ def test_bad_arguments():
         TorchRenderer(eps2d=-0.1)
     with pytest.raises(ValueError, match="`max_pairs`"):
         TorchRenderer(max_pairs=0)
+
+
+def test_a_splat_as_it_is_stored():
+    """Quaternions, logarithms of scales and harmonics give the picture of their covariances and colours."""
+    generator = torch.Generator().manual_seed(5)
+    count = 40
+    means = torch.randn(count, 3, generator=generator) * torch.tensor([0.6, 0.6, 0.6])
+    quats, opacities = torch.randn(count, 4, generator=generator), torch.rand(count, generator=generator)
+    log_scales = torch.randn(count, 3, generator=generator) * 0.5 - 2.5
+    sh = torch.randn(count, 9, 3, generator=generator) * 0.3
+    camera = look_at_camera((0.2, -3.0, 0.4), (0, 0, 0), (0, 0, 1), 40.0, 48, 32)
+    background = torch.tensor([0.2, 0.4, 0.6])
+    renderer = TorchRenderer()
+    colors = sh_to_color(sh, means - camera.position)
+    expected = renderer(means, surface.covariance(quats, log_scales), opacities, colors, camera, background)
+    tensors = [t.requires_grad_() for t in (means, quats, log_scales, opacities, sh)]
+    result = renderer.render_splat(*tensors, camera, background)
+    torch.testing.assert_close(result.color, expected.color)
+    torch.testing.assert_close(result.alpha, expected.alpha)
+    screen = result.screen
+    assert (screen.width, screen.height) == (48, 32)
+    assert screen.means2d.shape == screen.radii.shape == (len(screen.index), 2)
+    assert (screen.radii > 0).all()
+    screen.means2d.retain_grad()
+    result.color.square().sum().backward()
+    assert screen.means2d.grad.abs().sum() > 0
+    assert all(t.grad is not None and torch.isfinite(t.grad).all() for t in tensors)
+    # the centres on the screen are those of a pinhole
+    x, y, z = (means.detach()[screen.index] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(
+        -1
+    )
+    pinhole = torch.stack([x / z, y / z], -1) * camera.intrinsics[0, 0] + torch.tensor([24.0, 16.0])
+    torch.testing.assert_close(screen.means2d.detach(), pinhole, rtol=1e-4, atol=1e-3)
+    with pytest.raises(ValueError, match="no absolute gradients"):
+        renderer.render_splat(*tensors, camera, absgrad=True)

@@ -1,0 +1,141 @@
+"""The command line of the training: ``fit``, ``validate`` and ``test`` of Lightning, with what they need here."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import warnings
+from argparse import ArgumentError
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import LightningDataModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+
+import gaussian_swaying.data.datamodule
+import gaussian_swaying.data.generated_datamodule
+import gaussian_swaying.training.densification
+import gaussian_swaying.training.losses  # noqa: F401
+from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
+
+TRAINER_DEFAULTS: dict[str, Any] = {
+    "max_steps": 60_000,
+    "max_epochs": -1,  # images are counted, not rounds of them
+    "accelerator": "auto",
+    "devices": 1,
+    "check_val_every_n_epoch": None,
+    "num_sanity_val_steps": 0,
+    "enable_model_summary": False,
+    "default_root_dir": "outputs/train/run",
+}
+"""What ``tools/train.py`` sets where a YAML does not."""
+
+
+def default_loggers(folder: Path) -> list[Logger]:
+    """A CSV file and, if tensorboard is installed, its event files, all in ``folder``."""
+    loggers: list[Logger] = [CSVLogger(folder, name="", version="csv")]
+    if any(importlib.util.find_spec(name) is not None for name in ("tensorboard", "tensorboardX")):
+        loggers.append(TensorBoardLogger(folder, name="", version="tensorboard"))
+    return loggers
+
+
+class TrainCLI(LightningCLI):
+    """LightningCLI with the trainer's defaults, loggers and checkpoints of a splat training."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the checkpoints as options of their own."""
+        parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
+        parser.set_defaults(
+            {
+                "checkpoint.filename": "step_{step:06d}",
+                "checkpoint.auto_insert_metric_name": False,
+                "checkpoint.every_n_train_steps": 1000,
+                "checkpoint.save_top_k": 1,
+            }
+        )
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Make the trainer, with loggers and a folder of checkpoints below its folder."""
+        settings = self._get(self.config_init, "trainer", default={})
+        root = Path(settings["default_root_dir"])
+        if settings.get("logger") in (None, True):
+            kwargs["logger"] = default_loggers(root)
+        checkpoint = self._get(self.config_init, "checkpoint")
+        if checkpoint is not None and checkpoint.dirpath is None:
+            checkpoint.dirpath = str(root / "checkpoints")
+        return super().instantiate_trainer(**kwargs)
+
+
+def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainCLI:
+    """Parse a command line and, with ``run``, do what it says.
+
+    Args:
+        arguments: Command line; that of the process if None. Without ``run`` it has no subcommand.
+        run: Whether to run the subcommand.
+
+    Returns:
+        The command line interface, with its ``model``, ``datamodule`` and ``trainer``.
+
+    Raises:
+        ArgumentError: If an option is unknown or a value has the wrong type.
+        ValueError: If a value is out of range or the data are bad.
+        TrainingDiverged: If a loss or a Gaussian is not finite any more.
+    """
+    return TrainCLI(
+        SplatTrainer,
+        LightningDataModule,
+        subclass_mode_data=True,
+        trainer_defaults=dict(TRAINER_DEFAULTS),
+        seed_everything_default=0,
+        save_config_kwargs={"overwrite": True},
+        parser_kwargs={"exit_on_error": False, "description": "Train surface-aligned Gaussians from photos."},
+        args=None if arguments is None else list(arguments),
+        run=run,
+    )
+
+
+def _sentence(error: BaseException) -> str:
+    """The lines of a parser's message that name the value and the reason."""
+    noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+    lines = [line.strip() for line in str(error).splitlines()]
+    return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(noise))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse and run.
+
+    Args:
+        arguments: Command line; that of the process if None.
+
+    Returns:
+        0 if all went well, 2 on bad input or a training that diverged, 130 if stopped with Ctrl-C. With the
+        environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+    """
+    # checkpoints are written after the step, which is what a resumed run needs
+    warnings.filterwarnings("ignore", message="Using ModelCheckpoint with manual optimization")
+    warnings.filterwarnings("ignore", message="(?s).*does not have many workers")
+    warnings.filterwarnings("ignore", message=".*LeafSpec")
+    try:
+        cli = make_cli(arguments)
+    except KeyboardInterrupt:
+        print("Stopped; --ckpt_path with the last checkpoint continues.", file=sys.stderr)
+        return 130
+    except torch.OutOfMemoryError as error:
+        print(f"error: {error} Remedy: smaller images (`data.init_args.downscale`).", file=sys.stderr)
+        return 2
+    except (ArgumentError, ValueError, TypeError, OSError, TrainingDiverged) as error:
+        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
+            raise
+        print(f"error: {_sentence(error)}", file=sys.stderr)
+        return 2
+    if cli.subcommand == "fit":
+        for name in ("point_cloud.ply", "panels", "checkpoints"):
+            path = cli.model.folder / name
+            if path.exists():
+                print(f"wrote {path}")
+    return 130 if cli.trainer.interrupted else 0

@@ -1,0 +1,288 @@
+"""Which Gaussians to copy, split, move and remove while training: the strategies of gsplat behind one interface."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.rendering.base import ScreenGaussians
+
+PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+"""Parameters of a :class:`GaussianSurfaceModel`; a training has one optimiser for each."""
+
+
+def _check_steps(**values: int) -> None:
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise ValueError(f"Expected `densification.{name}` to be a number of steps, but got {value!r}.")
+
+
+class Densification(ABC):
+    """Keeps the parameters of a model, their optimisers and the state of a strategy together as their number changes.
+
+    In a training: :meth:`attach` once, then for each image :meth:`before_backward`, the backward pass, the steps of
+    the optimisers, and :meth:`after_step`. Steps count images from 0.
+    """
+
+    absgrad: bool = False
+    """Whether the renderer is to compute absolute gradients."""
+
+    def __init__(self) -> None:
+        self._model: GaussianSurfaceModel | None = None
+        self._optimizers: dict[str, torch.optim.Optimizer] = {}
+        self._strategy: Any = None
+        self._state: dict[str, Any] = {}
+        self._restored: dict[str, Any] | None = None
+
+    @abstractmethod
+    def make_strategy(self, device: torch.device) -> Any:
+        """The strategy of gsplat for parameters on a device; ValueError if it does not run there."""
+
+    def attach(
+        self, model: GaussianSurfaceModel, optimizers: Mapping[str, torch.optim.Optimizer], scene_scale: float
+    ) -> None:
+        """Take charge of a model and of its optimisers.
+
+        Args:
+            model: The model; its parameters are exchanged when their number changes.
+            optimizers: One for each of :data:`PARAMETERS`, with that one parameter.
+            scene_scale: Extent of the scene [scene units], which thresholds of size are a share of.
+
+        Raises:
+            ValueError: If an optimiser is missing or has another parameter, ``scene_scale`` is not positive, or the
+                strategy does not run on the model's device.
+        """
+        check_positive("scene_scale", scene_scale)
+        for name in PARAMETERS:
+            groups = optimizers[name].param_groups if name in optimizers else []
+            held = [id(item) for group in groups for item in group["params"]]
+            if held != [id(getattr(model, name))]:
+                raise ValueError(f"Expected an optimiser of `{name}` alone for the densification.")
+        device = model.means.device
+        self._strategy = self.make_strategy(device)
+        self._model, self._optimizers = model, {name: optimizers[name] for name in PARAMETERS}
+        self._state = self._initial_state(scene_scale)
+        if self._restored is not None:
+            moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self._restored.items()}
+            self._state |= moved
+            self._restored = None
+
+    def _initial_state(self, scene_scale: float) -> dict[str, Any]:
+        return dict(self._strategy.initialize_state())
+
+    def before_backward(self, step: int, screen: ScreenGaussians) -> None:
+        """Prepare the picture of a step for its backward pass."""
+        if screen.means2d.requires_grad:
+            screen.means2d.retain_grad()
+
+    def after_step(self, step: int, screen: ScreenGaussians) -> None:
+        """Change the Gaussians where the strategy wants it, after the optimisers have stepped."""
+        assert self._model is not None, "attach comes first"
+        parameters = {name: getattr(self._model, name) for name in PARAMETERS}
+        self._advance(parameters, step, screen)
+        for name, parameter in parameters.items():
+            if parameter is not getattr(self._model, name):
+                setattr(self._model, name, parameter)
+
+    @abstractmethod
+    def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
+        """Let the strategy act; it puts new parameters into the dictionary."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything the strategy accumulated since it last changed the Gaussians."""
+        return dict(self._state)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a state when the model is attached next."""
+        self._restored = dict(state)
+
+
+class NoDensification(Densification):
+    """The number of Gaussians stays."""
+
+    def make_strategy(self, device: torch.device) -> None:
+        """None is needed."""
+        return
+
+    def _initial_state(self, scene_scale: float) -> dict[str, Any]:
+        return {}
+
+    def before_backward(self, step: int, screen: ScreenGaussians) -> None:
+        """Nothing to prepare."""
+
+    def after_step(self, step: int, screen: ScreenGaussians) -> None:
+        """Nothing changes."""
+
+    def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
+        raise AssertionError("never called")
+
+
+class DefaultDensification(Densification):
+    """Copy, split and prune by the gradient on the screen: gsplat's ``DefaultStrategy`` (Kerbl et al. 2023).
+
+    On any device. In gsplat 1.5.3 opacities are never reset, as its condition for it cannot hold;
+    ``reset_opacity`` does it here.
+
+    Args:
+        start: Step after which Gaussians may change.
+        stop: Step from which on they do not.
+        every: Steps between changes.
+        grow_grad2d: Gradient on the screen (in units of half the picture) above which a Gaussian is copied or split;
+            about 0.0008 with ``absgrad``.
+        grow_scale3d: Scale above which it is split rather than copied, as a share of the scene's extent.
+        prune_opacity: Opacity below which it is removed.
+        prune_scale3d: Scale above which it is removed after ``reset_every``, as a share of the scene's extent.
+        reset_every: Steps between resets of the opacities; large Gaussians are pruned after the first.
+        reset_opacity: Whether opacities are lowered to twice ``prune_opacity`` then.
+        pause_after_reset: Steps after a reset without changes; 0 for none.
+        absgrad: Use absolute gradients (Ye et al. 2024, "AbsGS"); CUDA only.
+        revised_opacity: Opacities of split Gaussians after Rota Bulo et al. 2024 (arXiv 2404.06109).
+
+    Raises:
+        ValueError: If an argument is negative, or ``every`` or ``reset_every`` is 0.
+    """
+
+    def __init__(
+        self,
+        start: int = 500,
+        stop: int = 15_000,
+        every: int = 100,
+        grow_grad2d: float = 0.0002,
+        grow_scale3d: float = 0.01,
+        prune_opacity: float = 0.005,
+        prune_scale3d: float = 0.1,
+        reset_every: int = 3000,
+        reset_opacity: bool = False,
+        pause_after_reset: int = 0,
+        absgrad: bool = False,
+        revised_opacity: bool = False,
+    ) -> None:
+        super().__init__()
+        _check_steps(start=start, stop=stop, every=every, reset_every=reset_every, pause_after_reset=pause_after_reset)
+        for name, value in (("every", every), ("reset_every", reset_every), ("grow_grad2d", grow_grad2d)):
+            check_positive(f"densification.{name}", value)
+        for name, value in (("grow_scale3d", grow_scale3d), ("prune_scale3d", prune_scale3d)):
+            check_positive(f"densification.{name}", value)
+        if not 0.0 <= prune_opacity < 0.5:
+            raise ValueError(f"Expected `densification.prune_opacity` from 0 to below 0.5, but got {prune_opacity}.")
+        self.absgrad, self.reset_opacity = absgrad, reset_opacity
+        self.stop, self.reset_every, self.prune_opacity = stop, reset_every, float(prune_opacity)
+        self._options: dict[str, Any] = {
+            "refine_start_iter": start,
+            "refine_stop_iter": stop,
+            "refine_every": every,
+            "grow_grad2d": grow_grad2d,
+            "grow_scale3d": grow_scale3d,
+            "prune_opa": prune_opacity,
+            "prune_scale3d": prune_scale3d,
+            "reset_every": reset_every,
+            "pause_refine_after_reset": pause_after_reset,
+            "absgrad": absgrad,
+            "revised_opacity": revised_opacity,
+        }
+
+    def make_strategy(self, device: torch.device) -> Any:
+        """``gsplat.DefaultStrategy`` with these options."""
+        if self.absgrad and device.type != "cuda":
+            raise ValueError("`densification.absgrad` needs CUDA: leave it off on a CPU.")
+        from gsplat import DefaultStrategy
+
+        return DefaultStrategy(**self._options)
+
+    def _initial_state(self, scene_scale: float) -> dict[str, Any]:
+        return dict(self._strategy.initialize_state(scene_scale=scene_scale))
+
+    def before_backward(self, step: int, screen: ScreenGaussians) -> None:
+        """Keep the gradient of the centres on the screen."""
+        if step < self.stop:
+            super().before_backward(step, screen)
+
+    def after_step(self, step: int, screen: ScreenGaussians) -> None:
+        """See :meth:`Densification.after_step`."""
+        if step >= self.stop:
+            return
+        if screen.means2d.grad is None:  # nothing was drawn
+            screen.means2d.grad = torch.zeros_like(screen.means2d)
+        super().after_step(step, screen)
+
+    def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
+        self._strategy.step_post_backward(
+            parameters, self._optimizers, self._state, step, screen.info(), packed=screen.index is not None
+        )
+        if self.reset_opacity and step > 0 and step % self.reset_every == 0:
+            from gsplat.strategy.ops import reset_opa
+
+            reset_opa(parameters, self._optimizers, self._state, value=2.0 * self.prune_opacity)
+
+
+class MCMCDensification(Densification):
+    """Move faint Gaussians to opaque ones and add noise: gsplat's ``MCMCStrategy`` (Kheradmand et al. 2024). CUDA only.
+
+    It expects penalties on opacity and scale among the losses, with a weight of 0.01 each:
+    :class:`~gaussian_swaying.training.losses.MeanOpacityLoss` and
+    :class:`~gaussian_swaying.training.losses.MeanScaleLoss`.
+
+    Args:
+        cap: Largest number of Gaussians.
+        noise_rate: Noise on the centres, as a multiple of their learning rate.
+        start: Step after which Gaussians may move.
+        stop: Step from which on they do not.
+        every: Steps between moves.
+        min_opacity: Opacity up to which a Gaussian counts as dead.
+
+    Raises:
+        ValueError: If an argument is negative, or ``cap`` or ``every`` is 0.
+    """
+
+    def __init__(
+        self,
+        cap: int = 1_000_000,
+        noise_rate: float = 5e5,
+        start: int = 500,
+        stop: int = 25_000,
+        every: int = 100,
+        min_opacity: float = 0.005,
+    ) -> None:
+        super().__init__()
+        _check_steps(start=start, stop=stop, every=every)
+        check_positive("densification.cap", cap)
+        check_positive("densification.every", every)
+        check_positive("densification.noise_rate", noise_rate, allow_zero=True)
+        check_positive("densification.min_opacity", min_opacity)
+        self._options: dict[str, Any] = {
+            "cap_max": cap,
+            "noise_lr": noise_rate,
+            "refine_start_iter": start,
+            "refine_stop_iter": stop,
+            "refine_every": every,
+            "min_opacity": min_opacity,
+        }
+
+    def make_strategy(self, device: torch.device) -> Any:
+        """``gsplat.MCMCStrategy`` with these options; ValueError on anything but CUDA."""
+        if device.type != "cuda":
+            raise ValueError(
+                f"MCMCDensification needs CUDA, as gsplat moves Gaussians in a kernel, but the model is on {device}: "
+                "use DefaultDensification there."
+            )
+        from gsplat import MCMCStrategy
+
+        return MCMCStrategy(**self._options)
+
+    def before_backward(self, step: int, screen: ScreenGaussians) -> None:
+        """Nothing to prepare: no gradient on the screen is looked at."""
+
+    def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
+        rate = float(self._optimizers["means"].param_groups[0]["lr"])
+        with torch.no_grad():
+            self._strategy.step_post_backward(parameters, self._optimizers, self._state, step, screen.info(), lr=rate)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: its table of binomials is made anew."""
+        return {}

@@ -1,0 +1,63 @@
+"""Gaussians to start a training from."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+from gaussian_swaying.gaussians.ply import GaussianCloud
+from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+
+
+def gaussians_from_points(
+    points: Tensor, colors: Tensor, sh_degree: int = 3, opacity: float = 0.1, scale: float = 1.0
+) -> GaussianCloud:
+    """Round Gaussians at points, as large as the distance to their neighbours (Kerbl et al. 2023, section 5.2).
+
+    Args:
+        points: Centres [scene units], shape (N, 3).
+        colors: RGB colours from 0 to 1, shape (N, 3).
+        sh_degree: Degree of the spherical harmonics, 0 to 3; all but the constant start at zero.
+        opacity: Opacity of all, between 0 and 1.
+        scale: Standard deviation as a multiple of the root mean square distance to the three nearest points.
+
+    Returns:
+        The Gaussians on the CPU in float32.
+
+    Raises:
+        ValueError: If there is no point, one is not finite, a tensor has another shape or a number is out of range.
+    """
+    check_shape("points", points, None, 3)
+    check_shape("colors", colors, points.shape[0], 3)
+    check_positive("scale", scale)
+    if not 0.0 < opacity < 1.0:
+        raise ValueError(f"Expected `opacity` between 0 and 1 (both excluded), but got {opacity}.")
+    if sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"Expected `sh_degree` to be 0, 1, 2 or 3, but got {sh_degree}.")
+    points, colors = points.detach().cpu().float(), colors.detach().cpu().float()
+    count = len(points)
+    if count == 0:
+        raise ValueError("Expected at least one point to start from, but got none.")
+    if not bool(torch.isfinite(points).all()):
+        raise ValueError("Expected the points to start from to be finite, but some are not.")
+    if count > 1:
+        distance, _ = nearest_neighbours(points, min(3, count - 1))
+        spread = distance.square().mean(-1).sqrt()
+        positive = spread[spread > 0]
+        floor = 1e-3 * float(positive.median()) if len(positive) else 1e-3
+        sigma = scale * spread.clamp_min(floor)
+    else:
+        sigma = torch.full((1,), 0.01 * scale)
+    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = (colors - 0.5) / SH_DC
+    return GaussianCloud(
+        means=points,
+        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        scales=sigma.log()[:, None].repeat(1, 3),
+        opacities=torch.full((count,), math.log(opacity / (1.0 - opacity))),
+        sh=sh,
+    )

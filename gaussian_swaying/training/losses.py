@@ -1,0 +1,354 @@
+"""What a training step minimises: the terms of Gaussian Swaying ("Training") and their weighted sum."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gaussian_swaying._checks import check_choice, check_positive, check_shape
+
+SSIM_TAPS = 11
+"""Width of the window of :func:`ssim_map` [pixels]."""
+_SSIM_SIGMA = 1.5
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+_MIN_OPACITY = 1e-7
+_PADDINGS = ("valid", "reflect", "zeros")
+_REDUCTIONS = ("mean", "sum", "none")
+
+
+def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
+    r"""Structural similarity of two pictures around each pixel (Wang et al. 2004, equation 13).
+
+    Means, variances and covariance under a Gaussian window of 11 x 11 pixels with a standard deviation of 1.5, applied
+    along rows and columns in turn, for values from 0 to 1.
+
+    Args:
+        image: Picture, shape (..., H, W, C).
+        target: Picture to compare it with, of the same shape.
+        padding: ``valid`` looks only at windows that lie in the picture, as fused-ssim's option of that name.
+            ``reflect`` mirrors both pictures at their edges, and its mean is the SSIM of torchmetrics 1.9. ``zeros``
+            continues them with zeros, as Kerbl et al. 2023.
+
+    Returns:
+        Similarity up to 1, shape (..., H - 10, W - 10, C) with ``valid``, else that of the pictures.
+
+    Raises:
+        ValueError: If the shapes differ, the picture is smaller than the window, or ``padding`` is none of these.
+    """
+    check_choice("padding", padding, _PADDINGS)
+    _check_pictures(image, target)
+    height, width, channels = image.shape[-3:]
+    if min(height, width) < SSIM_TAPS:
+        raise ValueError(f"Expected pictures of at least {SSIM_TAPS} x {SSIM_TAPS} pixels, but got {width} x {height}.")
+    # One plane per channel: (planes, 1, H, W).
+    x, y = (picture.movedim(-1, -3).reshape(-1, 1, height, width) for picture in (image, target))
+    planes = x.shape[0]
+    offsets = torch.arange(SSIM_TAPS, dtype=x.dtype, device=x.device) - SSIM_TAPS // 2
+    window = torch.exp(-0.5 * (offsets / _SSIM_SIGMA).square())
+    window = window / window.sum()
+    if padding != "valid":
+        mode = "constant" if padding == "zeros" else padding
+        x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, mode) for plane in (x, y))
+    moments = torch.cat([x, y, x * x, y * y, x * y])
+    moments = functional.conv2d(moments, window.view(1, 1, 1, -1))
+    moments = functional.conv2d(moments, window.view(1, 1, -1, 1))
+    mean_x, mean_y, square_x, square_y, product = moments.split(planes)
+    variance_x = (square_x - mean_x.square()).clamp_min(0.0)
+    variance_y = (square_y - mean_y.square()).clamp_min(0.0)
+    covariance = product - mean_x * mean_y
+    similarity = ((2 * mean_x * mean_y + _SSIM_C1) * (2 * covariance + _SSIM_C2)) / (
+        (mean_x.square() + mean_y.square() + _SSIM_C1) * (variance_x + variance_y + _SSIM_C2)
+    )
+    return similarity.reshape(*image.shape[:-3], channels, *similarity.shape[-2:]).movedim(-3, -1)
+
+
+def photometric_loss(
+    image: Tensor, target: Tensor, ssim_weight: float = 0.2, padding: str = "valid", reduction: str = "mean"
+) -> Tensor:
+    r"""Distance of two pictures, :math:`(1 - w)\,\lvert I - \hat I \rvert + w\,(1 - \mathrm{SSIM})` with w = 0.2.
+
+    Kerbl et al. 2023, equation 7: the :math:`\mathcal L_\mathrm{rgb}` of Gaussian Swaying.
+
+    Args:
+        image: Rendered picture, values from 0 to 1, shape (..., H, W, C).
+        target: Photo, of the same shape.
+        ssim_weight: Weight w of the structural part, 0 to 1.
+        padding: See :func:`ssim_map`. With ``valid``, each part is the mean over the pixels that it is defined for.
+        reduction: ``mean``, ``sum`` over pixels and channels, or ``none``. The last two need another ``padding`` than
+            ``valid``, so that both parts have a value for each pixel, unless ``ssim_weight`` is 0.
+
+    Returns:
+        A number, or shape (..., H, W, C) with ``none``.
+
+    Raises:
+        ValueError: If shapes or options are not those above.
+    """
+    check_choice("reduction", reduction, _REDUCTIONS)
+    _check_pictures(image, target)
+    difference = (image - target).abs()
+    if ssim_weight == 0.0:
+        return _reduce(difference, reduction)
+    dissimilarity = 1.0 - ssim_map(image, target, padding)
+    if reduction == "mean":
+        return torch.lerp(difference.mean(), dissimilarity.mean(), ssim_weight)
+    if padding == "valid":
+        raise ValueError(f"Expected `padding` to be reflect or zeros with reduction={reduction!r}, but got 'valid'.")
+    return _reduce(torch.lerp(difference, dissimilarity, ssim_weight), reduction)
+
+
+def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", reduction: str = "mean") -> Tensor:
+    r"""Penalty on elongated Gaussians, :math:`\max(S^1 / S^2 - a, 0)` (Gaussian Swaying, "Training").
+
+    Args:
+        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
+        a: Ratio from which on a Gaussian counts as elongated.
+        ratio: ``paper`` divides the largest by the second largest scale, so that discs are free; ``max_min`` (Xie et
+            al. 2024, "PhysGaussian") divides the largest by the smallest, which asks for balls.
+        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``.
+
+    Returns:
+        A number, 0 without Gaussians, or shape (N,) with ``none``.
+
+    Raises:
+        ValueError: If ``log_scales`` has another shape or an option is none of those above.
+
+    Example:
+        >>> anisotropy_loss(torch.tensor([[3.0, 2.0, 0.5]]).log())
+        tensor(0.4000)
+    """
+    check_choice("ratio", ratio, ("paper", "max_min"))
+    check_choice("reduction", reduction, _REDUCTIONS)
+    check_shape("log_scales", log_scales, None, 3)
+    x, y, z = log_scales.unbind(-1)
+    low, high = torch.minimum(x, y), torch.maximum(x, y)
+    largest = torch.maximum(high, z)
+    other = torch.maximum(low, torch.minimum(high, z)) if ratio == "paper" else torch.minimum(low, z)
+    return _reduce(((largest - other).exp() - a).clamp_min(0.0), reduction)
+
+
+def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
+    r"""Entropy of the opacities, :math:`-\sigma \log \sigma` (Gaussian Swaying, "Training"; Duan et al. 2024).
+
+    Literally: it pushes opacities above 1/e towards 1 and those below towards 0.
+
+    Args:
+        opacities: Opacities from 0 to 1, shape (N,); values below 1e-7 count as that, where the gradient is zero.
+        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``.
+
+    Returns:
+        A number, 0 without Gaussians, or shape (N,) with ``none``.
+
+    Raises:
+        ValueError: If ``reduction`` is none of those above.
+    """
+    check_choice("reduction", reduction, _REDUCTIONS)
+    clamped = opacities.clamp_min(_MIN_OPACITY)
+    return _reduce(-clamped * clamped.log(), reduction)
+
+
+def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> Tensor:
+    r"""Penalty on large Gaussians, :math:`\max(S^1 - b, 0)` of the largest scale (Gaussian Swaying, "Training").
+
+    Args:
+        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
+        b: Scale from which on a Gaussian counts as large [scene units].
+        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``.
+
+    Returns:
+        A number [scene units], 0 without Gaussians, or shape (N,) with ``none``.
+
+    Raises:
+        ValueError: If ``log_scales`` has another shape or ``reduction`` is none of those above.
+    """
+    check_choice("reduction", reduction, _REDUCTIONS)
+    check_shape("log_scales", log_scales, None, 3)
+    return _reduce((log_scales.amax(-1).exp() - b).clamp_min(0.0), reduction)
+
+
+def _reduce(values: Tensor, reduction: str) -> Tensor:
+    if reduction == "none":
+        return values
+    return values.mean() if reduction == "mean" and values.numel() else values.sum()
+
+
+def _check_pictures(image: Tensor, target: Tensor) -> None:
+    check_shape("image", image, "H", "W", "C")
+    if image.shape != target.shape:
+        raise ValueError(f"Expected `target` of shape {tuple(image.shape)}, but got {tuple(target.shape)}.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LossInputs:
+    """What a loss term may look at in a training step.
+
+    Attributes:
+        image: Rendered picture, shape (H, W, 3).
+        target: Photo, over the background of this step, shape (H, W, 3).
+        alpha: Rendered opacity, shape (H, W, 1).
+        target_alpha: Opacity of the photo, shape (H, W, 1), or None.
+        means: Centres [scene units], shape (N, 3).
+        quats: Quaternions wxyz of any length above zero, shape (N, 4).
+        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
+        opacities: Opacities from 0 to 1, shape (N,).
+        step: Number of images trained on before this one.
+    """
+
+    image: Tensor
+    target: Tensor
+    alpha: Tensor
+    target_alpha: Tensor | None
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    opacities: Tensor
+    step: int
+
+
+class LossTerm(nn.Module, ABC):
+    """Base of all terms; a subclass anywhere can be named in a YAML by its class path."""
+
+    @abstractmethod
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """The term as a number, before its weight."""
+
+
+class PhotometricLoss(LossTerm):
+    """Distance between picture and photo, see :func:`photometric_loss`.
+
+    Args:
+        ssim_weight: Weight of the structural part, 0 to 1.
+        padding: ``valid``, ``reflect`` or ``zeros``, see :func:`ssim_map`.
+
+    Raises:
+        ValueError: If an argument is not one of those.
+    """
+
+    def __init__(self, ssim_weight: float = 0.2, padding: str = "valid") -> None:
+        super().__init__()
+        if not 0.0 <= ssim_weight <= 1.0:
+            raise ValueError(f"Expected `ssim_weight` between 0 and 1, but got {ssim_weight}.")
+        check_choice("padding", padding, _PADDINGS)
+        self.ssim_weight, self.padding = float(ssim_weight), padding
+
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """See :func:`photometric_loss`."""
+        return photometric_loss(inputs.image, inputs.target, self.ssim_weight, self.padding)
+
+
+class AnisotropyLoss(LossTerm):
+    """Penalty on elongated Gaussians, see :func:`anisotropy_loss`.
+
+    Args:
+        a: Ratio from which on a Gaussian counts as elongated, at least 1.
+        ratio: ``paper`` (largest over second largest scale) or ``max_min``.
+
+    Raises:
+        ValueError: If an argument is not one of those.
+    """
+
+    def __init__(self, a: float = 1.1, ratio: str = "paper") -> None:
+        super().__init__()
+        if not 1.0 <= a < math.inf:
+            raise ValueError(f"Expected `a` to be at least 1, but got {a}.")
+        check_choice("ratio", ratio, ("paper", "max_min"))
+        self.a, self.ratio = float(a), ratio
+
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """See :func:`anisotropy_loss`."""
+        return anisotropy_loss(inputs.log_scales, self.a, self.ratio)
+
+
+class OpacityEntropyLoss(LossTerm):
+    """Entropy of the opacities, see :func:`opacity_entropy_loss`."""
+
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """See :func:`opacity_entropy_loss`."""
+        return opacity_entropy_loss(inputs.opacities)
+
+
+class SizeLoss(LossTerm):
+    """Penalty on large Gaussians, see :func:`size_loss`.
+
+    Args:
+        b: Scale from which on a Gaussian counts as large [scene units].
+
+    Raises:
+        ValueError: If ``b`` is negative.
+    """
+
+    def __init__(self, b: float = 0.008) -> None:
+        super().__init__()
+        check_positive("b", b, allow_zero=True)
+        self.b = float(b)
+
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """See :func:`size_loss`."""
+        return size_loss(inputs.log_scales, self.b)
+
+
+class MeanOpacityLoss(LossTerm):
+    """Mean opacity: what Kheradmand et al. 2024 ("3DGS as Markov Chain Monte Carlo") add so that Gaussians can die."""
+
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """The mean."""
+        return _reduce(inputs.opacities, "mean")
+
+
+class MeanScaleLoss(LossTerm):
+    """Mean standard deviation [scene units], the other term of Kheradmand et al. 2024."""
+
+    def forward(self, inputs: LossInputs) -> Tensor:
+        """The mean."""
+        return _reduce(inputs.log_scales.exp(), "mean")
+
+
+DEFAULT_WEIGHTS = {"rgb": 1.0, "anisotropy": 10.0, "entropy": 0.01, "size": 0.01}
+"""Weights of Gaussian Swaying, "Training"."""
+
+
+class TotalLoss(nn.Module):
+    r"""Weighted sum of named terms, :math:`\mathcal L = \sum_k \lambda_k \mathcal L_k`.
+
+    The four terms of Gaussian Swaying are there with its weights: ``rgb`` 1, ``anisotropy`` 10, ``entropy`` 0.01 and
+    ``size`` 0.01. A term with weight 0 is not computed.
+
+    Args:
+        terms: Further terms by name, or others in place of the four.
+        weights: Weights by name, in place of those above; 1 for a further term that is not named.
+
+    Raises:
+        ValueError: If a weight is not finite or belongs to no term, or all are zero.
+    """
+
+    def __init__(self, terms: dict[str, LossTerm] | None = None, weights: dict[str, float] | None = None) -> None:
+        super().__init__()
+        named: dict[str, LossTerm] = {
+            "rgb": PhotometricLoss(),
+            "anisotropy": AnisotropyLoss(),
+            "entropy": OpacityEntropyLoss(),
+            "size": SizeLoss(),
+        }
+        named |= terms or {}
+        given = dict(weights or {})
+        unknown = sorted(set(given) - set(named))
+        if unknown:
+            raise ValueError(f"Expected `loss_weights` for {', '.join(named)}, but got one for {', '.join(unknown)}.")
+        self.weights = {name: float(given.get(name, DEFAULT_WEIGHTS.get(name, 1.0))) for name in named}
+        for name, weight in self.weights.items():
+            if not math.isfinite(weight):
+                raise ValueError(f"Expected `loss_weights.{name}` to be finite, but got {weight}.")
+        if not any(self.weights.values()):
+            raise ValueError("Expected one of `loss_weights` to be other than zero.")
+        self.terms = nn.ModuleDict({name: term for name, term in named.items() if self.weights[name] != 0.0})
+
+    def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
+        """The sum, with its gradient, and each term before its weight, detached."""
+        values = {name: term(inputs) for name, term in self.terms.items()}
+        total = torch.stack([self.weights[name] * value for name, value in values.items()]).sum()
+        return total, {name: value.detach() for name, value in values.items()}

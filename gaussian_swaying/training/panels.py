@@ -1,0 +1,92 @@
+"""Pictures to look at while training, and the metric that needs weights."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.rendering.base import Renderer
+from gaussian_swaying.rendering.camera import Camera
+
+_RAMP = ((0.27, 0.00, 0.33), (0.23, 0.32, 0.55), (0.13, 0.57, 0.55), (0.37, 0.79, 0.38), (0.99, 0.91, 0.14))
+_BACKBONES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth", "squeeze": "squeezenet1_1-*.pth"}
+
+
+def color_ramp(values: Tensor) -> Tensor:
+    """Colours from dark blue (0) to yellow (1), even in lightness.
+
+    Args:
+        values: Numbers, clamped to 0 to 1, shape (...).
+
+    Returns:
+        RGB, shape (..., 3).
+    """
+    stops = torch.tensor(_RAMP, dtype=values.dtype, device=values.device)
+    place = values.clamp(0.0, 1.0) * (len(_RAMP) - 1)
+    below = place.floor().long().clamp_max(len(_RAMP) - 2)
+    return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None])
+
+
+@torch.no_grad()
+def panel(
+    model: GaussianSurfaceModel, renderer: Renderer, camera: Camera, photo: Tensor, image: Tensor | None = None
+) -> Tensor:
+    """Photo, render, normals and area side by side.
+
+    Normals are those of the patches, turned to the camera, in its axes: red to the right, green up, blue towards it.
+    Areas are pi s1 s2 on a logarithmic scale from the 5th to the 95th percentile.
+
+    Args:
+        model: The Gaussians.
+        renderer: What draws them.
+        camera: Where from.
+        photo: Photo, shape (H, W, 3).
+        image: Render, shape (H, W, 3); drawn before black when None.
+
+    Returns:
+        Picture from 0 to 1, shape (H, 4 W, 3).
+    """
+    camera = camera.to(model.means.device, model.means.dtype)
+    gaussians = (model.means, model.covariance(), model.opacity())
+    view = model.means - camera.position
+    if image is None:
+        image = renderer(*gaussians, model.colors(view), camera).color
+    normals = model.normals()
+    normals = torch.where((normals * view).sum(-1, keepdim=True) > 0, -normals, normals)
+    axes = camera.world_to_camera[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]]).to(normals)
+    normal_colors = 0.5 + 0.5 * (normals @ axes.T)
+    areas = model.areas("paper").log()
+    if len(areas):
+        some = areas[:: len(areas) // 100_000 + 1]  # quantile takes only so many
+        low, high = some.quantile(0.05), some.quantile(0.95)
+        areas = (areas - low) / (high - low).clamp_min(1e-6)
+    drawn = [renderer(*gaussians, colors, camera).color for colors in (normal_colors, color_ramp(areas))]
+    return torch.cat([photo.to(image), image, *drawn], dim=1).clamp(0.0, 1.0)
+
+
+def lpips_metric(net: str = "alex") -> Any | None:
+    """The LPIPS metric (Zhang et al. 2018) of torchmetrics, if everything it needs is on this machine.
+
+    Args:
+        net: Backbone: ``alex``, ``vgg`` or ``squeeze``.
+
+    Returns:
+        The metric for pictures from 0 to 1, or None without torchvision or without the weights of the backbone in
+        torch's folder of checkpoints. Nothing is downloaded.
+
+    Raises:
+        ValueError: If there is no such backbone.
+    """
+    check_choice("net", net, tuple(_BACKBONES))
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    if importlib.util.find_spec("torchvision") is None or not any(folder.glob(_BACKBONES[net])):
+        return None
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=True)  # type: ignore[arg-type]

@@ -1,0 +1,151 @@
+"""The strategies of gsplat on a model, its optimisers and their state."""
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.rendering.base import ScreenGaussians
+from gaussian_swaying.training.densification import (
+    PARAMETERS,
+    DefaultDensification,
+    MCMCDensification,
+    NoDensification,
+)
+from gaussian_swaying.training.initial import gaussians_from_points
+
+
+def _model(count=6, opacity=0.5):
+    points = torch.arange(count, dtype=torch.float32)[:, None].repeat(1, 3)
+    return GaussianSurfaceModel.from_cloud(gaussians_from_points(points, torch.rand(count, 3), 1, opacity, 1e-3))
+
+
+def _optimizers(model):
+    optimizers = {name: torch.optim.Adam([getattr(model, name)], lr=1e-3) for name in PARAMETERS}
+    for name, optimizer in optimizers.items():
+        getattr(model, name).grad = torch.ones_like(getattr(model, name))
+        optimizer.step()
+    return optimizers
+
+
+def _screen(gradient, index):
+    means2d = torch.zeros(len(index), 2, requires_grad=True) * 1.0
+    means2d.retain_grad()
+    means2d.grad = torch.tensor(gradient)[:, None] * torch.tensor([[1.0, 0.0]])
+    return ScreenGaussians(means2d, torch.ones(len(index), 2), torch.tensor(index), 2, 2)
+
+
+def test_copies_splits_and_removes():
+    """By hand: 1 is copied, 3 is large and split, 5 is faint and removed, the rest has no gradient."""
+    model = _model()
+    with torch.no_grad():
+        model.scales[3] = 0.0
+        model.opacities[5] = -9.0
+    optimizers = _optimizers(model)
+    moved = model.means.detach().clone()
+    densification = DefaultDensification(start=0, every=2, grow_grad2d=0.5, grow_scale3d=0.1, prune_scale3d=10.0)
+    densification.attach(model, optimizers, 1.0)
+    densification.after_step(1, _screen([2.0, 2.0, 0.1], [1, 3, 4]))
+    assert len(model) == 6
+    assert densification.state_dict()["count"].tolist() == [0, 1, 0, 1, 1, 0]
+    densification.after_step(2, _screen([2.0, 2.0], [1, 3]))
+    assert len(model) == 7  # 6 + a copy + a half - a faint one
+    means = model.means.detach()
+    assert sum(torch.allclose(row, moved[1]) for row in means) == 2
+    assert not any(torch.allclose(row, moved[5]) for row in means)
+    assert float(model.scales.detach().max()) == pytest.approx(-torch.tensor(1.6).log().item(), abs=2e-3)
+    for name in PARAMETERS:
+        parameter = getattr(model, name)
+        assert optimizers[name].param_groups[0]["params"][0] is parameter
+        assert optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
+        assert dict(model.named_parameters())[name] is parameter
+    assert densification.state_dict()["grad2d"].eq(0).all()
+    assert len(densification.state_dict()["grad2d"]) == 7
+
+
+def test_all_gaussians_at_once():
+    """The layout of a picture that lists every Gaussian, drawn or not."""
+    model = _model()
+    densification = DefaultDensification(start=0, every=100)
+    densification.attach(model, _optimizers(model), 1.0)
+    means2d = torch.zeros(1, 6, 2, requires_grad=True) * 1.0
+    means2d.retain_grad()
+    means2d.grad = torch.ones(1, 6, 2)
+    radii = torch.tensor([3, 0, 2, 0, 1, 1])[None, :, None].expand(1, 6, 2)
+    densification.after_step(1, ScreenGaussians(means2d, radii, None, 2, 2))
+    assert densification.state_dict()["count"].tolist() == [1, 0, 1, 0, 1, 1]
+
+
+def test_opacities_are_reset_only_if_asked_for():
+    for reset in (False, True):
+        model = _model()
+        densification = DefaultDensification(reset_every=4, reset_opacity=reset)
+        densification.attach(model, _optimizers(model), 1.0)
+        densification.after_step(4, _screen([0.0], [0]))
+        assert float(model.opacity().detach().max()) == pytest.approx(0.01 if reset else 0.5, rel=0.01)
+
+
+def test_state_goes_through_a_dictionary():
+    model = _model()
+    optimizers = _optimizers(model)
+    one = DefaultDensification(start=0, every=100)
+    one.attach(model, optimizers, 1.0)
+    one.after_step(1, _screen([2.0], [3]))
+    two = DefaultDensification(start=0, every=100)
+    two.load_state_dict(one.state_dict())
+    two.attach(model, optimizers, 1.0)
+    for densification in (one, two):
+        densification.after_step(2, _screen([1.0], [3]))
+    assert torch.equal(one.state_dict()["grad2d"], two.state_dict()["grad2d"])
+
+
+def test_after_the_last_step_nothing_is_kept():
+    model = _model()
+    densification = DefaultDensification(stop=5)
+    densification.attach(model, _optimizers(model), 1.0)
+    screen = _screen([2.0], [3])
+    densification.before_backward(5, screen)
+    densification.after_step(5, screen)
+    assert densification.state_dict()["grad2d"] is None
+
+
+def test_no_densification():
+    model = _model()
+    densification = NoDensification()
+    densification.attach(model, _optimizers(model), 1.0)
+    densification.after_step(600, _screen([9.0], [0]))
+    assert len(model) == 6
+    assert densification.state_dict() == {}
+
+
+def test_what_needs_cuda_says_so():
+    model = _model()
+    with pytest.raises(ValueError, match=r"MCMCDensification needs CUDA.*use DefaultDensification"):
+        MCMCDensification().attach(model, _optimizers(model), 1.0)
+    with pytest.raises(ValueError, match=r"`densification.absgrad` needs CUDA"):
+        DefaultDensification(absgrad=True).attach(model, _optimizers(model), 1.0)
+
+
+@pytest.mark.gpu
+def test_mcmc_adds_up_to_its_cap():
+    model = _model(100).cuda()
+    densification = MCMCDensification(cap=103, start=0, every=1)
+    densification.attach(model, _optimizers(model), 1.0)
+    for step in (1, 2):
+        densification.after_step(step, ScreenGaussians(torch.zeros(1, 100, 2), torch.zeros(1, 100, 2), None, 2, 2))
+    assert len(model) == 103
+
+
+def test_foreign_optimizers_are_refused():
+    model = _model()
+    optimizers = _optimizers(model)
+    with pytest.raises(ValueError, match="optimiser of `means` alone"):
+        DefaultDensification().attach(_model(), optimizers, 1.0)
+    del optimizers["shN"]
+    with pytest.raises(ValueError, match="optimiser of `shN` alone"):
+        DefaultDensification().attach(model, optimizers, 1.0)
+
+
+@pytest.mark.parametrize("options", [{"every": 0}, {"start": -1}, {"prune_opacity": 0.7}, {"stop": 2.5}])
+def test_bad_settings(options):
+    with pytest.raises(ValueError, match=f"`densification.{next(iter(options))}`"):
+        DefaultDensification(**options)

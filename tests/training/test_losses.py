@@ -1,0 +1,191 @@
+"""The terms of the objective against closed forms, another implementation and their derivatives."""
+
+import math
+
+import pytest
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from gaussian_swaying.training.losses import (
+    AnisotropyLoss,
+    LossInputs,
+    LossTerm,
+    MeanOpacityLoss,
+    MeanScaleLoss,
+    OpacityEntropyLoss,
+    PhotometricLoss,
+    SizeLoss,
+    TotalLoss,
+    anisotropy_loss,
+    opacity_entropy_loss,
+    photometric_loss,
+    size_loss,
+    ssim_map,
+)
+
+
+def _pictures(height=24, width=31, dtype=torch.float64):
+    x = torch.rand(height, width, 3, dtype=dtype)
+    return x, (x + 0.2 * torch.randn_like(x)).clamp(0, 1)
+
+
+def _inputs(**changes):
+    image, target = _pictures(dtype=torch.float32)
+    fields = {
+        "image": image,
+        "target": target,
+        "alpha": torch.ones(24, 31, 1),
+        "target_alpha": None,
+        "means": torch.rand(5, 3),
+        "quats": torch.rand(5, 4),
+        "log_scales": torch.tensor([0.03, 0.02, 0.001]).log().repeat(5, 1),
+        "opacities": torch.full((5,), 0.5),
+        "step": 3,
+    }
+    return LossInputs(**(fields | changes))
+
+
+def test_ssim_equals_torchmetrics(device):
+    """Which mirrors at the edges: with `valid`, the part of its map that the edges do not reach."""
+    x, y = (picture.to(device) for picture in _pictures())
+    planes = [picture.movedim(-1, 0)[None] for picture in (x, y)]
+    mean, full = structural_similarity_index_measure(*planes, data_range=1.0, return_full_image=True)
+    torch.testing.assert_close(ssim_map(x, y, "reflect").mean(), mean, rtol=1e-7, atol=1e-9)
+    result = ssim_map(x, y)
+    assert result.shape == (14, 21, 3)
+    torch.testing.assert_close(result, full[0, :, 5:-5, 5:-5].movedim(0, -1), rtol=1e-7, atol=1e-9)
+
+
+def test_ssim_of_equal_pictures_is_one_and_padding_keeps_the_size():
+    x, y = _pictures()
+    torch.testing.assert_close(ssim_map(x, x), torch.ones(14, 21, 3, dtype=torch.float64))
+    for padding in ("reflect", "zeros"):
+        padded = ssim_map(x, y, padding)
+        assert padded.shape == x.shape
+        torch.testing.assert_close(padded[5:-5, 5:-5], ssim_map(x, y))
+    batch = ssim_map(torch.stack([x, y]), torch.stack([y, y]))
+    torch.testing.assert_close(batch, torch.stack([ssim_map(x, y), ssim_map(y, y)]))
+
+
+def test_ssim_refuses():
+    x, y = _pictures()
+    with pytest.raises(ValueError, match=r"at least 11 x 11 pixels, but got 31 x 10"):
+        ssim_map(x[:10], y[:10])
+    with pytest.raises(ValueError, match=r"`target` of shape \(24, 31, 3\), but got \(24, 30, 3\)"):
+        ssim_map(x, y[:, :30])
+    with pytest.raises(ValueError, match=r"`padding` to be one of valid, reflect, zeros"):
+        ssim_map(x, y, padding="mirror")
+
+
+def test_photometric_loss_is_the_weighted_sum():
+    x, y = _pictures()
+    expected = 0.8 * (x - y).abs().mean() + 0.2 * (1 - ssim_map(x, y).mean())
+    torch.testing.assert_close(photometric_loss(x, y), expected)
+    torch.testing.assert_close(photometric_loss(x, y, ssim_weight=0.0), (x - y).abs().mean())
+    assert float(photometric_loss(x, x)) == pytest.approx(0.0, abs=1e-12)
+    unreduced = photometric_loss(x, y, padding="zeros", reduction="none")
+    assert unreduced.shape == x.shape
+    torch.testing.assert_close(unreduced.mean(), photometric_loss(x, y, padding="zeros"))
+    with pytest.raises(ValueError, match="reflect or zeros with reduction='none'"):
+        photometric_loss(x, y, reduction="none")
+
+
+def test_photometric_gradient():
+    x, y = _pictures(12, 13)
+    assert torch.autograd.gradcheck(lambda p: photometric_loss(p, y), x.requires_grad_(), fast_mode=True)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 2, 0], [2, 1, 0]])
+def test_anisotropy_by_hand(order):
+    """The paper's ratio leaves discs alone, PhysGaussian's does not."""
+    scales = torch.tensor([[0.3, 0.2, 0.001], [0.2, 0.2, 0.001], [0.21, 0.2, 0.2]], dtype=torch.float64)[:, order].log()
+    literal = anisotropy_loss(scales, reduction="none")
+    torch.testing.assert_close(literal, torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))
+    spread = anisotropy_loss(scales, ratio="max_min", reduction="none")
+    torch.testing.assert_close(spread, torch.tensor([298.9, 198.9, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(anisotropy_loss(scales), literal.mean())
+    torch.testing.assert_close(anisotropy_loss(scales, reduction="sum"), literal.sum())
+
+
+def test_entropy_by_hand():
+    values = torch.tensor([0.0, 1.0, 0.5, 1 / math.e], dtype=torch.float64, requires_grad=True)
+    result = opacity_entropy_loss(values, reduction="none")
+    expected = torch.tensor([0.0, 0.0, 0.5 * math.log(2), 1 / math.e], dtype=torch.float64)
+    torch.testing.assert_close(result, expected, rtol=1e-9, atol=2e-6)
+    result.sum().backward()
+    assert torch.isfinite(values.grad).all()
+    assert (values.grad[1:3] < 0).all()  # descent raises an opacity above 1/e
+    assert opacity_entropy_loss(torch.tensor([0.1, 0.9])).item() == pytest.approx(0.16252, abs=1e-4)
+
+
+def test_size_by_hand():
+    scales = torch.tensor([[0.001, 0.010, 0.002], [0.008, 0.001, 0.001]], dtype=torch.float64).log()
+    torch.testing.assert_close(size_loss(scales, reduction="none"), torch.tensor([0.002, 0.0], dtype=torch.float64))
+    assert size_loss(scales, b=0.0).item() == pytest.approx(0.009)
+
+
+def test_scale_gradients():
+    scales = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
+    for function in (anisotropy_loss, lambda s: anisotropy_loss(s, ratio="max_min"), size_loss):
+        assert torch.autograd.gradcheck(function, scales)
+
+
+def test_no_gaussians_cost_nothing():
+    assert anisotropy_loss(torch.zeros(0, 3)).item() == 0.0
+    assert opacity_entropy_loss(torch.zeros(0)).item() == 0.0
+    assert size_loss(torch.zeros(0, 3)).item() == 0.0
+
+
+def test_modules_are_their_functions():
+    inputs = _inputs()
+    pairs = [
+        (PhotometricLoss(0.4, "zeros"), photometric_loss(inputs.image, inputs.target, 0.4, "zeros")),
+        (AnisotropyLoss(1.2, "max_min"), anisotropy_loss(inputs.log_scales, 1.2, "max_min")),
+        (OpacityEntropyLoss(), opacity_entropy_loss(inputs.opacities)),
+        (SizeLoss(0.01), size_loss(inputs.log_scales, 0.01)),
+        (MeanOpacityLoss(), torch.tensor(0.5)),
+        (MeanScaleLoss(), torch.tensor(0.017)),
+    ]
+    for module, expected in pairs:
+        torch.testing.assert_close(module(inputs), expected)
+
+
+def test_total_with_the_weights_of_the_paper():
+    inputs = _inputs()
+    total, terms = TotalLoss()(inputs)
+    assert list(terms) == ["rgb", "anisotropy", "entropy", "size"]
+    expected = terms["rgb"] + 10 * terms["anisotropy"] + 0.01 * terms["entropy"] + 0.01 * terms["size"]
+    torch.testing.assert_close(total, expected)
+    assert terms["anisotropy"].item() == pytest.approx(0.4, abs=1e-6)
+
+
+class Steps(LossTerm):
+    """A term of a user's own."""
+
+    def forward(self, inputs):
+        return inputs.means.new_tensor(float(inputs.step))
+
+
+def test_total_with_a_term_of_ones_own():
+    total, terms = TotalLoss({"steps": Steps()}, {"steps": 2.0, "rgb": 0, "anisotropy": 0, "size": 0})(_inputs())
+    assert list(terms) == ["entropy", "steps"]
+    assert total.item() == pytest.approx(6.0 + 0.01 * 0.5 * math.log(2), rel=1e-5)
+    other = TotalLoss({"size": SizeLoss(0.0)}, {"rgb": 0, "anisotropy": 0, "entropy": 0})(_inputs())[0]
+    assert other.item() == pytest.approx(0.01 * 0.03)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: TotalLoss(weights={"depth": 1.0}), r"`loss_weights` for rgb.*but got one for depth"),
+        (lambda: TotalLoss(weights={"size": math.nan}), "`loss_weights.size` to be finite"),
+        (lambda: TotalLoss(weights={"rgb": 0, "anisotropy": 0, "entropy": 0, "size": 0}), "other than zero"),
+        (lambda: PhotometricLoss(1.5), "`ssim_weight` between 0 and 1"),
+        (lambda: AnisotropyLoss(0.5), "`a` to be at least 1"),
+        (lambda: AnisotropyLoss(ratio="min_max"), "paper, max_min"),
+        (lambda: SizeLoss(-1.0), "`b`"),
+    ],
+)
+def test_bad_terms(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

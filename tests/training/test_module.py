@@ -1,0 +1,253 @@
+"""Trainings that learn, stop when something is not finite, and continue exactly."""
+
+import math
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.training.densification import (
+    PARAMETERS,
+    DefaultDensification,
+    MCMCDensification,
+    NoDensification,
+)
+from gaussian_swaying.training.initial import gaussians_from_points
+from gaussian_swaying.training.losses import LossTerm, MeanOpacityLoss, MeanScaleLoss
+from gaussian_swaying.training.module import LearningRates, SplatTrainer, TrainingDiverged, means_rate
+
+
+def _often():
+    """A densification that acts every four steps: in the middle of its sums after ten."""
+    return DefaultDensification(start=1, every=4, grow_grad2d=1e-4, reset_every=8, reset_opacity=True)
+
+
+def _module(**options):
+    return SplatTrainer(**({"sh_degree": 1, "sh_every": 7, "densification": _often(), "lpips": None} | options))
+
+
+def _checkpoints(folder, every=10, **options):
+    return ModelCheckpoint(dirpath=folder, every_n_train_steps=every, save_top_k=-1, filename="{step}", **options)
+
+
+def test_a_training_learns(data, make_trainer, tmp_path):
+    """More than 6 dB in 200 images on held-out views, with Gaussians that multiply and become flat."""
+    module = _module(densification=DefaultDensification(start=20, every=50, grow_grad2d=5e-4), sh_every=100)
+    trainer = make_trainer(200, limit_val_batches=1.0, val_check_interval=100, num_sanity_val_steps=0)
+    start = trainer.validate(module, data, verbose=False)[0]
+    trainer.fit(module, data)
+    end = trainer.validate(module, data, verbose=False)[0]
+    assert end["val/psnr"] >= start["val/psnr"] + 6.0
+    assert end["val/ssim"] > start["val/ssim"]
+    assert trainer.global_step == 200
+    assert len(module.splat) > data.points
+    scales = module.splat.scales.detach().sort(-1).values.exp()
+    assert float((scales[:, 2] / scales[:, 1]).median()) < 1.2
+    cloud = read_ply(tmp_path / "run" / "point_cloud.ply")
+    assert len(cloud) == len(module.splat)
+    torch.testing.assert_close(cloud.means, module.splat.means.detach())
+    assert {path.name for path in (tmp_path / "run" / "panels").iterdir()} >= {"val_00_000100.png", "val_01_000200.png"}
+
+
+def _state(module):
+    """Everything that decides how a training goes on."""
+    result = {name: getattr(module.splat, name).detach() for name in PARAMETERS}
+    for name, optimizer in zip(PARAMETERS, module.trainer.optimizers, strict=True):
+        for values in optimizer.state.values():
+            result |= {f"{name}.{key}": value for key, value in values.items()}
+        result[f"{name}.lr"] = torch.tensor(optimizer.param_groups[0]["lr"])
+    state = module.densification.state_dict()
+    return result | {key: value for key, value in state.items() if isinstance(value, torch.Tensor)}
+
+
+def test_a_resumed_training_is_the_same_bit_for_bit(data, make_trainer, tmp_path):
+    """20 images at once, or 10, a checkpoint and 10, with Gaussians that split and vanish in both halves."""
+    torch.manual_seed(1)
+    straight = _module()
+    make_trainer(20).fit(straight, data)
+    torch.manual_seed(2)
+    first = _module()
+    trainer = make_trainer(20, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path / "c"), _StopAt(10)])
+    trainer.fit(first, data)
+    assert trainer.global_step == 10
+    count = len(first.splat)
+    assert count != data.points
+    torch.manual_seed(3)
+    second = _module()
+    make_trainer(20).fit(second, data, ckpt_path=tmp_path / "c" / "step=10.ckpt", weights_only=False)
+    assert len(second.splat) != count
+    expected, result = _state(straight), _state(second)
+    assert result.keys() == expected.keys()
+    assert len(expected) > 20
+    for name, value in expected.items():
+        assert torch.equal(result[name], value), name
+
+
+class _StopAt(lightning.Callback):
+    """Ends a training early, its schedule unchanged."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def on_train_batch_end(self, trainer, *_):
+        trainer.should_stop = trainer.should_stop or trainer.global_step >= self.step
+
+
+def test_a_checkpoint_can_be_read_alone_and_tested(data, make_trainer, tmp_path):
+    module = _module()
+    trainer = make_trainer(10, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path)])
+    trainer.fit(module, data)
+    path = tmp_path / "step=10.ckpt"
+    loaded = SplatTrainer.load_from_checkpoint(path, sh_degree=1, weights_only=False)
+    assert torch.equal(loaded.splat.means, module.splat.means)
+    results = [
+        make_trainer(1, folder="test").test(_module(), data, ckpt_path=path, weights_only=False, verbose=False)[0],
+        make_trainer(1, folder="test").test(module, data, verbose=False)[0],
+    ]
+    assert results[0]["test/gaussians"] == len(module.splat)
+    assert results[0] == results[1]
+    with pytest.raises(ValueError, match="`sh_degree` 1, but the configuration says 2"):
+        SplatTrainer.load_from_checkpoint(path, sh_degree=2, weights_only=False)
+
+
+class Breaks(LossTerm):
+    """Zero, and not a number from a step on."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def forward(self, inputs):
+        return inputs.means.sum() * (math.nan if inputs.step >= self.at else 0.0)
+
+
+def test_a_loss_that_is_not_finite_stops(data, make_trainer, tmp_path):
+    """The step and the last good checkpoint are named; that checkpoint is intact."""
+    module = _module(loss_terms={"breaks": Breaks(7)})
+    trainer = make_trainer(20, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=3)])
+    with pytest.raises(TrainingDiverged, match=r"step 7: the loss is not finite.*step=6\.ckpt") as caught:
+        trainer.fit(module, data)
+    assert caught.value.step == 7
+    assert sorted(path.name for path in tmp_path.glob("*.ckpt")) == ["step=3.ckpt", "step=6.ckpt"]
+    state = torch.load(caught.value.checkpoint, weights_only=False)["state_dict"]
+    assert all(torch.isfinite(value).all() for value in state.values())
+
+
+def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path):
+    class Spoils(lightning.Callback):
+        def on_train_batch_start(self, trainer, module, *_):
+            if trainer.global_step == 4:
+                module.splat.quats.data[3] = math.nan
+
+    only_rgb = {"anisotropy": 0, "entropy": 0, "size": 0}
+    module = _module(loss_weights=only_rgb, densification=NoDensification())
+    callbacks = [Spoils(), _checkpoints(tmp_path, every=3)]
+    with pytest.raises(TrainingDiverged, match=r"step 6: a value of `.*step=3\.ckpt"):
+        make_trainer(20, enable_checkpointing=True, callbacks=callbacks).fit(module, data)
+    assert [path.name for path in tmp_path.glob("*.ckpt")] == ["step=3.ckpt"]
+    module.export(tmp_path / "some.ply")
+    assert len(read_ply(tmp_path / "some.ply")) == data.points - 1
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", ["default", "absgrad", "mcmc"])
+def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
+    """gsplat's kernels, fused optimisers and strategies together; the splat draws on a CPU afterwards."""
+    if kind == "mcmc":
+        terms = {"opacity": MeanOpacityLoss(), "scale": MeanScaleLoss()}
+        options = {"loss_terms": terms, "loss_weights": {"opacity": 0.01, "scale": 0.01}}
+        options["densification"] = MCMCDensification(cap=200, start=20, every=20)
+    else:
+        chosen = DefaultDensification(start=20, every=40, grow_grad2d=5e-4, absgrad=kind == "absgrad")
+        options = {"densification": chosen}
+    module = _module(sh_every=50, **options)
+    callbacks = [_checkpoints(tmp_path, every=100)]
+    trainer = make_trainer(200, accelerator="gpu", devices=1, enable_checkpointing=True, callbacks=callbacks)
+    start = trainer.validate(module, data, verbose=False)[0]
+    trainer.fit(module, data)
+    end = trainer.validate(module, data, verbose=False)[0]
+    assert end["val/psnr"] > start["val/psnr"] + 3.0
+    assert len(module.splat) != data.points
+    module.cpu().render(data.held_out[0]["camera"])
+    again = _module(sh_every=50, **options)
+    path = tmp_path / "step=100.ckpt"
+    make_trainer(200, accelerator="gpu", devices=1).fit(again, data, ckpt_path=path, weights_only=False)
+    assert again.trainer.global_step == 200
+
+
+def test_schedules(data, make_trainer):
+    rates = LearningRates()
+    assert means_rate(rates, 2.0, 0, 100) == pytest.approx(3.2e-4)
+    assert means_rate(rates, 2.0, 50, 100) == pytest.approx(3.2e-5)
+    assert means_rate(rates, 2.0, 100, 100) == pytest.approx(3.2e-6)
+    module = SplatTrainer(sh_degree=2, sh_every=10)
+    assert [module.active_degree(step) for step in (0, 9, 10, 25, 99)] == [0, 0, 1, 2, 2]
+    assert SplatTrainer(sh_degree=2, sh_every=0).active_degree(0) == 2
+    module = _module(densification=NoDensification())
+    make_trainer(3).fit(module, data)
+    got = [group["lr"] for optimizer in module.trainer.optimizers for group in optimizer.param_groups]
+    assert got == pytest.approx([means_rate(rates, 1.5, 2, 3), 5e-3, 1e-3, 5e-2, 2.5e-3, 2.5e-3 / 20])
+    assert all(parameter.grad is None for parameter in module.splat.parameters())
+    # harmonics that are not in use do not move
+    assert module.splat.shN.abs().max() == 0
+
+
+def test_backgrounds(data):
+    """Random behind a photo with alpha in training, fixed in validation; a photo without alpha stays as it is."""
+    module = _module(background=[1.0, 0.5, 0.0])
+    image = torch.full((2, 2, 3), 0.25)
+    alpha = torch.tensor([[1.0, 0.0], [0.5, 0.0]])[..., None]
+    target, shape, _ = module._target({"image": image, "alpha": alpha}, train=True)
+    assert shape.shape == (2, 2, 1)
+    torch.testing.assert_close(target[0, 1], torch.tensor([1.0, 0.5, 0.0]))
+    torch.testing.assert_close(target[1, 0], torch.tensor([0.625, 0.375, 0.125]))
+    assert module._target({"image": image, "alpha": None}, train=True)[0] is image
+    module = _module()
+    one, two = (module._target({"image": image, "alpha": alpha}, train=True)[2] for _ in range(2))
+    assert not torch.equal(one, two)
+    assert module._target({"image": image, "alpha": alpha}, train=False)[2].eq(0).all()
+
+
+def test_gaussians_from_a_file(data, make_trainer, tmp_path):
+    """A splat of a higher degree is cut, one of a lower one extended."""
+    make_trainer(1).fit(_module(densification=NoDensification()), data)
+    for degree in (0, 2):
+        module = _module(init_ply=str(tmp_path / "run/point_cloud.ply"), sh_degree=degree)
+        make_trainer(1, folder="other").fit(module, data)
+        assert module.splat.sh.shape[1] == (degree + 1) ** 2
+
+
+def test_nothing_to_start_from(data, make_trainer):
+    with pytest.raises(ValueError, match="`init_ply`"):
+        make_trainer(1).fit(_module(), data.train)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sh_degree": 4}, "`sh_degree`"),
+        ({"background": [1.0]}, "`background` to have 3 numbers"),
+        ({"scene_scale": 0.0}, "`scene_scale`"),
+        ({"log_every": 0}, "`log_every`"),
+    ],
+)
+def test_bad_settings(options, words):
+    with pytest.raises(ValueError, match=words):
+        SplatTrainer(**options)
+
+
+def test_bad_rates():
+    with pytest.raises(ValueError, match=r"`rates\.scales`"):
+        LearningRates(scales=-1.0)
+
+
+def test_a_view_without_gaussians(data, make_trainer):
+    """Nothing drawn: the step passes, losses of the Gaussians still count."""
+    module = _module()
+    cloud = gaussians_from_points(torch.rand(20, 3), torch.rand(20, 3), 1)
+    cloud.means.sub_(torch.tensor([0.0, 100.0, 0.0]))  # behind the cameras
+    data.initial_cloud = lambda degree: cloud
+    make_trainer(5).fit(module, data)
+    assert torch.isfinite(module.splat.means).all()

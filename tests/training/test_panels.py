@@ -1,0 +1,34 @@
+"""Panels and the metric that needs weights."""
+
+import torch
+
+from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.rendering.camera import look_at_camera
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer
+from gaussian_swaying.training.panels import color_ramp, lpips_metric, panel
+
+
+def test_a_panel_shows_four_pictures():
+    """The flag lies in the x-z plane: seen along y its normals point to the camera."""
+    model = GaussianSurfaceModel.from_cloud(FlagScene(spacing=0.05, ripple=0.0).generate())
+    camera = look_at_camera((0.6, -1.0, 0.4), (0.6, 0.0, 0.4), (0.0, 0.0, 1.0), 30.0, 40, 30)
+    photo = torch.rand(30, 40, 3)
+    result = panel(model, TorchRenderer(), camera, photo)
+    assert result.shape == (30, 160, 3)
+    assert not result.requires_grad
+    torch.testing.assert_close(result[:, :40], photo)
+    normals, areas = result[15, 100], result[15, 140]
+    torch.testing.assert_close(normals, torch.tensor([0.5, 0.5, 1.0]), atol=0.03, rtol=0.0)
+    assert areas.std() > 0.05  # equal areas have one colour of the ramp, which is none of its greys
+
+
+def test_the_ramp_gets_lighter():
+    lightness = color_ramp(torch.linspace(0, 1, 50)) @ torch.tensor([0.2126, 0.7152, 0.0722])
+    assert (lightness.diff() > 0).all()
+
+
+def test_no_weights_no_lpips(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert lpips_metric("alex") is None
+    assert not any(tmp_path.rglob("*.pth"))
