@@ -34,22 +34,23 @@ FORMULATIONS = ("total", "updated")
 SECTIONS = ("substep", "sand", "batch", "frame")
 
 LIMITS: list[str] = [
-    "A substep on a GPU moves a small share of what a copy moves (see the table): the kernel over the particles"
-    " is limited by its instructions and by the latency of the 27 gathers and 81 sums, not by memory. It needs"
-    " some 125 registers a thread, which leave 16 warps to a multiprocessor. Tried: fewer registers (96) and more"
-    " (168), both slower for 8 to 32 lanes to a cell; 64 lanes with 128 registers are the fastest where cells are"
+    "The numbers of the H200 were recorded before the last changes of the kernels (idle lanes, node rows, winds"
+    " by graph).",
+    "A substep on a GPU moves a small share of what a copy moves (see the table), so it is not limited by memory"
+    " but, it seems, by instructions and the latency of the 27 gathers and 81 sums: the particle kernel needs some"
+    " 125 registers a thread, which leave 16 warps to a multiprocessor. Tried: fewer registers (96) and more"
+    " (168), both slower for 8 to 32 lanes to a cell; 64 lanes with 128 registers were the fastest where cells are"
     " full, and are taken there.",
     "`total` has no atomics: the sums of each cell are written once, and each node reads those of its 27 cells."
     " In `updated` a segmented scan over the warp leaves one atomic addition for each run of particles in a cell,"
-    " node and column; what is left is the scan. For few particles the pass over all nodes of the grid counts too,"
-    " and sorting and reading out every 32 substeps.",
-    "Sand: the singular value decomposition by Jacobi rotations is most of a substep. There is one, shared by the"
-    " return map and the stress.",
-    "Batches: a single small flag already runs from CUDA graphs, at the latency of two kernels a substep, so one"
-    " after the other is fast; many at once are limited by the throughput of the particle kernel with four"
-    " particles to a cell, of which a warp takes eight at a time.",
-    "Frames: besides the substeps, what the host launches before the first graph (substep, wind, drag) while the"
-    " GPU waits.",
+    " node and column. For few particles the pass over all nodes of the grid counts too, and sorting and reading"
+    " out every 32 substeps.",
+    "Sand: the singular value decomposition by Jacobi rotations. There is one a substep, shared by the return map"
+    " and the stress.",
+    "Batches: a single small flag already runs from CUDA graphs, so one after the other is fast, while many at"
+    " once fill the GPU.",
+    "Frames: reckoned, not measured: besides the substeps, what the host launches before the first graph while"
+    " the GPU waits.",
 ]
 """What limits the speed, a sentence each: text of the page that is no measurement."""
 

@@ -96,10 +96,14 @@ def _pose(where: str, pose: tuple[float, ...]) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
+class _UnknownLensError(Exception):
+    """A whole file with a lens that cannot be undone here, as against a damaged one."""
+
+
 def _lens(identity: int, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
     """Lens of a COLMAP camera."""
     if model not in _READABLE:
-        raise NotImplementedError(
+        raise _UnknownLensError(
             f"camera {identity} has the model {model}, whose distortion cannot be undone here (only "
             f"{', '.join(_READABLE)}): run `colmap image_undistorter` and give its output"
         )
@@ -129,7 +133,7 @@ def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable
             f"Cannot read {name} of the COLMAP model {model} ({error.strerror}): give cameras, images and points3D, "
             "all .bin or all .txt."
         ) from error
-    except NotImplementedError as error:
+    except _UnknownLensError as error:
         raise ValueError(f"In the COLMAP file {file} {error}.") from error
     except (struct.error, IndexError, ValueError) as error:
         raise ValueError(f"The COLMAP file {file} is damaged ({error}): export the model again.") from error
@@ -163,7 +167,7 @@ def _binary_cameras(data: bytes) -> dict[int, Lens]:
     for _ in range(source.take("Q")[0]):
         identity, model, width, height = source.take("iiQQ")
         if not 0 <= model < len(_MODELS):
-            raise NotImplementedError(f"camera {identity} has the unknown model {model}: use one of {_READABLE}")
+            raise _UnknownLensError(f"camera {identity} has the unknown model {model}: use one of {_READABLE}")
         name, count = _MODELS[model]
         result[identity] = _lens(identity, name, width, height, source.take(f"{count}d"))
     return result

@@ -44,7 +44,6 @@ FOAM = tl.constexpr(32)
 SNOW = tl.constexpr(64)
 FLUID = tl.constexpr(128)
 PLASTIC_KINDS = tl.constexpr(8 + 16 + 32 + 64 + 128)
-ELASTIC_KINDS = tl.constexpr(1 + 2 + 4)
 SPECTRAL_KINDS = tl.constexpr(4 + 8 + 16 + 32 + 64 + 128)
 
 
