@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -12,6 +12,7 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying.data.capture import Capture, View, read_capture
 from gaussian_swaying.data.images import straight_colors
 from gaussian_swaying.data.initial_points import initial_points
@@ -38,6 +39,7 @@ class TrainingImage:
     camera: Camera
     name: str
     index: int
+    _cameras: dict[torch.device, Camera] = field(default_factory=dict, repr=False)  # on devices, kept by the dataset
 
     @property
     def image(self) -> Tensor:
@@ -64,8 +66,11 @@ class TrainingImage:
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> TrainingImage:
         """Copy on another device."""
+        device = torch.device(device)
+        if device not in self._cameras:
+            self._cameras[device] = self.camera.to(device)
         pixels = self.pixels.to(device, non_blocking=non_blocking or self.pixels.is_pinned())
-        return replace(self, pixels=pixels, camera=self.camera.to(device))
+        return replace(self, pixels=pixels, camera=self._cameras[device])
 
     def pin_memory(self) -> TrainingImage:
         """Copy in page-locked memory, for DataLoader."""
@@ -77,7 +82,7 @@ class CaptureDataset(Dataset[TrainingImage]):
 
     Args:
         views: The views.
-        cache: Keep the pixels in memory, as bytes of the size that the views have.
+        cache: Keep the pixels in memory, as bytes of the size that the views have; page-locked if there is a GPU.
         threads: Threads that read images into the cache.
 
     Raises:
@@ -86,10 +91,13 @@ class CaptureDataset(Dataset[TrainingImage]):
 
     def __init__(self, views: tuple[View, ...], cache: bool = True, threads: int = 4) -> None:
         self.views = views
+        self._cameras: list[dict[torch.device, Camera]] = [{} for _ in views]
         self._pixels: list[Tensor] | None = None
         if cache:
             with ThreadPoolExecutor(max(threads, 1)) as pool:
                 self._pixels = list(pool.map(View.load, views))
+            if torch.cuda.is_available():
+                self._pixels = [pixels.pin_memory() for pixels in self._pixels]
 
     def __len__(self) -> int:
         return len(self.views)
@@ -98,7 +106,7 @@ class CaptureDataset(Dataset[TrainingImage]):
         """The view of an index."""
         view = self.views[index]
         pixels = view.load() if self._pixels is None else self._pixels[index]
-        return TrainingImage(pixels, view.camera, view.name, index)
+        return TrainingImage(pixels, view.camera, view.name, index, self._cameras[index])
 
 
 class CaptureDataModule(LightningDataModule):
@@ -121,6 +129,8 @@ class CaptureDataModule(LightningDataModule):
         points: What the Gaussians start from, see :func:`~gaussian_swaying.data.initial_points.initial_points`.
         point_count: Number of points, where they are drawn at random.
         seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
+        initial_opacity: Opacity of the Gaussians at these points, between 0 and 1; 0.5 suits MCMC.
+        initial_scale: Their standard deviation as a multiple of the distance to their neighbours; 0.1 suits MCMC.
 
     Raises:
         ValueError: If an argument is out of range; in ``setup``, if the capture is bad.
@@ -138,8 +148,14 @@ class CaptureDataModule(LightningDataModule):
         points: str = "auto",
         point_count: int = 100_000,
         seed: int | None = None,
+        initial_opacity: float = 0.1,
+        initial_scale: float = 1.0,
     ) -> None:
         super().__init__()
+        if not 0.0 < initial_opacity < 1.0:
+            raise ValueError(f"Expected `initial_opacity` between 0 and 1 (both excluded), but got {initial_opacity}.")
+        check_positive("initial_scale", initial_scale)
+        self.initial_opacity, self.initial_scale = initial_opacity, initial_scale
         if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
             raise ValueError(f"Expected `workers` to be a whole number of at least 0, but got {workers!r}.")
         self.path, self.format, self.downscale, self.test_every = path, format, downscale, test_every
@@ -174,7 +190,9 @@ class CaptureDataModule(LightningDataModule):
         from gaussian_swaying.training.initial import gaussians_from_points
 
         cloud = initial_points(self.capture, self.points, self.point_count, self.seed)
-        return gaussians_from_points(cloud.points, cloud.colors, sh_degree)
+        return gaussians_from_points(
+            cloud.points, cloud.colors, sh_degree, self.initial_opacity, self.initial_scale
+        )
 
     @property
     def validation_split(self) -> str:
@@ -205,7 +223,7 @@ class CaptureDataModule(LightningDataModule):
             "batch_size": None,  # an item is a batch
             "num_workers": workers,
             "persistent_workers": workers > 0,
-            "pin_memory": torch.cuda.is_available(),
+            "pin_memory": torch.cuda.is_available() and not self.cache,
         }
 
     def train_dataloader(self) -> DataLoader[TrainingImage]:

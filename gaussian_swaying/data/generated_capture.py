@@ -167,6 +167,29 @@ class GeneratedCapture:
         along, upward = self.slopes(*torch.meshgrid(x, z, indexing="ij"))
         return float((1 + along**2 + upward**2).sqrt().mean()) * self.width * self.height
 
+    def nearest(self, points: Tensor, iterations: int = 20) -> tuple[Tensor, Tensor]:
+        """Nearest points on the sheet, by Gauss-Newton steps in its tangent plane from the point straight below.
+
+        Args:
+            points: Points [m], shape (N, 3). For one that is further away than the sheet's radius of curvature, another
+                point than the nearest may be found.
+            iterations: Number of steps.
+
+        Returns:
+            The points on the sheet [m] and the unit normals there, both float64, shape (N, 3).
+        """
+        points = points.detach().double()
+        x, z = points[:, 0].clamp(0, self.width), points[:, 2].clamp(0, self.height)
+        for _ in range(iterations):
+            along, upward = self.slopes(x, z)
+            dx, dy, dz = points[:, 0] - x, points[:, 1] - self.elevation(x, z), points[:, 2] - z
+            right, up = dx + along * dy, dz + upward * dy
+            xx, xz, zz = 1 + along.square(), along * upward, 1 + upward.square()
+            determinant = xx * zz - xz.square()
+            x = (x + (zz * right - xz * up) / determinant).clamp(0, self.width)
+            z = (z + (xx * up - xz * right) / determinant).clamp(0, self.height)
+        return torch.stack([x, self.elevation(x, z), z], -1), self.normals(x, z)
+
     # ---- the pictures
 
     def cameras(self) -> list[Camera]:

@@ -25,6 +25,8 @@ class GeneratedDataModule(CaptureDataModule):
         points: What the Gaussians start from: ``random`` in the space that the cameras see, or a file.
         point_count: Number of points, where they are drawn at random.
         seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
+        initial_opacity: Opacity of the Gaussians at these points, between 0 and 1.
+        initial_scale: Their standard deviation as a multiple of the distance to their neighbours.
 
     Raises:
         ValueError: In ``setup``, if the folder holds something else, or images of another flag.
@@ -39,9 +41,19 @@ class GeneratedDataModule(CaptureDataModule):
         points: str = "random",
         point_count: int = 100_000,
         seed: int | None = None,
+        initial_opacity: float = 0.1,
+        initial_scale: float = 1.0,
     ) -> None:
         super().__init__(
-            path, "transforms", 1, test_every, workers=workers, points=points, point_count=point_count, seed=seed
+            path,
+            "transforms",
+            test_every=test_every,
+            workers=workers,
+            points=points,
+            point_count=point_count,
+            seed=seed,
+            initial_opacity=initial_opacity,
+            initial_scale=initial_scale,
         )
         self.generated = capture
 

@@ -49,13 +49,15 @@ def initial_points(
     if source in ("auto", "random"):
         center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
         return random_points(center, reach, count, seed)
+    if source == "consistent":
+        return consistent_points(capture, count, seed, half_side)
     path = Path(source)
     if path.suffix.lower() == ".obj":
         return sample_mesh(*read_obj_mesh(path), count=count, seed=seed)
     if path.suffix.lower() == ".ply":
         vertices, faces = read_ply_points(path)
         return vertices if faces is None else sample_mesh(vertices, faces, count, seed)
-    raise ValueError(f"Initial points cannot come from {source!s}: set auto, capture, random, or a .ply or .obj file.")
+    raise ValueError(f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply or .obj file.")
 
 
 def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -> PointCloud:
@@ -72,6 +74,67 @@ def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -
     generator = torch.Generator().manual_seed(seed)
     draw = torch.rand(count, 6, generator=generator)
     return PointCloud(center.float() + half_side * (2 * draw[:, :3] - 1), draw[:, 3:].contiguous())
+
+
+def consistent_points(
+    capture: Capture, count: int, seed: int = 0, half_side: float | None = None, candidates: int = 8, width: int = 160
+) -> PointCloud:
+    """Points at which the photos agree on a colour: of random candidates, those whose colour varies least.
+
+    In the spirit of space carving by photo-consistency (Kutulakos & Seitz 2000), without its test of occlusion. Half
+    of the candidates are uniform in the cube of :func:`initial_points`, the others around it, as dense per logarithm of
+    the distance up to ten times its half side; each half gives half of the points, so that the background has some.
+
+    Args:
+        capture: The capture; photos with alpha are taken in front of black.
+        count: Number of points.
+        seed: Of the random numbers.
+        half_side: Half the side of the cube [scene units]; that of :func:`initial_points` by default.
+        candidates: Number of candidates for each point.
+        width: Width to which the photos are reduced [pixels].
+
+    Returns:
+        The points, with the mean of the colours that the photos show there.
+
+    Raises:
+        ValueError: If fewer than ``count`` candidates are in three photos.
+    """
+    center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
+    generator = torch.Generator().manual_seed(seed)
+    inner = candidates * (count - count // 2)
+    outer = candidates * (count // 2)
+    near = 2 * torch.rand(inner, 3, generator=generator) - 1
+    ray = torch.nn.functional.normalize(torch.randn(outer, 3, generator=generator), dim=-1)
+    far = ray * 10.0 ** torch.rand(outer, 1, generator=generator)
+    points = center.float() + reach * torch.cat([near, far])
+    seen, total, squares = torch.zeros(len(points)), torch.zeros(len(points), 3), torch.zeros(len(points))
+    for view in capture.split("train"):
+        pixels = view.load()[..., :3].permute(2, 0, 1)[None].float() / 255
+        height = max(round(width * pixels.shape[2] / pixels.shape[3]), 1)
+        photo = torch.nn.functional.interpolate(pixels, (height, width), mode="area")[0]
+        camera = view.camera
+        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        scale = local[:, :2] / depth.clamp_min(1e-6)[:, None]
+        column = ((scale[:, 0] * camera.intrinsics[0, 0] + camera.intrinsics[0, 2]) * (width / camera.width)).floor()
+        row = ((scale[:, 1] * camera.intrinsics[1, 1] + camera.intrinsics[1, 2]) * (height / camera.height)).floor()
+        inside = (depth > camera.near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        found = photo[:, row[inside].long(), column[inside].long()].T
+        seen[inside] += 1
+        total[inside] += found
+        squares[inside] += found.square().sum(-1)
+    mean = total / seen.clamp_min(1)[:, None]
+    spread = squares / seen.clamp_min(1) - mean.square().sum(-1)
+    spread[seen < 3] = math.inf
+    parts = ((spread[:inner], 0, count - count // 2), (spread[inner:], inner, count // 2))
+    chosen = torch.cat([begin + part.topk(number, largest=False).indices for part, begin, number in parts])
+    missing = int(spread[chosen].isinf().sum())
+    if missing:
+        raise ValueError(
+            f"Only {count - missing} of {count} consistent points are in three photos or more: set a smaller "
+            "`point_count`, or the initial points to random."
+        )
+    return PointCloud(points[chosen], mean[chosen].clamp(0.0, 1.0))
 
 
 def _focus(capture: Capture) -> Tensor:

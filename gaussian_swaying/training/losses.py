@@ -46,19 +46,21 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
     height, width, channels = image.shape[-3:]
     if min(height, width) < SSIM_TAPS:
         raise ValueError(f"Expected pictures of at least {SSIM_TAPS} x {SSIM_TAPS} pixels, but got {width} x {height}.")
-    # One plane per channel: (planes, 1, H, W).
-    x, y = (picture.movedim(-1, -3).reshape(-1, 1, height, width) for picture in (image, target))
-    planes = x.shape[0]
+    # One plane per channel: (1, planes, H, W).
+    x, y = (picture.movedim(-1, -3).reshape(1, -1, height, width) for picture in (image, target))
+    planes = x.shape[1]
     offsets = torch.arange(SSIM_TAPS, dtype=x.dtype, device=x.device) - SSIM_TAPS // 2
     window = torch.exp(-0.5 * (offsets / _SSIM_SIGMA).square())
     window = window / window.sum()
     if padding != "valid":
         mode = "constant" if padding == "zeros" else padding
         x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, mode) for plane in (x, y))
-    moments = torch.cat([x, y, x * x, y * y, x * y])
-    moments = functional.conv2d(moments, window.view(1, 1, 1, -1))
-    moments = functional.conv2d(moments, window.view(1, 1, -1, 1))
-    mean_x, mean_y, square_x, square_y, product = moments.split(planes)
+    moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
+    # planes as groups, not as a batch: the gradient of a convolution of one channel is ten times slower
+    groups = moments.shape[1]
+    moments = functional.conv2d(moments, window.view(1, 1, 1, -1).expand(groups, 1, 1, -1), groups=groups)
+    moments = functional.conv2d(moments, window.view(1, 1, -1, 1).expand(groups, 1, -1, 1), groups=groups)
+    mean_x, mean_y, square_x, square_y, product = moments.split(planes, dim=1)
     variance_x = (square_x - mean_x.square()).clamp_min(0.0)
     variance_y = (square_y - mean_y.square()).clamp_min(0.0)
     covariance = product - mean_x * mean_y
@@ -350,5 +352,6 @@ class TotalLoss(nn.Module):
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
         """The sum, with its gradient, and each term before its weight, detached."""
         values = {name: term(inputs) for name, term in self.terms.items()}
-        total = torch.stack([self.weights[name] * value for name, value in values.items()]).sum()
+        total = sum(self.weights[name] * value for name, value in values.items())
+        assert isinstance(total, Tensor)  # one weight at least is not zero
         return total, {name: value.detach() for name, value in values.items()}

@@ -24,8 +24,6 @@ from gaussian_swaying.training.densification import PARAMETERS, DefaultDensifica
 from gaussian_swaying.training.losses import SSIM_TAPS, LossInputs, LossTerm, TotalLoss
 from gaussian_swaying.training.panels import lpips_metric, panel
 
-_SEED_STRIDE = 1_000_003  # a prime, so that seeds and steps do not meet
-
 
 class TrainingDiverged(RuntimeError):  # noqa: N818
     """A loss or a Gaussian is not finite any more; the message names the step and the last good checkpoint.
@@ -43,6 +41,40 @@ class TrainingDiverged(RuntimeError):  # noqa: N818
             f"Training diverged at step {step}: {what} is not finite; {kept}. Remedy: lower the learning rates "
             "(`model.rates`) or the weight of the loss that grew (`model.loss_weights`)."
         )
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A loss on its way to the host, which does not wait for it."""
+
+    step: int
+    loss: Tensor
+    arrived: torch.cuda.Event | None
+
+    @classmethod
+    def of(cls, step: int, loss: Tensor) -> _Pending:
+        if loss.device.type != "cuda":
+            return cls(step, loss, None)
+        host = torch.empty((), dtype=loss.dtype, pin_memory=True).copy_(loss, non_blocking=True)
+        arrived = torch.cuda.Event()
+        arrived.record()
+        return cls(step, host, arrived)
+
+    def value(self) -> float:
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        return float(self.loss)
+
+
+def _random_state(device: torch.device) -> dict[str, Tensor]:
+    state = {"cpu": torch.get_rng_state()}
+    return state | {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else state
+
+
+def _set_random_state(state: Mapping[str, Tensor], device: torch.device) -> None:
+    torch.set_rng_state(state["cpu"])
+    if device.type == "cuda" and "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"], device)
 
 
 @dataclass(frozen=True)
@@ -92,8 +124,8 @@ class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.surface.GaussianSurfaceModel` on photos with known cameras.
 
     A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one. Its
-    random numbers follow from the seed and its number, and so does all that the schedule sets, so a resumed training
-    continues exactly.
+    random numbers come from a stream of their own, which starts from the seed and is kept in checkpoints, so that
+    nothing else changes them and a resumed training continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. Where there is an
     alpha, the image holds colours that are not multiplied with it. The Gaussians to start from come from ``init_ply``,
@@ -169,8 +201,8 @@ class SplatTrainer(lightning.LightningModule):
         self._lpips: list[Any] = []  # in a list, so that its weights stay out of the checkpoints
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
-        self._pending: tuple[int, Tensor] | None = None
-        self._trained = False
+        self._pending: _Pending | None = None
+        self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
 
     fixed_background: Tensor
 
@@ -271,11 +303,16 @@ class SplatTrainer(lightning.LightningModule):
 
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
         """One image: picture, losses, gradients, six optimisers, densification."""
-        step = self.global_step
-        devices = [self.device] if self.device.type == "cuda" else []
-        with torch.random.fork_rng(devices):
-            torch.manual_seed((self.seed * _SEED_STRIDE + step) % 2**63)
-            return self._train_on(batch, step)
+        outside = _random_state(self.device)
+        if self._random:
+            _set_random_state(self._random, self.device)
+        else:
+            torch.manual_seed(self.seed)
+        try:
+            return self._train_on(batch, self.global_step)
+        finally:
+            self._random = _random_state(self.device)
+            _set_random_state(outside, self.device)
 
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
         optimizers = self._raw_optimizers()
@@ -295,7 +332,7 @@ class SplatTrainer(lightning.LightningModule):
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
         self.manual_backward(loss)
-        self._pending = (step, loss.detach())
+        self._pending = _Pending.of(step, loss.detach())
         if self.device.type != "cuda":
             self._check_pending()
         # Lightning counts a step of its wrapper as one of `max_steps`: it wraps one optimiser only.
@@ -335,10 +372,9 @@ class SplatTrainer(lightning.LightningModule):
         """Raise if the last loss was not finite: on a GPU one step later, so that nothing waits for it."""
         if self._pending is None:
             return
-        step, loss = self._pending
-        self._pending = None
-        if not math.isfinite(float(loss)):
-            raise TrainingDiverged(step, "the loss", self._last_checkpoint())
+        pending, self._pending = self._pending, None
+        if not math.isfinite(pending.value()):
+            raise TrainingDiverged(pending.step, "the loss", self._last_checkpoint())
 
     def _last_checkpoint(self) -> str | None:
         folders = [getattr(callback, "dirpath", None) for callback in self.trainer.checkpoint_callbacks]
@@ -359,6 +395,7 @@ class SplatTrainer(lightning.LightningModule):
             "scene_scale": self.scene_scale,
             "sh_degree": self.sh_degree,
             "seed": self.seed,
+            "random": self._random,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -382,6 +419,7 @@ class SplatTrainer(lightning.LightningModule):
         )
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
+        self._random = {name: state.cpu() for name, state in stored["random"].items()}
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
 

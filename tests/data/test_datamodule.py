@@ -1,6 +1,7 @@
 """What a training gets: every image once a round, the same after a restart, nothing but bytes in memory."""
 
 import itertools
+import math
 
 import pytest
 import torch
@@ -153,10 +154,25 @@ def test_what_a_trainer_starts_from(folder):
     cloud = data.initial_cloud(1)
     assert len(cloud) == 64
     assert cloud.sh.shape == (64, 4, 3)
+    other = CaptureDataModule(folder, point_count=64, initial_opacity=0.5, initial_scale=0.1).initial_cloud(1)
+    torch.testing.assert_close(other.opacities, torch.zeros(64))
+    torch.testing.assert_close(other.scales, cloud.scales + math.log(0.1))
+
+
+def test_the_camera_of_a_view_is_moved_once(folder):
+    data = CaptureDataModule(folder)
+    data.setup("fit")
+    first, again = (data._dataset("train")[1].to("cpu").camera for _ in range(2))
+    assert first is again
+    assert data._dataset("train")[0].to("cpu").camera is not first
 
 
 def test_bad_arguments(folder):
     with pytest.raises(ValueError, match="`workers`"):
         CaptureDataModule(folder, workers=-1)
+    with pytest.raises(ValueError, match="`initial_opacity`"):
+        CaptureDataModule(folder, initial_opacity=1.0)
+    with pytest.raises(ValueError, match="`initial_scale`"):
+        CaptureDataModule(folder, initial_scale=0.0)
     with pytest.raises(ValueError, match="`format`"):
         CaptureDataModule(folder, format="nerf").setup()

@@ -36,6 +36,20 @@ def test_area_is_that_of_the_mesh(small):
     assert float((facing * truth.normals[truth.faces[:, 0]]).sum(-1).min()) > 0.99
 
 
+def test_the_nearest_point_lies_below_along_the_normal(small):
+    """Points lifted off the sheet along its normal, by less than its radius of curvature (0.2 m), come back."""
+    generator = torch.Generator().manual_seed(1)
+    x, z = torch.rand(2, 200, generator=generator, dtype=torch.float64) * torch.tensor([[1.0], [0.6]]) + 0.1
+    below = torch.stack([x, small.elevation(x, z), z], -1)
+    lift = 0.05 * (2 * torch.rand(200, 1, generator=generator, dtype=torch.float64) - 1)
+    found, normals = small.nearest(below + lift * small.normals(x, z))
+    torch.testing.assert_close(found, below, rtol=0, atol=1e-5)
+    torch.testing.assert_close(normals, small.normals(x, z), rtol=0, atol=1e-4)
+    # beside the sheet its rim is nearest
+    rim, _ = GeneratedCapture(ripple=0.0).nearest(torch.tensor([[1.5, 0.3, 0.4], [-1.0, 0.0, 2.0]]))
+    torch.testing.assert_close(rim, torch.tensor([[1.2, 0.0, 0.4], [0.0, 0.0, 0.8]], dtype=torch.float64))
+
+
 def test_pictures_show_the_true_surface(small):
     """Rays end on the sheet, where a march in 1500 small steps first crosses it, and normals look at the camera."""
     missed = several = total = 0

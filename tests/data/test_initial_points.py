@@ -6,7 +6,8 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from gaussian_swaying.data.capture import read_capture
-from gaussian_swaying.data.initial_points import initial_points, random_points
+from gaussian_swaying.data.generated_capture import GeneratedCapture
+from gaussian_swaying.data.initial_points import consistent_points, initial_points, random_points
 from gaussian_swaying.data.point_cloud import PointCloud, read_obj_mesh, sample_mesh
 
 SQUARE = "# a square and its colours\nv 0 0 0 1 0 0\nv 2 0 0 1 0 0\nv 2 1 0 0 0 1\nv 0 1 0 0 0 1\nvn 0 0 1\n"
@@ -37,6 +38,26 @@ def test_random_points_fill_what_the_cameras_see(capture):
     assert not torch.equal(initial_points(capture, count=20_000, seed=4).points, cloud.points)
     small = initial_points(capture, half_side=0.1, count=100)
     assert float((small.points - torch.tensor([0.0, 0.0, 0.2])).abs().max()) <= 0.1 + 1e-6
+
+
+def test_consistent_points_lie_where_the_photos_agree(tmp_path):
+    """Of points around a flag seen from all sides, those near it; the mean of their colours is the flag's there."""
+    flag = GeneratedCapture(views=24, size=48)
+    capture = read_capture(flag.write(tmp_path / "flag"))
+    chosen = consistent_points(capture, 400, seed=1, half_side=0.9)
+    assert len(chosen) == 400
+    around = random_points(torch.tensor([0.6, 0.0, 0.4]), 0.9, 400)
+    off_black = chosen.colors.sum(-1) > 0.2  # the background is black in all photos: consistent too
+    assert torch.equal(consistent_points(capture, 400, seed=1, half_side=0.9).points, chosen.points)
+
+    def typical(points):
+        places, _ = flag.nearest(points)
+        return float((points - places).norm(dim=-1).median())
+
+    assert off_black.any()
+    assert typical(chosen.points[off_black]) < 0.5 * typical(around.points)
+    with pytest.raises(ValueError, match="`point_count`"):
+        consistent_points(capture, 400, half_side=1e3)
 
 
 def test_a_mesh_is_sampled_by_area(tmp_path, capture):

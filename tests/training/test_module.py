@@ -164,7 +164,8 @@ def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
         options = {"densification": chosen}
     module = _module(sh_every=50, **options)
     callbacks = [_checkpoints(tmp_path, every=100)]
-    trainer = make_trainer(200, accelerator="gpu", devices=1, enable_checkpointing=True, callbacks=callbacks)
+    on_gpu = {"accelerator": "gpu", "devices": 1, "limit_val_batches": 1.0, "val_check_interval": 1000}
+    trainer = make_trainer(200, enable_checkpointing=True, callbacks=callbacks, **on_gpu)
     start = trainer.validate(module, data, verbose=False)[0]
     trainer.fit(module, data)
     end = trainer.validate(module, data, verbose=False)[0]
@@ -173,7 +174,7 @@ def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
     module.cpu().render(data.held_out[0]["camera"])
     again = _module(sh_every=50, **options)
     path = tmp_path / "step=100.ckpt"
-    make_trainer(200, accelerator="gpu", devices=1).fit(again, data, ckpt_path=path, weights_only=False)
+    make_trainer(200, **on_gpu).fit(again, data, ckpt_path=path, weights_only=False)
     assert again.trainer.global_step == 200
 
 

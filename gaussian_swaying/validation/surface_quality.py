@@ -1,0 +1,63 @@
+"""How well trained Gaussians lie on a surface that is known."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from gaussian_swaying.data.generated_capture import GeneratedCapture
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+
+
+@torch.no_grad()
+def surface_quality(
+    model: GaussianSurfaceModel,
+    truth: GeneratedCapture,
+    a: float = 1.1,
+    b: float = 0.008,
+    min_opacity: float = 0.1,
+    near: float = 0.05,
+) -> dict[str, float]:
+    """Shape, opacity, orientation, place and area of Gaussians against a generated surface.
+
+    Shape, orientation, place and area are those of the Gaussians that a simulation takes: those with an opacity of at
+    least ``min_opacity``.
+
+    Args:
+        model: The Gaussians, in metres.
+        truth: The surface.
+        a: Ratio of the two largest scales up to which a Gaussian counts as round.
+        b: Scale up to which one counts as small [m].
+        min_opacity: Opacity from which on a Gaussian is simulated.
+        near: Distance up to which a Gaussian counts as one of the surface [m].
+
+    Returns:
+        ``gaussians`` and ``simulated`` (numbers); ``round_share``, ``small_share`` and ``near_share`` of those that
+        are simulated; ``decided_share`` of all with an opacity outside [0.1, 0.9]; ``flatness_median`` (smallest over
+        second largest scale); ``angle_median_deg`` and ``angle_p90_deg`` between patch normals and the normals of the
+        nearest points, whatever their sign; ``distance_median_m`` and ``distance_p90_m``; ``area_paper_ratio`` and
+        ``area_coverage_ratio``, sums of areas over the true area of one side.
+    """
+    opacity = model.opacity()
+    kept = (opacity >= min_opacity).nonzero()[:, 0]
+    found: dict[str, float] = {"gaussians": len(model), "simulated": len(kept)}
+    found["decided_share"] = float(((opacity < 0.1) | (opacity > 0.9)).float().mean())
+    part = GaussianSurfaceModel.from_cloud(model.to_cloud().select(kept), requires_grad=False)
+    part.reference_normals = None
+    scales = part.scales.exp().sort(dim=-1, descending=True).values
+    found["round_share"] = float((scales[:, 0] / scales[:, 1] <= a).float().mean())
+    found["small_share"] = float((scales[:, 0] <= b).float().mean())
+    found["flatness_median"] = float((scales[:, 2] / scales[:, 1]).median())
+    places, normals = truth.nearest(part.means)
+    distance = (part.means.double() - places).norm(dim=-1)
+    cosine = (part.normals().double() * normals).sum(-1).abs().clamp(max=1.0)
+    angle = torch.rad2deg(torch.acos(cosine))
+    found["near_share"] = float((distance <= near).float().mean())
+    for name, values in (("angle", angle), ("distance", distance)):
+        unit = "deg" if name == "angle" else "m"
+        found[f"{name}_median_{unit}"] = float(values.median())
+        found[f"{name}_p90_{unit}"] = float(values.sort().values[math.ceil(0.9 * len(values)) - 1])
+    for mode in ("paper", "coverage"):
+        found[f"area_{mode}_ratio"] = float(part.areas(mode).double().sum()) / truth.area()
+    return found
