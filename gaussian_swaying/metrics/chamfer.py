@@ -1,0 +1,209 @@
+"""Chamfer distance between point sets, in chunks, so that its memory does not grow with the product of their sizes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, imported when it is used
+
+from gaussian_swaying._checks import check_choice, check_positive, check_shape
+
+DIRECTIONS = ("both", "average", "forward", "backward")
+REDUCTIONS = ("mean", "sum")
+_PAIRS = 2**20  # on a CPU a chunk of distances should stay in its cache
+_PAIRS_CUDA = 2**24
+_SLABS_FROM = 2**22  # pairs from which looking at slabs pays, on a CPU
+_GROUP = 128  # points that share a slab
+
+
+@torch.no_grad()
+def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) -> tuple[Tensor, Tensor]:
+    """Distance of every point to the nearest one of the other set, both ways.
+
+    Exact on any device: a GPU looks at all pairs, a CPU at those that can be nearest. Distances are those of the
+    differences of the coordinates, not of expanded squares, so they keep their precision far from the origin. No
+    gradient.
+
+    Args:
+        source: Points [m], shape (P, D).
+        target: Points [m], shape (Q, D).
+        pairs: Largest number of distances held at a time, but at least Q; by default what suits the device.
+
+    Returns:
+        Distances from ``source`` to ``target`` [m], shape (P,), and from ``target`` to ``source`` [m], shape (Q,).
+
+    Raises:
+        ValueError: If a set is empty, the shapes do not fit, or ``pairs`` is not positive.
+    """
+    if pairs is None:
+        pairs = _PAIRS_CUDA if source.is_cuda else _PAIRS
+    check_positive("pairs", pairs)
+    check_shape("source", source, "P", "D")
+    check_shape("target", target, "Q", source.shape[-1])
+    for name, points in (("source", source), ("target", target)):
+        if len(points) == 0:
+            raise ValueError(f"Expected `{name}` to hold at least one point, but it is empty.")
+    many = not source.is_cuda and len(source) * len(target) > _SLABS_FROM
+    if many and bool(torch.isfinite(source).all()) and bool(torch.isfinite(target).all()):
+        return _by_slabs(source, target, pairs), _by_slabs(target, source, pairs)
+    return _by_chunks(source, target, pairs)
+
+
+def _by_chunks(source: Tensor, target: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
+    """All pairs, so many at a time."""
+    forward = source.new_empty(len(source))
+    backward = target.new_full((len(target),), torch.inf)
+    rows = max(1, int(pairs) // len(target))
+    for start in range(0, len(source), rows):
+        part = slice(start, start + rows)
+        distance = torch.cdist(source[part], target, compute_mode="donot_use_mm_for_euclid_dist")
+        forward[part] = distance.amin(1)
+        backward = torch.minimum(backward, distance.amin(0))
+    return forward, backward
+
+
+def _by_slabs(source: Tensor, target: Tensor, pairs: int) -> Tensor:
+    """Distances to the target, shape (P,); a group of sources looks only at targets that are near along one axis.
+
+    A few targets around the group bound how far its nearest ones can be, and so the slab that holds them all.
+    """
+    axis = int((target.amax(0) - target.amin(0)).argmax())
+    target = target[target[:, axis].argsort()]
+    order = source[:, axis].argsort()
+    heights = target[:, axis].contiguous()
+    nearest = source.new_empty(len(source))
+    for group in order.split(_GROUP):
+        some = source[group]
+        ends = some[[0, -1], axis]
+        begin, end = torch.searchsorted(heights, ends).tolist()
+        begin, end = max(0, begin - _GROUP), end + _GROUP
+        found = _by_chunks(some, target[begin:end], pairs)[0]
+        reach = 1.0001 * float(found.max())  # more than rounding
+        first, last = torch.searchsorted(heights, ends + torch.tensor([-reach, reach]).to(ends)).tolist()
+        if first < begin or last > end:
+            found = _by_chunks(some, target[min(first, begin) : max(last, end)], pairs)[0]
+        nearest[group] = found
+    return nearest
+
+
+def chamfer_distance(
+    source: Tensor,
+    target: Tensor,
+    *,
+    squared: bool = False,
+    reduction: str = "mean",
+    direction: str = "both",
+    pairs: int | None = None,
+) -> Tensor:
+    r"""Chamfer distance between two sets of points (Fan et al. 2017).
+
+    .. math::
+        d(S, T) = \frac{1}{\lvert S \rvert} \sum_{x \in S} \min_{y \in T} \lvert x - y \rvert^k
+                + \frac{1}{\lvert T \rvert} \sum_{y \in T} \min_{x \in S} \lvert x - y \rvert^k
+
+    with k = 1, or k = 2 if ``squared``; ``reduction="sum"`` leaves out the two divisions. The two directions are added
+    unless told otherwise: two equal sheets at a distance h have d = 2 h. Papers differ in all of this: Fan et al. add
+    squares, PyTorch3D takes the mean of squares by default, and others plain distances, as here.
+
+    Args:
+        source: Points [m], shape (..., P, 3), or any other number of coordinates.
+        target: Points [m], shape (..., Q, 3), with the same leading dimensions.
+        squared: Add squared distances.
+        reduction: ``mean`` or ``sum`` over the points of each set.
+        direction: ``both`` terms added, ``average`` of the two (half of that), or one term only: ``forward``, from each
+            source point to the target, or ``backward``.
+        pairs: Largest number of distances held at a time, see :func:`nearest_distances`.
+
+    Returns:
+        The distance [m], or [m²] if ``squared``, shape (...). It has no gradient.
+
+    Raises:
+        TypeError: If a set is not a tensor.
+        ValueError: If the shapes do not fit, a set is empty, or an option is unknown.
+
+    Example:
+        >>> sheet = torch.cartesian_prod(torch.arange(4.0), torch.arange(4.0), torch.zeros(1))
+        >>> chamfer_distance(sheet, sheet + torch.tensor([0.0, 0.0, 0.25]))
+        tensor(0.5000)
+    """
+    check_choice("reduction", reduction, REDUCTIONS)
+    check_choice("direction", direction, DIRECTIONS)
+    check_shape("source", source, "P", "D")
+    check_shape("target", target, "Q", source.shape[-1])
+    if source.shape[:-2] != target.shape[:-2]:
+        raise ValueError(
+            f"Expected `target` to have the leading dimensions of `source`, {tuple(source.shape[:-2])}, but got "
+            f"{tuple(target.shape[:-2])}."
+        )
+    leading = source.shape[:-2]
+    sets = zip(*(points.reshape(leading.numel(), *points.shape[-2:]) for points in (source, target)), strict=True)
+    values = [_combine(*nearest_distances(one, other, pairs), squared, reduction, direction) for one, other in sets]
+    return torch.stack(values).reshape(leading) if values else source.new_empty(leading)
+
+
+def _combine(forward: Tensor, backward: Tensor, squared: bool, reduction: str, direction: str) -> Tensor:
+    terms = {"forward": [forward], "backward": [backward]}.get(direction, [forward, backward])
+    if squared:
+        terms = [term.square() for term in terms]
+    values = torch.stack([term.mean() if reduction == "mean" else term.sum() for term in terms])
+    return values.mean() if direction == "average" else values.sum()
+
+
+class ChamferDistance(Metric):
+    """Mean over frames of :func:`chamfer_distance`.
+
+    Every pair of sets weighs the same, whatever its number of points. Frames whose sets differ in size are given one
+    by one.
+
+    Args:
+        squared: Add squared distances.
+        reduction: ``mean`` or ``sum`` over the points of each set.
+        direction: ``both`` (added), ``average``, ``forward`` or ``backward``.
+        pairs: Largest number of distances held at a time.
+        kwargs: Options of :class:`torchmetrics.Metric`.
+
+    Raises:
+        ValueError: If an option is unknown.
+
+    Example:
+        >>> metric = ChamferDistance(direction="forward")
+        >>> metric.update(torch.zeros(1, 3), torch.tensor([[3.0, 0.0, 4.0]]))
+        >>> metric.update(torch.zeros(1, 3), torch.tensor([[1.0, 0.0, 0.0]]))
+        >>> metric.compute()
+        tensor(3., dtype=torch.float64)
+    """
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+    total: Tensor
+    count: Tensor
+
+    def __init__(
+        self,
+        squared: bool = False,
+        reduction: str = "mean",
+        direction: str = "both",
+        pairs: int | None = None,
+        **kwargs: object,
+    ) -> None:
+        super().__init__(**kwargs)
+        check_choice("reduction", reduction, REDUCTIONS)
+        check_choice("direction", direction, DIRECTIONS)
+        self.squared, self.reduction, self.direction, self.pairs = squared, reduction, direction, pairs
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros((), dtype=torch.long), dist_reduce_fx="sum")
+
+    def update(self, source: Tensor, target: Tensor) -> None:
+        """Add frames: points of the run (..., P, 3) and of the reference (..., Q, 3) [m]."""
+        options = {"squared": self.squared, "reduction": self.reduction, "direction": self.direction}
+        values = chamfer_distance(source, target, pairs=self.pairs, **options)  # type: ignore[arg-type]
+        self.total += values.sum(dtype=torch.float64)
+        self.count += values.numel()
+
+    def compute(self) -> Tensor:
+        """The mean over all frames so far [m], or [m²] if ``squared``; NaN without frames."""
+        return self.total / self.count
+
+
+__all__ = ["ChamferDistance", "chamfer_distance", "nearest_distances"]

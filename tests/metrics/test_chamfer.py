@@ -1,0 +1,190 @@
+"""Chamfer distance against brute force and closed forms."""
+
+import copy
+
+import pytest
+import torch
+
+from gaussian_swaying.metrics import chamfer
+from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance, nearest_distances
+
+
+def _brute(source, target):
+    """All distances, from the differences in float64."""
+    return (source.double()[:, None] - target.double()[None]).norm(dim=-1)
+
+
+def _lattice(count, spacing, device, dtype):
+    line = torch.arange(count, device=device, dtype=dtype) * spacing
+    return torch.cartesian_prod(line, line, torch.zeros(1, device=device, dtype=dtype))
+
+
+@pytest.mark.parametrize("pairs", [1, 57, 4 * 57, None])
+def test_nearest_distances_equal_brute_force_whatever_the_chunk(device, dtype, pairs):
+    source, target = (torch.rand(count, 3, device=device, dtype=dtype) for count in (103, 57))
+    forward, backward = nearest_distances(source, target, pairs)
+    every = _brute(source, target).to(dtype)
+    # differences of numbers up to 1 are exact to one unit in the last place, and three of them are added
+    tolerance = {"rtol": 8 * torch.finfo(dtype).eps, "atol": 8 * torch.finfo(dtype).eps}
+    torch.testing.assert_close(forward, every.amin(1), **tolerance)
+    torch.testing.assert_close(backward, every.amin(0), **tolerance)
+
+
+@pytest.mark.parametrize(
+    "moved",
+    [(0.0, 0.0, 0.0), (0.03, 0.0, 0.01), (5.0, 0.0, 0.0), (-5.0, 0.0, 0.0), (0.0, 9.0, 0.0)],
+    ids=["mixed", "near", "above", "below", "aside"],
+)
+def test_slabs_find_the_nearest_of_all(moved):
+    """Sheets, clusters and points that coincide, large enough for a CPU not to look at all pairs."""
+    sheet = torch.rand(2500, 3) * torch.tensor([1.2, 0.05, 0.8])
+    clusters = torch.cat([torch.rand(1200, 3) * 0.01 + c for c in (0.0, 0.7)] + [sheet[:300]]) + torch.tensor(moved)
+    assert len(sheet) * len(clusters) > chamfer._SLABS_FROM
+    every = torch.cdist(sheet, clusters, compute_mode="donot_use_mm_for_euclid_dist")
+    forward, backward = nearest_distances(sheet, clusters)
+    assert torch.equal(forward, every.amin(1))
+    assert torch.equal(backward, every.amin(0))
+
+
+def test_slabs_look_at_few_pairs(monkeypatch):
+    sizes = _watch(monkeypatch)
+    flat = torch.tensor([1.0, 0.0, 1.0])
+    nearest_distances(torch.rand(8000, 3) * flat, torch.rand(8000, 3) * flat)
+    assert sum(sizes) < 8000**2 / 4
+
+
+def _watch(monkeypatch):
+    """Sizes of the matrices of distances from now on."""
+    sizes = []
+    cdist = torch.cdist
+
+    def watched(*arguments, **options):
+        result = cdist(*arguments, **options)
+        sizes.append(result.numel())
+        return result
+
+    monkeypatch.setattr(torch, "cdist", watched)
+    return sizes
+
+
+def test_memory_is_bounded_by_the_chunk(monkeypatch):
+    sizes = _watch(monkeypatch)
+    nearest_distances(torch.rand(1000, 3), torch.rand(200, 3), pairs=2000)
+    assert max(sizes) <= 2000
+    assert sum(sizes) == 1000 * 200
+    sizes.clear()
+    nearest_distances(torch.rand(3000, 3), torch.rand(3000, 3) + 2)  # so far apart that slabs do not help
+    assert max(sizes) <= 2**20
+
+
+@pytest.mark.parametrize("squared", [False, True])
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+@pytest.mark.parametrize("direction", ["both", "average", "forward", "backward"])
+def test_options_against_brute_force(squared, reduction, direction):
+    source, target = torch.rand(31, 3, dtype=torch.float64), torch.rand(23, 3, dtype=torch.float64)
+    every = _brute(source, target) ** (2 if squared else 1)
+    terms = {"forward": getattr(every.amin(1), reduction)(), "backward": getattr(every.amin(0), reduction)()}
+    terms["both"] = terms["forward"] + terms["backward"]
+    terms["average"] = terms["both"] / 2
+    found = chamfer_distance(source, target, squared=squared, reduction=reduction, direction=direction)
+    torch.testing.assert_close(found, terms[direction])
+
+
+@pytest.mark.parametrize("far", [0.0, 100.0])
+def test_parallel_sheets(device, far):
+    """Equal sheets at a height h: each term is h; far from the origin too, where expanded squares would lose it."""
+    sheet = _lattice(20, 0.05, device, torch.float32) + far
+    height = 0.03125  # exact in float32, also beside 100
+    above = sheet + torch.tensor([0.0, 0.0, height], device=device)
+    assert float(chamfer_distance(sheet, above)) == 2 * height
+    assert float(chamfer_distance(sheet, above, squared=True, direction="forward")) == height**2
+    assert float(chamfer_distance(sheet, above, reduction="sum", direction="backward")) == 400 * height
+
+
+def test_shifted_lattices(dtype):
+    """Shifted by a third of the spacing a along one axis: every point finds one at a/3, the last row's at a/3 too."""
+    n, a = 8, 0.3
+    lattice = _lattice(n, a, "cpu", dtype)
+    shifted = lattice + torch.tensor([a / 3, 0.0, 0.0], dtype=dtype)
+    close = {"rtol": 0.0, "atol": 8 * n * a * torch.finfo(dtype).eps}
+    torch.testing.assert_close(chamfer_distance(lattice, shifted), torch.tensor(2 * a / 3, dtype=dtype), **close)
+    # by two thirds: the next one is at a/3, but for one row of n, which has none beyond
+    shifted = lattice + torch.tensor([2 * a / 3, 0.0, 0.0], dtype=dtype)
+    expected = torch.tensor(2 * (a / 3 * (n - 1) + 2 * a / 3) / n, dtype=dtype)
+    torch.testing.assert_close(chamfer_distance(lattice, shifted), expected, **close)
+
+
+def test_directions_differ_when_one_set_holds_the_other():
+    part, whole = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    assert float(chamfer_distance(part, whole, direction="forward")) == 0.0
+    assert float(chamfer_distance(part, whole, direction="backward")) == 1.0
+
+
+def test_batches_keep_their_shape():
+    source, target = torch.rand(2, 3, 17, 3), torch.rand(2, 3, 11, 3)
+    found = chamfer_distance(source, target)
+    assert found.shape == (2, 3)
+    torch.testing.assert_close(found[1, 2], chamfer_distance(source[1, 2], target[1, 2]))
+
+
+@pytest.mark.parametrize("count", [10, 3000])
+def test_a_position_that_is_nan_is_not_hidden(count):
+    source = torch.rand(count, 3)
+    source[3, 1] = torch.nan
+    assert bool(chamfer_distance(source, torch.rand(count, 3)).isnan())
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "options", "message"),
+    [
+        ((4, 3), (4, 2), {}, r"Expected `target` of shape \(Q, 3\), but got \(4, 2\)"),
+        ((2, 4, 3), (3, 4, 3), {}, r"leading dimensions of `source`, \(2,\), but got \(3,\)"),
+        ((0, 3), (4, 3), {}, "Expected `source` to hold at least one point"),
+        ((4, 3), (0, 3), {}, "Expected `target` to hold at least one point"),
+        ((4, 3), (4, 3), {"reduction": "median"}, "Expected `reduction` to be one of mean, sum"),
+        ((4, 3), (4, 3), {"direction": "up"}, "Expected `direction` to be one of both, average, forward, backward"),
+        ((4, 3), (4, 3), {"pairs": 0}, "Expected `pairs` to be positive"),
+    ],
+)
+def test_bad_input(source, target, options, message):
+    with pytest.raises(ValueError, match=message):
+        chamfer_distance(torch.rand(source), torch.rand(target), **options)
+
+
+def test_metric_is_the_mean_over_frames(device):
+    frames = [(torch.rand(n, 3, device=device), torch.rand(m, 3, device=device)) for n, m in ((9, 5), (30, 8), (4, 4))]
+    metric = ChamferDistance(squared=True).to(device)
+    for source, target in frames:
+        metric.update(source, target)
+    expected = torch.stack([chamfer_distance(s, t, squared=True) for s, t in frames]).double().mean()
+    torch.testing.assert_close(metric.compute(), expected)
+
+
+def test_metric_counts_a_batch_as_frames_and_resets():
+    source, target = torch.rand(3, 9, 3), torch.rand(3, 5, 3)
+    metric, single = ChamferDistance(), ChamferDistance()
+    metric.update(source, target)
+    for one, other in zip(source, target, strict=True):
+        single.update(one, other)
+    torch.testing.assert_close(metric.compute(), single.compute())
+    assert int(metric.count) == 3
+    metric.reset()
+    metric.update(source[0], source[0])
+    assert float(metric.compute()) == 0.0
+
+
+def test_metrics_of_two_processes_add_up():
+    """States are summed, as torchmetrics does when it gathers them."""
+    frames = [(torch.rand(9, 3), torch.rand(7, 3)) for _ in range(4)]
+    whole, parts = ChamferDistance(), [ChamferDistance(), ChamferDistance()]
+    for number, pair in enumerate(frames):
+        whole.update(*pair)
+        parts[number % 2].update(*pair)
+    merged = copy.deepcopy(parts[0])
+    merged.merge_state(parts[1])
+    torch.testing.assert_close(merged.compute(), whole.compute())
+
+
+def test_metric_rejects_options_when_it_is_made():
+    with pytest.raises(ValueError, match="Expected `direction`"):
+        ChamferDistance(direction="up")

@@ -1,0 +1,138 @@
+"""tools/eval.py on a run of tools/sim.py, and the one sentence it answers bad input with."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying.simulation.config import main as simulate
+from gaussian_swaying.simulation.recorder import load_trajectory
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+ROOT = Path(__file__).parents[2]
+TOOL = ROOT / "tools/eval.py"
+SIDE = 1.2
+CENTRE = torch.tensor([0.6, 0.0, 0.4])  # of the flag's box, where the simulation has its origin
+POLE = [{"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {}}}}]
+POLE[0]["init_args"]["region"]["init_args"] = {"min": [None, None, None], "max": [0.11, None, None]}
+
+
+class Means(nn.Module):
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mean(dim=[3, 4]).flatten(1)
+
+
+@pytest.fixture(scope="module")
+def tool():
+    spec = importlib.util.spec_from_file_location("eval_tool", TOOL)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _simulate(folder, gravity):
+    command = ["--config", str(ROOT / "configs/sim/flag.yaml"), "--frames", "4", "--device", "cpu"]
+    command += ["--scene.generator.init_args.spacing", "0.1", "--solver.dx", "0.2", "--recorder.video", "false"]
+    command += ["--solver.boundaries", json.dumps(POLE), "--solver.gravity", f"[0, 0, {gravity}]"]
+    command += ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--output", str(folder)]
+    assert simulate(command) == 0
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A run, and a reference made of another run whose flag falls faster."""
+    folder = tmp_path_factory.mktemp("eval")
+    run, reference = folder / "run", folder / "reference"
+    _simulate(run, -9.8)
+    _simulate(folder / "other", -40.0)
+    shutil.copytree(folder / "other/frames", reference / "frames")
+    positions = np.stack([load_trajectory(folder / "other/trajectory.npz", i)[0] + CENTRE for i in range(4)])
+    i = np.arange(12 * 8).reshape(12, 8)
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
+    np.savez(reference / "cloth.npz", positions=positions, faces=faces, side=SIDE)
+    return run, reference
+
+
+def test_a_run_beside_a_reference(tool, folders, tmp_path, capsys):
+    run, reference = folders
+    output = tmp_path / "out"
+    assert tool.main([str(run), str(reference), "--output", str(output), "--device", "cpu"]) == 0
+    printed = capsys.readouterr().out
+    result = json.loads((output / "eval.json").read_text())
+    assert (output / "eval.md").read_text() in printed
+    assert f"wrote {output / 'comparison.mp4'}" in printed
+    assert (output / "comparison.mp4").stat().st_size > 500
+    assert (result["frames"], result["size"]) == (4, [32, 18])
+    rows = result["per_frame"]
+    # both begin at rest, with the same picture and on the same surface; later the reference is lower
+    assert rows[0]["mse"] == 0.0
+    assert rows[3]["mse"] > 0.0
+    excess = [row["run_to_reference_m"] - rows[0]["run_to_reference_m"] for row in rows]
+    assert excess[3] > excess[1] >= 0
+    assert rows[0]["run_to_reference_m"] < 0.01
+    assert result["chamfer_share"] == pytest.approx(result["mean"]["chamfer_m"] / SIDE)
+
+
+def test_options(tool, folders, tmp_path):
+    run, reference = folders
+    network = tmp_path / "network.pt"
+    torch.jit.script(Means()).save(str(network))
+    command = [str(run), str(reference), "--output", str(tmp_path / "out"), "--device", "cpu", "--no-video"]
+    command += ["--reference-offset", "1", "--frames", "3", "--side", "2", "--points", "50", "--seed", "7"]
+    command += ["--i3d", str(network), "--clip-length", "2", "--clip-stride", "1", "--resize", "8"]
+    assert tool.main(command) == 0
+    result = json.loads((tmp_path / "out/eval.json").read_text())
+    assert [row["reference_frame"] for row in result["per_frame"]] == [1, 2, 3]
+    assert (result["side_m"], result["reference_points"], result["run_points"], result["seed"]) == (2.0, 50, 50, 7)
+    fvd = result["fvd"]
+    assert (fvd["clip_length"], fvd["stride"], fvd["resize"], fvd["real_clips"]) == (2, 1, [8, 8], 2)
+    assert not (tmp_path / "out/comparison.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere", "REFERENCE"], ["There is no run folder nowhere", "tools/sim.py"]),
+        (["RUN", "nowhere"], ["There is no reference folder nowhere"]),
+        (["RUN", "REFERENCE", "--reference-offset", "1"], ["4 pictures of", "--frames 3"]),
+        (["RUN", "REFERENCE", "--i3d", "i3d.pt"], ["There is no file i3d.pt", "none is downloaded"]),
+        (["RUN", "REFERENCE", "--points", "0"], ["`points`", "positive"]),
+        pytest.param(
+            ["RUN", "REFERENCE", "--device", "cuda"],
+            ["needs a CUDA GPU"],
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="shows what happens without a GPU"),
+        ),
+    ],
+)
+def test_bad_input_is_one_sentence(tool, folders, tmp_path, capsys, arguments, words):
+    names = {"RUN": str(folders[0]), "REFERENCE": str(folders[1])}
+    arguments = [names.get(argument, argument) for argument in arguments]
+    assert tool.main([*arguments, "--output", str(tmp_path / "a/out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    for word in words:
+        assert word in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_as_a_program(folders):
+    done = subprocess.run(
+        [sys.executable, str(TOOL), *map(str, folders), "--device", "cpu", "--points", "50", "--no-video"],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "PSNR" in done.stdout
+    assert (folders[0] / "eval/eval.json").exists()
