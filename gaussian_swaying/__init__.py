@@ -19,9 +19,13 @@ if TYPE_CHECKING:
     from gaussian_swaying.data.generated_capture import GeneratedCapture
     from gaussian_swaying.data.initial_points import initial_points
     from gaussian_swaying.data.point_cloud import PointCloud
+    from gaussian_swaying.gaussians.filling import InteriorFilling
     from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
     from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
     from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+    from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
+    from gaussian_swaying.metrics.compare import compare_run
+    from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance, frechet_distance
     from gaussian_swaying.mpm.boundary import (
         Boundary,
         EnclosingBox,
@@ -52,6 +56,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
     from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
     from gaussian_swaying.simulation.frame import SimFrame
+    from gaussian_swaying.simulation.physgaussian import Normalisation, PhysGaussianCamera
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
     from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
@@ -68,9 +73,13 @@ _HOMES = {
     "data.generated_capture": ("GeneratedCapture",),
     "data.initial_points": ("initial_points",),
     "data.point_cloud": ("PointCloud",),
+    "gaussians.filling": ("InteriorFilling",),
     "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
     "gaussians.selection": ("Box", "Cylinder", "Sphere"),
     "gaussians.surface": ("GaussianSurfaceModel",),
+    "metrics.chamfer": ("ChamferDistance", "chamfer_distance"),
+    "metrics.compare": ("compare_run",),
+    "metrics.frechet_video": ("FrechetVideoDistance", "frechet_distance"),
     "mpm.boundary": (
         "Boundary",
         "EnclosingBox",
@@ -101,6 +110,7 @@ _HOMES = {
     "rendering.torch_renderer": ("TorchRenderer",),
     "simulation.diagnostics": ("SimulationDiverged", "TearingGauge"),
     "simulation.frame": ("SimFrame",),
+    "simulation.physgaussian": ("Normalisation", "PhysGaussianCamera"),
     "simulation.pipeline": ("SimulationPipeline",),
     "simulation.recorder": ("Recorder", "load_trajectory"),
     "simulation.scene": ("Material", "Scene", "SimulatedScene"),
@@ -117,6 +127,7 @@ __all__ = [
     "Camera",
     "Capture",
     "CaptureDataModule",
+    "ChamferDistance",
     "ConstitutiveLaw",
     "Cylinder",
     "DefaultDensification",
@@ -126,6 +137,7 @@ __all__ = [
     "FlowKey",
     "Fluid",
     "Foam",
+    "FrechetVideoDistance",
     "GaussianCloud",
     "GaussianGust",
     "GaussianSurfaceModel",
@@ -134,6 +146,7 @@ __all__ = [
     "GsplatRenderer",
     "Handle",
     "Impulse",
+    "InteriorFilling",
     "LookAtCamera",
     "LossInputs",
     "LossTerm",
@@ -144,8 +157,10 @@ __all__ = [
     "MaterialPoints",
     "Metal",
     "NeoHookean",
+    "Normalisation",
     "OrbitCamera",
     "PhongShader",
+    "PhysGaussianCamera",
     "PinnedRegion",
     "Plane",
     "Plasticine",
@@ -173,6 +188,9 @@ __all__ = [
     "WindField",
     "WindLoad",
     "aero_force",
+    "chamfer_distance",
+    "compare_run",
+    "frechet_distance",
     "initial_points",
     "load_trajectory",
     "read_capture",

@@ -86,7 +86,8 @@ class RegionInFrame(Region):
 
     def bounds(self, points: Tensor) -> str:
         """Where points [m, z up] lie, in the units in which the region was given."""
-        return _bounds(self.frame.point_to_scene(points.reshape(-1, 3)))
+        given = self.frame.point_to_scene(points.reshape(-1, 3))
+        return self.region.bounds(given) if isinstance(self.region, RegionInFrame) else _bounds(given)
 
     def __repr__(self) -> str:
         return repr(self.region)
@@ -313,6 +314,8 @@ class SequentialRelease(PinnedRegion):
         start: Time at which the front meets the first particle [s]; before it all are held.
         end: Time at which it passes the last one [s].
         held_share: Share of the nodal mass in ``total``, between 0 and 1.
+        first: Point that the front meets at ``start``, in scene units, in place of the first particle.
+        last: Point that it passes at ``end``, likewise; given together with ``first``, and farther along ``direction``.
     """
 
     recordable = True
@@ -324,6 +327,8 @@ class SequentialRelease(PinnedRegion):
         start: float = 0.0,
         end: float = 1.0,
         held_share: float = 0.07,
+        first: Sequence[float] | None = None,
+        last: Sequence[float] | None = None,
     ) -> None:
         super().__init__(region, held_share, start, end)
         if not math.isfinite(self.end):
@@ -332,20 +337,37 @@ class SequentialRelease(PinnedRegion):
             raise ValueError("Expected `direction` of the SequentialRelease not to be zero.")
         self.register_buffer("direction", torch.tensor([float(c) for c in direction], dtype=torch.float64))
         self.direction: Tensor
+        if (first is None) != (last is None):
+            raise ValueError("Give both `first` and `last` of the SequentialRelease, or neither.")
+        ends = None
+        if first is not None and last is not None:
+            ends = torch.tensor([check_vector("first", first), check_vector("last", last)], dtype=torch.float64)
+            if not float((ends[1] - ends[0]) @ self.direction) > 0:
+                raise ValueError(
+                    f"Expected `last` of the SequentialRelease farther along `direction` than `first`, but got "
+                    f"{list(last)} and {list(first)}."
+                )
+        self.register_buffer("ends", ends)  # first and last, shape (2, 3)
+        self.ends: Tensor | None
 
     def in_frame(self, frame: FrameLike) -> SequentialRelease:
-        """The release with its region and direction in metres, z up."""
+        """The release with its region, direction and points in metres, z up."""
         moved = copy.copy(self)
         moved.region = RegionInFrame(self.region, frame)
         moved._buffers = dict(self._buffers) | {"direction": frame.direction_to_sim(self.direction).clone()}
+        if self.ends is not None:
+            moved._buffers["ends"] = frame.point_to_sim(self.ends)
         return moved
 
     def release_time(self, rest_position: Tensor) -> Tensor:
         """When the front passes each particle [s], shape (..., P), float64."""
         mask = self.region.contains(rest_position)
         along = (rest_position.double() * self.direction.to(rest_position.device)).sum(-1)
-        low = along.where(mask, math.inf).amin(-1, keepdim=True)
-        high = along.where(mask, -math.inf).amax(-1, keepdim=True)
+        if self.ends is None:
+            low = along.where(mask, math.inf).amin(-1, keepdim=True)
+            high = along.where(mask, -math.inf).amax(-1, keepdim=True)
+        else:
+            low, high = (self.ends.to(along) @ self.direction.to(along)).unbind()
         part = (along - low) / (high - low).clamp(min=torch.finfo(torch.float64).tiny)
         return self.start + part * (self.end - self.start)
 
@@ -364,16 +386,41 @@ class Impulse(_OfParticles):
         impulse: Impulse on the region as a whole [N s], z up.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s].
+        per_particle: Whether ``impulse`` is that on each particle, so that the whole grows with their number.
     """
 
     recordable = True
 
-    def __init__(self, region: Region, impulse: Sequence[float], start: float = 0.0, end: float = 0.04) -> None:
+    def __init__(
+        self,
+        region: Region,
+        impulse: Sequence[float],
+        start: float = 0.0,
+        end: float = 0.04,
+        per_particle: bool = False,
+    ) -> None:
         super().__init__(region, start, end)
         if not math.isfinite(self.end):
             raise ValueError(f"Expected `end` of the Impulse to be a finite time, but got {end}.")
         self.register_buffer("impulse", torch.tensor(check_vector("impulse", impulse), dtype=torch.float64))
         self.impulse: Tensor
+        self.per_particle = bool(per_particle)
+        # particles of each scene of the batch, once they are known
+        self.register_buffer("count", torch.ones((), dtype=torch.float64), persistent=False)
+        self.count: Tensor
+
+    def in_frame(self, frame: FrameLike) -> Impulse:
+        """The impulse with its region asked in metres."""
+        moved = copy.copy(self)
+        moved.region, moved._buffers = RegionInFrame(self.region, frame), dict(self._buffers)
+        return moved
+
+    def particle_mask(self, rest_position: Tensor) -> Tensor:
+        """Particles inside the region at rest, which are counted too; ValueError if there are none."""
+        mask = super().particle_mask(rest_position)
+        if self.per_particle:
+            self.count = mask.sum(-1).to(self.impulse)
+        return mask
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Add the part of the impulse that falls into the substep."""
@@ -383,7 +430,8 @@ class Impulse(_OfParticles):
         part = (overlap.clamp(min=0) / (self.end - self.start)).to(velocity)
         # a scene of the batch without any such particle has no share to push
         per_mass = nodes.share / nodes.held_mass.clamp(min=torch.finfo(velocity.dtype).tiny)[..., None]
-        return velocity + per_mass[..., None] * (part * self.impulse.to(velocity))
+        whole = self.impulse if not self.per_particle else self.count[..., None, None] * self.impulse
+        return velocity + per_mass[..., None] * (part * whole.to(velocity))
 
 
 class Plane(Boundary):
@@ -494,13 +542,21 @@ class VelocityBox(Boundary):
         velocity: Velocity [m/s], z up.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
+        travels: Whether the region moves with ``velocity`` from ``start`` on; otherwise it stays where it is.
     """
 
     needs_position = True
 
-    def __init__(self, region: Region, velocity: Sequence[float], start: float = 0.0, end: float | None = None) -> None:
+    def __init__(
+        self,
+        region: Region,
+        velocity: Sequence[float],
+        start: float = 0.0,
+        end: float | None = None,
+        travels: bool = False,
+    ) -> None:
         super().__init__(start, end)
-        self.region, self.recordable = region, region.recordable
+        self.region, self.recordable, self.travels = region, region.recordable, bool(travels)
         self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
         self.velocity: Tensor
 
@@ -513,5 +569,8 @@ class VelocityBox(Boundary):
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Drive the nodes inside."""
         assert nodes.position is not None
-        inside = self.region.contains(nodes.position) & self.active(nodes.time)
+        where = nodes.position
+        if self.travels:
+            where = where - (self.velocity * (nodes.time - self.start)).to(where)
+        inside = self.region.contains(where) & self.active(nodes.time)
         return torch.where(inside[..., None], self.velocity.to(velocity), velocity)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from argparse import ArgumentError
+from argparse import SUPPRESS, Action, ArgumentError
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +19,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.camera import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.physgaussian import Normalisation, convert, read_config, to_yaml
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
@@ -28,6 +29,23 @@ if TYPE_CHECKING:
 
 # what may change between a run and the one that resumes it
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
+
+
+class PhysGaussianAction(Action):
+    """Takes a PhysGaussian configuration as ``--config`` takes a YAML file, and prints the differences in meaning."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Convert the file and merge it into what was parsed so far."""
+        from jsonargparse import ActionConfigFile
+
+        try:
+            settings, notes = convert(read_config(values))
+        except ValueError as error:  # which argparse would not report
+            raise TypeError(str(error)) from error
+        ActionConfigFile.apply_config(parser, namespace, "config", to_yaml(settings))
+        namespace["config"][-1] = values
+        for note in notes:
+            print(f"note: {note}", file=sys.stderr)
 
 
 def build_parser() -> ArgumentParser:
@@ -41,6 +59,12 @@ def build_parser() -> ArgumentParser:
         "are in scene units and axes; velocities, gravity and light are in metres, z up.",
     )
     parser.add_argument("--config", action="config", help="YAML file; options given after it override it.")
+    parser.add_argument(
+        "--physgaussian",
+        action=PhysGaussianAction,
+        default=SUPPRESS,
+        help="The same for a JSON file of PhysGaussian, which is converted.",
+    )
     parser.add_argument("--output", type=str | None, help="Folder of the results. Default: outputs/<config name>.")
     parser.add_argument(
         "--device", type=Literal["auto", "cpu", "cuda"], default="auto", help="auto takes a CUDA GPU if there is one."
@@ -56,6 +80,12 @@ def build_parser() -> ArgumentParser:
         action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
         default=False,
         help="Continue the run found in the output folder.",
+    )
+    parser.add_argument(
+        "--normalisation",
+        type=Normalisation | None,
+        default=None,
+        help="Take boundaries and regions of the material in PhysGaussian's normalised space; null for scene units.",
     )
     parser.add_class_arguments(Scene, "scene")
     parser.add_class_arguments(Material, "material")
@@ -96,6 +126,8 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
     parts = parser.instantiate(settings)
     solver = parts.solver
+    if parts.normalisation is not None:
+        parts.normalisation.place(parts.scene, parts.material, solver, parts.get("camera"))
     scene = SimulatedScene(parts.scene, parts.material, solver.dx, getattr(torch, settings.dtype))
     pipeline = SimulationPipeline(
         scene,
@@ -161,6 +193,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         folder = output_folder(settings)
         scene = pipeline.scene
         print(f"{len(scene.simulated):,} of {len(scene.model.means):,} Gaussians simulated on {pipeline.device}")
+        if scene.filled:
+            print(f"{scene.filled:,} points fill the inside")
         print(scene.frame.describe())
         extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
         text = config_text(parser, settings)

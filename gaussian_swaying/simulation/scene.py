@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.data.procedural import ProceduralScene
+from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
@@ -53,8 +54,8 @@ class Material:
         nu: Poisson's ratio, below 0.5.
         density: Density [kg/m³].
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
-        volume: ``patch`` (area x thickness) or ``cell`` (PhysGaussian's rule for solids: cell volume / particles in
-            it).
+        volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
+            (PhysGaussian's rule for solids: cell volume / particles in it).
         law: Constitutive law, for example ``Sand``; fixed corotated elasticity if null. All but ``FixedCorotated``,
             ``NeoHookean`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
         regions: Parts made of something else; later entries win.
@@ -95,6 +96,9 @@ class Scene:
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
         area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface) or ``paper`` (pi s1 s2).
+        filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
+        wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
+            those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
     """
 
     def __init__(
@@ -108,8 +112,11 @@ class Scene:
         longest_side: float | None = None,
         metres_per_unit: float | None = None,
         area: str = "coverage",
+        filling: InteriorFilling | None = None,
+        wind_on: str = "surface",
     ) -> None:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
+        check_choice("scene.wind_on", wind_on, ("surface", "all"))
         check_choice("scene.area", area, ("coverage", "paper"))
         if not any(check_vector("scene.up", up)):
             raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
@@ -120,6 +127,7 @@ class Scene:
         self.ply, self.generator, self.region = ply, generator, region or Everything()
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
+        self.filling, self.wind_on = filling, wind_on
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -133,16 +141,20 @@ class SimulatedScene(nn.Module):
     """Gaussians, material points and patches of one scene, and how the first follow the second.
 
     Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
-    simulated one, static ones stay.
+    simulated one, static ones stay. The points that fill a solid are material only: no Gaussian belongs to them, and
+    their patch area is zero.
 
     Args:
         scene: Where the Gaussians come from.
         material: What they are made of.
-        dx: Grid spacing [m], for ``material.volume = "cell"``.
+        dx: Grid spacing [m], for ``material.volume = "cell"`` and as twice the spacing of ``scene.filling``.
         dtype: Precision of the simulation.
 
     Attributes:
-        points: The material, for the solver.
+        points: The material, for the solver: the simulated Gaussians in their order, then the filled points.
+        filled: Number of filled points.
+        patch_normal: Unit normals of the points at rest in the z-up frame, shape (P, 3).
+        patch_area: Their areas that feel the wind [m²], shape (P,).
         frame: Scene units to metres.
         bounds: Smallest and largest corner of the simulated part at rest [scene units].
         size: Its longest side [scene units].
@@ -167,7 +179,18 @@ class SimulatedScene(nn.Module):
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
         normals = self.model.normals()
-        areas = GaussianSurfaceModel.from_cloud(cloud.select(chosen), requires_grad=False).areas(scene.area)
+        position = self.frame.point_to_sim(cloud.means[simulated].double())
+        filling = None
+        if scene.filling is not None:
+            shape = self.frame.covariance_to_sim(self.model.covariance()[simulated].double())
+            visible = self.model.opacity()[simulated]
+            filling = within_region(scene.filling.fill(position, shape, visible, 0.5 * dx), scene.region, self.frame)
+        self.filled = 0 if filling is None else len(filling.position)
+        outer = torch.ones(len(simulated), dtype=torch.bool) if filling is None else filling.on_surface
+        areas = cloud.means.new_zeros(len(simulated))
+        for group in (outer, ~outer):  # what lies within takes no area from the surface
+            part = cloud.select(simulated[group])
+            areas[group] = GaussianSurfaceModel.from_cloud(part, requires_grad=False).areas(scene.area)
         self.register_buffer("simulated", simulated)
         carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
         self.register_buffer("carried", carried)
@@ -175,9 +198,15 @@ class SimulatedScene(nn.Module):
         self.register_buffer("anchor", anchor[:, 0])
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
-        position = self.frame.point_to_sim(cloud.means[simulated].double())
-        self.register_buffer("patch_normal", self.frame.direction_to_sim(normals[simulated].double()).to(dtype))
-        self.register_buffer("patch_area", self.frame.area_to_sim(areas).to(dtype))
+        facing = self.frame.direction_to_sim(normals[simulated].double())
+        area = self.frame.area_to_sim(areas)
+        body_area, area = area, area if scene.wind_on == "all" else torch.where(outer, area, 0)
+        if filling is not None:  # a filled point is a patch of no area
+            position = torch.cat([position, filling.position])
+            facing = torch.cat([facing, torch.tensor([[0.0, 0.0, 1.0]]).to(facing).expand(self.filled, 3)])
+            body_area, area = (torch.cat([part, part.new_zeros(self.filled)]) for part in (body_area, area))
+        self.register_buffer("patch_normal", facing.to(dtype))
+        self.register_buffer("patch_area", area.to(dtype))
         # what every picture would otherwise compute again
         moving = torch.cat([simulated, carried])
         self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
@@ -198,11 +227,14 @@ class SimulatedScene(nn.Module):
         self.arm: Tensor
         self.rest_facing: Tensor
         self.identity: Tensor
-        count = len(simulated)
+        count = len(position)
+        where = cloud.means[simulated]
+        if filling is not None:
+            where = torch.cat([where, self.frame.point_to_scene(filling.position).to(where.dtype)])
         fields = {name: torch.full((count,), getattr(material, name), dtype=dtype) for name in _MATERIAL_FIELDS}
         laws, law_index = [material.law or FixedCorotated()], torch.zeros(count, dtype=torch.long)
         for entry in material.regions:
-            inside = entry.region.contains(cloud.means[simulated])
+            inside = entry.region.contains(where)
             if not bool(inside.any()):
                 raise ValueError(f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian.")
             for name in _MATERIAL_FIELDS:
@@ -212,7 +244,10 @@ class SimulatedScene(nn.Module):
                 law_index[inside] = len(laws)
                 laws.append(entry.law)
         if material.volume == "patch":
-            volume = self.patch_area * fields["thickness"]
+            volume = body_area.to(dtype) * fields["thickness"]
+            if filling is not None:
+                solid = torch.cat([filling.gaussian_volume, filling.volume]).to(dtype)
+                volume = torch.where(solid > 0, solid, volume)
         else:
             volume = cell_volume(position, dx).to(dtype)
         self.points = MaterialPoints.create(
@@ -254,8 +289,9 @@ class SimulatedScene(nn.Module):
         """
         rest = self.rest()
         kind = rest.means.dtype
-        move = self.frame.displacement_to_scene((state.position - self.points.position).to(kind))
-        F = self.frame.gradient_to_scene(state.F_total.to(kind))
+        count = len(self.simulated)  # the points after them fill a solid and are not drawn
+        move = self.frame.displacement_to_scene((state.position - self.points.position)[:count].to(kind))
+        F = self.frame.gradient_to_scene(state.F_total[:count].to(kind))
         if len(self.carried):
             near = F[self.anchor]
             turned = (near * self.arm[:, None, :]).sum(-1) - self.arm  # a difference, so that nothing moves at rest
@@ -276,6 +312,12 @@ class SimulatedScene(nn.Module):
 
 
 _MATERIAL_FIELDS = ("E", "nu", "density", "thickness")
+
+
+def within_region(filling: Filling, region: Region, frame: SimFrame) -> Filling:
+    """A filling without the points outside a region given in scene units."""
+    inside = region.contains(frame.point_to_scene(filling.position))
+    return replace(filling, position=filling.position[inside], volume=filling.volume[inside])
 
 
 def cell_volume(position: Tensor, dx: float) -> Tensor:

@@ -446,6 +446,56 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation):
     torch.testing.assert_close(fall, -0.098 * counts, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_impulse_per_particle_grows_with_their_number(formulation):
+    """And with that of each scene of a batch, whatever their mass; counted anew for another material."""
+    knock = Impulse(Box([None, None, 0.2], [None] * 3), [0.01, -0.02, 0.03], end=2e-3, per_particle=True)
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[knock], gravity=(0, 0, 0))
+    impulse = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
+    for per_side, count in ((4, 32), (6, 108)):  # the upper half
+        end = _march(solver, _block(per_side=per_side), 2e-3, 3)[-1]
+        torch.testing.assert_close(solver.momenta(end)["linear"], count * impulse, rtol=1e-12, atol=0)
+    one = _lone([[0, 0, 0], [1, 0, 0.5], [2, 0, 1]])
+    position = torch.stack([one.position, one.position + torch.tensor([0, 0, 5.0])])
+    points = MaterialPoints.create(position, volume=1e-3, density=100.0, youngs_modulus=1e3, poisson_ratio=0.3)
+    end = _march(solver, points, 2e-3, 3)[-1]
+    expected = torch.stack([2 * impulse, 3 * impulse])
+    torch.testing.assert_close(solver.momenta(end)["linear"], expected, rtol=1e-12, atol=0)
+
+
+# ---- boxes of velocity that travel
+
+
+def test_a_travelling_box_takes_its_nodes_from_where_it_is():
+    """From its start on, in the metres of a frame that scales and turns; one that stays has none of it."""
+    frame = SimFrame.fit(_block().position, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
+    box = Box([0.0, 0.0, 0.0], [0.2, 0.4, 0.4])
+    drift = frame.direction_to_sim(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    move = (0.3 * drift).tolist()
+    boxes = [VelocityBox(box, move, start=0.1, end=9.0, travels=travels).in_frame(frame) for travels in (True, False)]
+    place = torch.rand(500, 3, dtype=torch.float64) * torch.tensor([1.0, 0.6, 0.6])
+    for time in (0.1, 0.4):
+        nodes = Nodes(torch.tensor(time, dtype=torch.float64), 1e-3, frame.point_to_sim(place))
+        driven = [(b(torch.zeros_like(place), nodes) != 0).any(-1) for b in boxes]
+        # 0.3 m/s are 0.6 scene units a second
+        gone = place - torch.tensor([0.6 * (time - 0.1), 0, 0], dtype=torch.float64)
+        assert torch.equal(driven[0], box.contains(gone))
+        assert torch.equal(driven[1], box.contains(place))
+        assert torch.equal(driven[0], driven[1]) == (time == 0.1)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_travelling_box_carries_a_block(formulation):
+    """Far beyond where it began, as the box goes along; one that stays leaves the block behind."""
+    region, ways = Box([-0.1, -0.1, -0.1], [0.5, 0.5, 0.5]), []
+    for travels in (True, False):
+        drive = VelocityBox(region, [1.0, 0.0, 0.0], end=0.8, travels=travels)
+        state = _run(formulation, [drive], _block(), 0.8, gravity=(0, 0, 0), damping=5.0)
+        ways.append(float((state.position - _block().position)[:, 0].mean()))
+    assert ways[0] == pytest.approx(0.8, rel=1e-6)
+    assert ways[1] < 0.75
+
+
 # ---- sequential release
 
 
@@ -508,16 +558,32 @@ def test_release_of_a_single_layer_is_at_its_start():
     assert release.release_time(torch.rand(5, 3) * torch.tensor([1.0, 1, 0])).tolist() == [0.25] * 5
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
+def test_release_between_given_points(up):
+    """The front meets them at its start and end, in whatever frame, and nothing depends on who is there."""
+    scene = torch.tensor([[-1.0, 5, 0], [0.5, 0, 1], [1.0, 2, 9], [2.0, 0, 0], [3.5, 0, 0]], dtype=torch.float64)
+    frame = SimFrame.fit(scene, up=up, metres_per_unit=0.5)
+    release = SequentialRelease(
+        Sphere([0, 0, 0], 99.0), [2.0, 0, 0], start=1.0, end=3.0, first=[0, 0, 0], last=[2, 7, 7]
+    ).in_frame(frame)
+    expected = [0.0, 1.5, 2.0, 3.0, 4.5]
+    assert release.release_time(frame.point_to_sim(scene)).tolist() == pytest.approx(expected)
+    assert release.release_time(frame.point_to_sim(scene[1:2])).tolist() == pytest.approx([1.5])
+
+
 # ---- all of them
 
 CONDITIONS = {
     "pin": lambda r: PinnedRegion(r, end=0.5),
     "handle": lambda r: Handle(r, [0.1, 0.0, 0.0], [0.0, 0.0, 1.0], [0.1, 0.2, 0.3], end=0.5),
     "release": lambda r: SequentialRelease(r, [0.0, 1.0, 0.0], end=0.5),
+    "front": lambda r: SequentialRelease(r, [0.0, 1.0, 0.0], end=0.5, first=[0.0, -0.3, 0.1], last=[0.2, 0.9, 0.3]),
     "impulse": lambda r: Impulse(r, [0.1, 0.2, 0.3], end=0.5),
+    "impulse-each": lambda r: Impulse(r, [0.01, 0.02, 0.03], end=0.5, per_particle=True),
     "plane": lambda r: Plane([0.11, 0.12, 0.23], [0.0, 1.0, 1.5], "slip", 0.3, end=0.5),
     "box": lambda r: EnclosingBox([-0.13, 0.07, 0.13], [0.33, 0.43, 0.51], "separate", 0.3, end=0.5),
     "velocity": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5),
+    "velocity-travels": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5, travels=True),
 }
 
 
@@ -564,7 +630,7 @@ def test_a_substep_may_be_a_tensor(name, dtype):
     assert found.dtype == dtype
     torch.testing.assert_close(found, known, rtol=1e-12 if dtype == torch.float64 else 1e-6, atol=0)
     assert not torch.equal(found, velocity)
-    if name in ("handle", "impulse"):  # what depends on the substep
+    if name in ("handle", "impulse", "impulse-each"):  # what depends on the substep
         longer = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(0.3, dtype=torch.float64)))
         assert float((longer - known).abs().max()) > 1e-3
 
@@ -611,7 +677,7 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
         torch.testing.assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=1e-7)
         seen.append(recorded.clone())
     assert not torch.equal(seen[0], velocity)
-    if name != "release":  # which the solver, not the condition, lets go
+    if name not in ("release", "front"):  # which the solver, not the condition, lets go
         assert torch.equal(seen[3], velocity)
 
 
@@ -669,7 +735,7 @@ def test_conditions_can_be_copied_saved_and_narrowed(name, formulation):
     torch.testing.assert_close(end.position.double(), known.position, rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize("name", ["pin", "handle", "release", "impulse"])
+@pytest.mark.parametrize("name", ["pin", "handle", "release", "front", "impulse", "impulse-each"])
 @pytest.mark.parametrize("framed", [False, True])
 def test_region_that_holds_nothing_names_its_condition(name, framed):
     boundary, points = CONDITIONS[name](Sphere([9, 9, 9], 0.1)), _block(low=(0.2, 0.2, 0.2), side=0.2)
@@ -713,6 +779,11 @@ def test_share_that_no_node_reaches_names_its_condition(kind):
         (lambda: SequentialRelease(Sphere([0, 0, 0], 1), [0, 0, 0]), "`direction` of the SequentialRelease not to be"),
         (lambda: SequentialRelease(Sphere([0, 0, 0], 1), [1, 0]), "`direction` to have 3 numbers"),
         (lambda: SequentialRelease(Sphere([0, 0, 0], 1), end=None), "`end` of the SequentialRelease .* finite time"),
+        (lambda: SequentialRelease(Sphere([0, 0, 0], 1), first=[0, 0, 0]), "both `first` and `last`"),
+        (
+            lambda: SequentialRelease(Sphere([0, 0, 0], 1), [0, 0, 1], first=[0, 0, 1], last=[5, 0, 1]),
+            "`last` of the SequentialRelease farther along",
+        ),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0, 0], end=None), "`end` of the Impulse to be a finite time"),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0, 0], end=math.inf), "`end` of the Impulse to be a finite time"),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0]), "`impulse` to have 3 numbers"),

@@ -1,0 +1,358 @@
+"""Filling of solids against closed forms: volumes, holes, cavities, open surfaces, and what must not matter."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.filling import (
+    InteriorFilling,
+    density_grid,
+    depth_below,
+    enclosed,
+    grid_around,
+    odd_crossings,
+    open_air,
+    ray_directions,
+    sample,
+    share_volume,
+)
+
+H = 0.05  # m, cells
+
+
+def _discs(normals, sigma):
+    """Covariances of flat discs across the normals."""
+    n = normals[:, :, None]
+    flat = torch.eye(3, dtype=torch.float64) - n * n.mT
+    return sigma**2 * (flat + 0.01 * n * n.mT)
+
+
+def _ball(radius, spacing=H):
+    """Points of a Fibonacci lattice on a sphere, and their normals."""
+    count = round(4 * math.pi * radius**2 / spacing**2)
+    k = torch.arange(count, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * k / count, math.pi * (1 + math.sqrt(5)) * k
+    across = (1 - z * z).sqrt()
+    normals = torch.stack([across * angle.cos(), across * angle.sin(), z], -1)
+    return radius * normals, normals
+
+
+def _torus(ring, tube, spacing=H):
+    u = torch.arange(round(2 * math.pi * (ring + tube) / spacing), dtype=torch.float64)
+    v = torch.arange(round(2 * math.pi * tube / spacing), dtype=torch.float64)
+    u, v = torch.cartesian_prod(2 * math.pi * u / len(u), 2 * math.pi * v / len(v)).unbind(-1)
+    normals = torch.stack([v.cos() * u.cos(), v.cos() * u.sin(), v.sin()], -1)
+    middle = ring * torch.stack([u.cos(), u.sin(), torch.zeros_like(u)], -1)
+    return middle + tube * normals, normals
+
+
+def _box(sides, spacing=H):
+    points, normals = [], []
+    for axis in range(3):
+        a, b = (i for i in range(3) if i != axis)
+        lines = [(torch.arange(round(sides[i] / spacing)).double() + 0.5) * spacing - 0.5 * sides[i] for i in (a, b)]
+        face = torch.cartesian_prod(*lines)
+        for side in (-1, 1):
+            x, n = torch.zeros(2, len(face), 3, dtype=torch.float64)
+            x[:, a], x[:, b], x[:, axis] = face[:, 0], face[:, 1], 0.5 * side * sides[axis]
+            n[:, axis] = side
+            points.append(x)
+            normals.append(n)
+    return torch.cat(points), torch.cat(normals)
+
+
+def _shell(*surfaces):
+    return tuple(torch.cat(parts) for parts in zip(*surfaces, strict=True))
+
+
+def _bodies():
+    """Points, normals, volume and area."""
+    ball, hollow = _ball(0.5), _shell(_ball(0.5), _ball(0.25))
+    torus = _torus(0.4, 0.15)
+    tilt = torch.tensor([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]], dtype=torch.float64) / 3
+    box = _box((1.0, 0.8, 0.6))
+    return {
+        "ball": (*ball, math.pi / 6, math.pi),
+        "hollow": (*hollow, math.pi / 6 * 7 / 8, math.pi * 5 / 4),
+        "torus": (*torus, 2 * math.pi**2 * 0.4 * 0.15**2, 4 * math.pi**2 * 0.4 * 0.15),
+        "tilted torus": (*(part @ tilt for part in torus), 2 * math.pi**2 * 0.4 * 0.15**2, 4 * math.pi**2 * 0.06),
+        "box": (*box, 0.48, 3.76),
+        "tilted box": (*(part @ tilt for part in box), 0.48, 3.76),
+    }
+
+
+def _fill(points, normals, spacing=H, sigma=0.6 * H, **settings):
+    settings = {"spacing": spacing, **settings}
+    chunk = settings.pop("chunk", 1_000_000)
+    opacity = torch.full((len(points),), 0.99)
+    return InteriorFilling(**settings).fill(points, _discs(normals, sigma), opacity, progress=False, chunk=chunk)
+
+
+# ---- the pieces
+
+
+def test_density_of_one_gaussian_is_its_formula():
+    """Also the blur, which keeps two of the three standard deviations."""
+    mean = torch.tensor([[0.31, 0.52, 0.47]], dtype=torch.float64)
+    scales = torch.tensor([0.08, 0.05, 0.002], dtype=torch.float64)
+    q, _ = torch.linalg.qr(torch.rand(3, 3, dtype=torch.float64))
+    cov = (q * scales**2) @ q.T
+    low, n = torch.zeros(3, dtype=torch.float64), (20, 21, 22)
+    density = density_grid(mean, cov[None], torch.tensor([0.8]), low, H, n)
+    axes = [(torch.arange(k, dtype=torch.float64) + 0.5) * H for k in n]
+    offset = torch.cartesian_prod(*axes).reshape(*n, 3) - mean[0]
+    wide = cov + 0.25 * H**2 * torch.eye(3, dtype=torch.float64)
+    distance = (offset @ torch.linalg.inv(wide) * offset).sum(-1)
+    peak = 0.8 * (scales[:2].square() / (scales[:2].square() + 0.25 * H**2)).prod().sqrt()
+    expected = (peak * (-0.5 * distance).exp()).float()
+    near = density > 0  # kernels end at three standard deviations along the axes
+    torch.testing.assert_close(density[near], expected[near], rtol=1e-4, atol=1e-6)
+    assert float(expected[~near].max()) <= 0.8 * math.exp(-4.5)
+
+
+def test_a_gaussian_that_blew_up_is_cut_off():
+    cov = torch.eye(3, dtype=torch.float64)[None] * 1e6
+    mean = torch.full((1, 3), 0.5, dtype=torch.float64)
+    density = density_grid(mean, cov, torch.ones(1), torch.zeros(3), H, (20, 20, 20), max_radius=2)
+    assert int((density > 0).sum()) == 5**3
+
+
+@pytest.mark.parametrize("count", [6, 18, 26])
+def test_directions(count):
+    directions = ray_directions(count)
+    assert len(set(directions)) == count
+    assert {tuple(-c for c in d) for d in directions} == set(directions)
+    assert (0, 0, 0) not in directions
+
+
+@pytest.mark.parametrize("direction", ray_directions(26))
+def test_crossings_are_those_of_a_walk(direction):
+    """Against a walk from cell to cell."""
+    dense = torch.rand(6, 7, 8) < 0.3
+    odd = odd_crossings(dense, direction)
+    for start in torch.cartesian_prod(torch.arange(6), torch.arange(7), torch.arange(8)).tolist():
+        at, before, count = list(start), bool(dense[tuple(start)]), 0
+        while True:
+            at = [a + d for a, d in zip(at, direction, strict=True)]
+            if any(not 0 <= a < n for a, n in zip(at, dense.shape, strict=True)):
+                break
+            now = bool(dense[tuple(at)])
+            count += now and not before
+            before = now
+        assert bool(odd[tuple(start)]) == (count % 2 == 1)
+
+
+def test_votes_decide():
+    """A cube with one open face: below it 9 of 26 rays leave, so 17/26 of them say inside."""
+    dense = torch.zeros(11, 11, 11, dtype=torch.bool)
+    dense[2:9, 2:9, 2:9] = True
+    dense[3:8, 3:8, 3:] = False
+    assert bool(enclosed(dense, votes=0.65)[5, 5, 7])
+    assert not bool(enclosed(dense, votes=0.66)[5, 5, 7])
+    dense[2:9, 2:9, 8] = True
+    assert int(enclosed(dense, votes=1.0).sum()) == 5**3
+    assert not bool((enclosed(dense) & dense).any())
+
+
+def test_open_air_goes_round_corners_but_not_through_walls():
+    air = torch.ones(9, 9, 9, dtype=torch.bool)
+    air[2:7, 2:7, 2:7] = False
+    air[3:6, 3:6, 3:6] = True  # a cavity
+    assert not bool(open_air(air)[4, 4, 4])
+    air[2, 3, 3] = True  # a hole near a corner
+    assert torch.equal(open_air(air), air)
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [1.0, 1.0, 1.0]])
+@pytest.mark.parametrize("width", [0.75, 1.0, 2.0])
+def test_depth_below_a_plane(normal, width):
+    """Whichever way the plane is turned, to a part of a cell; more where the blur is narrower than a cell."""
+    n = torch.tensor(normal)
+    n = n / n.norm()
+    size = 25
+    x = torch.cartesian_prod(*(torch.arange(float(size)) - 12,) * 3)
+    true = (x @ n + 0.3).reshape(size, size, size)
+    found = depth_below(true > 0, width)
+    middle = (slice(6, 19),) * 3  # outside the grid counts as air
+    error = (found - true)[middle][true[middle].abs() < 1.5 * width]
+    assert float(error.mean().abs()) < 0.35  # the cells of an aligned plane cannot tell where within them it lies
+    if normal[0]:
+        assert float(error.mean().abs()) < 0.05
+        assert float(error.std()) < 0.25
+
+
+def test_sample_is_trilinear():
+    x, y, z = torch.meshgrid(*(torch.arange(float(n)) for n in (4, 5, 6)), indexing="ij")
+    field = 1 + 2 * x - 3 * y + 0.5 * z + 0.1 * x * y * z
+    p = torch.rand(50, 3, dtype=torch.float64) * torch.tensor([3.0, 4.0, 5.0])
+    a, b, c = p.unbind(-1)
+    expected = (1 + 2 * a - 3 * b + 0.5 * c + 0.1 * a * b * c).float()
+    torch.testing.assert_close(sample(field, p, chunk=7), expected, rtol=0, atol=1e-4)
+
+
+def test_volume_is_shared_equally():
+    owner, filled = torch.tensor([0, 0, 2, -1]), torch.tensor([False, True, True])
+    volume, gaussians = share_volume(owner, filled, 6.0)
+    assert volume.tolist() == [6.0, 3.0]
+    assert gaussians.tolist() == [3.0, 3.0, 3.0, 0.0]
+
+
+# ---- bodies
+
+
+@pytest.mark.parametrize("name", _bodies())
+@pytest.mark.parametrize("per_cell", [1, 8])
+def test_volume_against_the_closed_form(name, per_cell):
+    """A cell of the surface may count or not: half a cell on all of it bounds the error."""
+    points, normals, volume, area = _bodies()[name]
+    filling = _fill(points, normals, particles_per_cell=per_cell)
+    assert abs(filling.total_volume - volume) < 0.5 * H * area
+    assert float(filling.volume.min()) > 0
+    assert float(filling.volume.max()) <= H**3 / per_cell * (1 + 1e-12)
+    # all Gaussians lie on the surface, so all have a share
+    assert float((filling.gaussian_volume > 0).double().mean()) > 0.95
+
+
+def test_opposite_faces_round_to_opposite_sides():
+    """Faces along the axes lie up to half a cell off, but two of them together no more than half of that each."""
+    for step in range(4):
+        sides = tuple(side + 0.25 * step * H for side in (1.0, 0.8, 0.6))
+        filling = _fill(*_box(sides))
+        volume = math.prod(sides)
+        area = 2 * sum(volume / side for side in sides)
+        assert abs(filling.total_volume - volume) < 0.3 * H * area
+
+
+def test_a_point_is_added_only_where_there_is_no_gaussian():
+    points, normals, *_ = _bodies()["ball"]
+    filling = _fill(points, normals, jitter=0.0)
+    low, _ = grid_around(points, H)
+    gaussian, added = (
+        {tuple(cell) for cell in ((x - low) / H).floor().long().tolist()} for x in (points, filling.position)
+    )
+    assert len(added) == len(filling.position)
+    assert not gaussian & added
+
+
+def test_the_error_shrinks_with_the_cells():
+    """What is left of a ball is of the order of a cell, not of the body."""
+    for spacing in (0.05, 0.025):
+        points, normals = _ball(0.5, spacing)
+        filling = _fill(points, normals, spacing=spacing, sigma=0.6 * spacing)
+        assert abs(filling.total_volume - math.pi / 6) < 0.15 * spacing * math.pi
+
+
+def test_points_lie_inside_and_holes_stay_empty():
+    """Distance to the ball, the ring of the torus and the walls of the hollow ball; half a cell beyond is allowed."""
+    bodies = _bodies()
+    x = _fill(*bodies["torus"][:2]).position
+    assert float(torch.hypot(x[:, :2].norm(dim=-1) - 0.4, x[:, 2]).max()) < 0.15 + H
+    radius = _fill(*bodies["hollow"][:2]).position.norm(dim=-1)
+    assert float(radius.max()) < 0.5 + H
+    assert float(radius.min()) > 0.25 - H
+
+
+def test_which_gaussians_are_on_the_surface():
+    """The outer wall, not that of a closed cavity, and of a solid splat not what lies two cells deep."""
+    ball = _ball(0.5)
+    points, normals, *_ = _bodies()["hollow"]
+    assert torch.equal(_fill(points, normals).on_surface, torch.arange(len(points)) < len(ball[0]))
+    line = torch.arange(-0.5, 0.5, H, dtype=torch.float64) + 0.3 * H
+    core = torch.cartesian_prod(line, line, line)
+    core = core[core.norm(dim=-1) < 0.5 - 0.5 * H]
+    both = _shell(ball, (core, torch.nn.functional.normalize(core, dim=-1)))
+    filling = _fill(*both)
+    deep = 0.5 - both[0].norm(dim=-1)
+    assert bool(filling.on_surface[deep < 0.5 * H].all())
+    assert not bool(filling.on_surface[deep > 2 * H].any())
+    # the splat is solid already: few points are added, and all volume is shared
+    assert abs(filling.total_volume - math.pi / 6) < 0.5 * H * math.pi
+    assert float(filling.gaussian_volume.sum()) > 0.5 * filling.total_volume
+
+
+def test_a_torn_surface_is_outvoted():
+    """Three quarters of a dense ball taken away at random leave no hole wider than the Gaussians."""
+    points, normals = _ball(0.5, 0.5 * H)
+    keep = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[: len(points) // 4]
+    filling = _fill(points[keep], normals[keep])
+    assert abs(filling.total_volume - math.pi / 6) < 0.5 * H * math.pi
+
+
+def test_open_surfaces_enclose_nothing():
+    u = torch.cartesian_prod(torch.arange(24).double(), torch.arange(16).double()) * H
+    flag = torch.stack([u[:, 0], 0.05 * torch.sin(5 * u[:, 0]), u[:, 1]], -1)
+    across = torch.nn.functional.normalize(
+        torch.stack([-0.25 * torch.cos(5 * u[:, 0]), torch.ones(len(u)), torch.zeros(len(u))], -1), dim=-1
+    ).double()
+    ball = _ball(0.5)
+    bowl = ball[0][:, 2] < -0.1
+    for points, normals in ((flag, across), (ball[0][bowl], ball[1][bowl])):
+        with pytest.raises(ValueError, match=r"Expected `filling` to find an inside.*leave out `filling`"):
+            _fill(points, normals, votes=0.9)
+    with pytest.raises(ValueError, match="find an inside"):
+        _fill(flag, across)
+
+
+# ---- what must not matter, and what must
+
+
+def test_chunks_do_not_matter():
+    points, normals, *_ = _bodies()["torus"]
+    one, two = (_fill(points, normals, particles_per_cell=8, chunk=chunk) for chunk in (1_000_000, 3_001))
+    for name in ("position", "volume", "gaussian_volume", "on_surface"):
+        assert torch.equal(getattr(one, name), getattr(two, name)), name
+
+
+def test_the_seed_moves_points_within_their_elements():
+    points, normals, *_ = _bodies()["ball"]
+    first, again, other, regular = (
+        _fill(points, normals, **options).position
+        for options in ({"seed": 3}, {"seed": 3}, {"seed": 4}, {"jitter": 0.0})
+    )
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert float((first - regular).abs().max()) <= 0.25 * H  # jitter of half the distance
+    low, _ = grid_around(points, H)
+    phase = ((regular - low) / H) % 1
+    torch.testing.assert_close(phase, torch.full_like(phase, 0.5))
+
+
+def test_scale_does_not_matter():
+    """A scene in millimetres and one in kilometres get the same points."""
+    points, normals, *_ = _bodies()["ball"]
+    small = _fill(points, normals)
+    large = _fill(1024 * points, normals, spacing=1024 * H, sigma=0.6 * 1024 * H)
+    torch.testing.assert_close(large.position, 1024 * small.position)
+    torch.testing.assert_close(large.volume, 1024**3 * small.volume)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"spacing": -1.0}, "filling.spacing"),
+        ({"threshold": 0.0}, "filling.threshold"),
+        ({"directions": 14}, "6, 18 or 26, but got 14"),
+        ({"votes": 0.5}, "filling.votes"),
+        ({"particles_per_cell": 4}, "filling.particles_per_cell"),
+        ({"jitter": 1.5}, "filling.jitter"),
+        ({"max_radius": 0}, "filling.max_radius"),
+    ],
+)
+def test_bad_settings_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words):
+        InteriorFilling(**settings)
+
+
+def test_bad_bodies_are_refused():
+    points, normals, *_ = _bodies()["ball"]
+    with pytest.raises(ValueError, match="Give the `spacing`"):
+        InteriorFilling().fill(points, _discs(normals, H), torch.ones(len(points)))
+    with pytest.raises(ValueError, match=r"at most 30,000,000 cells.*raise it"):
+        _fill(points, normals, spacing=5e-4)
+    broken = points.clone()
+    broken[3, 1] = float("nan")
+    with pytest.raises(ValueError, match="finite"):
+        _fill(broken, normals)
+    with pytest.raises(ValueError, match="`covariances` of shape"):
+        InteriorFilling(spacing=H).fill(points, _discs(normals, H)[1:], torch.ones(len(points)), progress=False)

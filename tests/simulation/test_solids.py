@@ -1,0 +1,246 @@
+"""Filled solids in a run: what they weigh, where the wind acts, and that nobody sees the filling."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.data.solid_scene import SolidScene
+from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.gaussians.selection import Box, Not, Sphere
+from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.simulation.config import build_parser, build_pipeline, main
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
+
+ROOT = Path(__file__).parents[2]
+DX = 0.12  # m
+FILLING = InteriorFilling()
+SETTINGS = {"shape": "ball", "size": 0.6, "spacing": 0.06}
+VOLUME, AREA = math.pi / 6 * 0.6**3, math.pi * 0.6**2
+
+
+def _scene(gaussians="shell", material=None, dtype=torch.float32, generator=None, **settings):
+    settings = {"filling": FILLING, **settings}
+    generator = generator or SolidScene(**SETTINGS, gaussians=gaussians)
+    return SimulatedScene(Scene(generator=generator, **settings), material or Material(density=200.0), DX, dtype)
+
+
+def _pipeline(scene, **solver):
+    return SimulationPipeline(
+        scene,
+        MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.24]))], **solver),
+        WindField([6.0, 0.0, 0.0]),
+        AeroForce(),
+        None,
+        OrbitCamera(width=32, height=18, radius=2.0),
+    )
+
+
+@pytest.mark.parametrize("gaussians", ["shell", "throughout"])
+def test_the_body_weighs_density_times_volume(gaussians):
+    """Whatever its Gaussians are, and whatever the thickness; half a cell of the surface bounds the error."""
+    for thickness in (0.01, 0.1):
+        scene = _scene(gaussians, Material(density=200.0, thickness=thickness), dtype=torch.float64)
+        torch.testing.assert_close(scene.points.mass, 200.0 * scene.points.volume)
+        assert abs(float(scene.points.mass.sum()) / 200.0 - VOLUME) < 0.25 * DX * AREA
+        assert scene.filled == scene.points.count - len(scene.simulated) > 0
+        assert bool((scene.points.mass > 0).all())
+
+
+def test_without_a_solid_nothing_changes():
+    """`filling: null` is the scene as it was."""
+    scene = _scene(filling=None, wind_on="surface")
+    assert scene.filled == 0
+    assert scene.points.count == len(scene.model.means)
+    torch.testing.assert_close(scene.points.volume, 0.01 * scene.patch_area)
+    assert torch.equal(scene.patch_area, _scene(filling=None, wind_on="all").patch_area)
+
+
+def test_filled_points_feel_no_wind():
+    """The total force is that on the patches of the hollow splat, to the last bit of each patch."""
+    filled, hollow = _scene(), _scene(filling=None)
+    count = len(filled.simulated)
+    assert torch.equal(filled.patch_area[:count], hollow.patch_area)
+    assert not bool(filled.patch_area[count:].any())
+    forces = []
+    for scene in (filled, hollow):
+        pipeline = _pipeline(scene)
+        state = pipeline.start()
+        turned = torch.eye(3) + 0.1 * torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 2.0], [0.0, 0.5, 0.3]])
+        state = state.replace(F_total=turned.expand_as(state.F_total))
+        forces.append(pipeline.load(state)[0])
+    assert torch.equal(forces[0][:count], forces[1])
+    assert not bool(forces[0][count:].any())
+    assert float(forces[1].norm(dim=-1).min()) > 0
+
+
+def test_wind_on_the_surface_or_on_all():
+    """On the surface the areas add up to that of the ball; on all they are several times as much."""
+    shell = len(SolidScene(**SETTINGS, gaussians="shell").generate())
+    surface, everywhere = _scene("throughout"), _scene("throughout", wind_on="all")
+    count = len(surface.simulated)
+    assert count > 2 * shell
+    windy = surface.patch_area[:count] > 0
+    assert bool(windy[:shell].all())
+    deep = 0.3 - surface.model.means.norm(dim=-1)
+    assert not bool(windy[deep > DX].any())
+    assert bool((everywhere.patch_area[:count] > 0).all())
+    assert not bool(everywhere.patch_area[count:].any())
+    assert float(everywhere.patch_area.sum()) > 1.5 * float(surface.patch_area.sum())
+    assert torch.equal(everywhere.patch_area[:count][windy], surface.patch_area[:count][windy])
+    assert torch.equal(surface.points.mass, everywhere.points.mass)
+    # with cells so small that only the outer Gaussians are less than one deep, their areas are the ball's
+    fine = _scene("throughout", filling=InteriorFilling(spacing=0.03))
+    assert float(fine.patch_area.sum()) == pytest.approx(AREA, rel=0.1)
+
+
+def test_the_filling_is_neither_drawn_nor_exported(tmp_path):
+    scene = _scene()
+    pipeline = _pipeline(scene)
+    state = pipeline.start()
+    shift = torch.linspace(0, 0.1, len(state.position))[:, None]
+    state = state.replace(position=state.position + shift, F_total=state.F_total * 1.1)
+    deformed = scene.deformed(state)
+    count = len(scene.simulated)
+    assert len(deformed.means) == count == len(scene.model.means)
+    torch.testing.assert_close(deformed.means, scene.model.means + shift[:count])
+    assert len(pipeline.cloud(deformed)) == count
+    # a point that fills can be anywhere: the picture is the same
+    other = state.replace(position=torch.cat([state.position[:count], state.position[count:] + 0.3]))
+    assert torch.equal(pipeline.render(state, 0).color, pipeline.render(other, 0).color)
+
+
+def test_carried_gaussians_follow_gaussians():
+    """Faint ones hang on their nearest Gaussian, not on a point that fills."""
+    cloud = SolidScene(**SETTINGS, gaussians="shell").generate()
+    opacities = cloud.opacities.clone()
+    opacities[::10] = -6.0
+    faint = dataclasses.replace(cloud, opacities=opacities)
+
+    class Given(SolidScene):
+        def generate(self):
+            return faint
+
+    scene = _scene(generator=Given())
+    assert len(scene.carried) > 0
+    state = _pipeline(scene).start()
+    moved = torch.cat([state.position[: len(scene.simulated)] + 0.2, state.position[len(scene.simulated) :]])
+    means = scene.deformed(state.replace(position=moved)).means
+    torch.testing.assert_close(means, cloud.means + 0.2, rtol=0, atol=1e-6)
+
+
+def test_the_frame_reaches_the_filling():
+    """Volumes are in cubic metres, z up, whatever the units and axes of the splat."""
+    unit, large = _scene(), _scene(metres_per_unit=10.0, filling=InteriorFilling(spacing=5 * DX))
+    torch.testing.assert_close(large.points.position, 10 * unit.points.position)
+    torch.testing.assert_close(large.points.volume, 1000 * unit.points.volume)
+    turned = _scene(up=[0.0, -1.0, 0.0])
+    assert float(turned.points.volume.sum()) == pytest.approx(VOLUME, abs=0.25 * DX * AREA)
+    assert float(turned.points.position.norm(dim=-1).max()) < 0.3 + 0.5 * DX
+
+
+def test_regions_reach_the_filling():
+    """They are in scene units and axes."""
+    lower = MaterialRegion(Box([None, None, None], [None, 0.05, None]), density=400.0)
+    settings = {"metres_per_unit": 10.0, "up": [0.0, 1.0, 0.0], "filling": InteriorFilling(spacing=5 * DX)}
+    scene = _scene(material=Material(density=200.0, regions=[lower]), **settings)
+    below = scene.frame.point_to_scene(scene.points.position)[:, 1] <= 0.05
+    assert 0 < int(below[len(scene.simulated) :].sum()) < scene.filled
+    assert torch.equal(scene.points.mass, scene.points.volume * torch.where(below, 400.0, 200.0))
+    half = _scene(region=Box([None, None, None], [None, None, 0.1]))
+    assert float(half.points.position[:, 2].max() - half.points.position[:, 2].min()) < 0.4 + 1e-6
+    hole = _scene(region=Not(Sphere([0.0, 0.0, 0.0], 0.15)), metres_per_unit=2.0)
+    assert len(hole.simulated) == len(hole.model.means)
+    assert float(hole.points.position.norm(dim=-1).min()) > 2 * 0.15
+
+
+def test_physgaussians_volumes_count_the_filling():
+    scene = _scene(material=Material(volume="cell"))
+    torch.testing.assert_close(scene.points.volume, cell_volume(scene.points.position, DX))
+
+
+def test_an_open_surface_is_refused():
+    with pytest.raises(ValueError, match="leave out `filling`"):
+        _scene(generator=FlagScene(spacing=0.05))
+    with pytest.raises(ValueError, match=r"scene\.wind_on"):
+        _scene(wind_on="inside")
+
+
+def test_a_run_of_a_filled_solid(tmp_path):
+    """Video, export, trajectory, summary and a resumed run; a heavier body moves less than its hollow splat."""
+    recorder = {"video": False, "ply_every": 2, "checkpoint_every": 1}
+    short, whole = tmp_path / "short", tmp_path / "whole"
+    summary = _pipeline(_scene()).run(Recorder(**recorder), whole, 4, progress=False)
+    scene = _scene()
+    count = len(scene.simulated)
+    assert summary["filled_particles"] == scene.filled > 0
+    assert summary["gaussians"] == count
+    assert summary["particles"] == scene.points.count
+    assert summary["mass_kg"] == pytest.approx(float(scene.points.mass.sum()), rel=1e-5)
+    assert summary["patch_area_m2"] == pytest.approx(float(scene.patch_area.sum()), rel=1e-5)
+    assert summary["lost_particles"] == 0
+    from gaussian_swaying.gaussians.ply import read_ply
+
+    files = sorted(whole.rglob("*.ply"))
+    assert len(files) == 2
+    assert all(len(read_ply(file)) == count for file in files)
+    _pipeline(_scene()).run(Recorder(**recorder), short, 2, progress=False)
+    _pipeline(_scene()).run(Recorder(**recorder), short, 4, resume=True, progress=False)
+    with np.load(short / "trajectory.npz") as a, np.load(whole / "trajectory.npz") as b:
+        assert a.files == b.files
+        assert all(np.array_equal(a[name], b[name]) for name in a.files)
+    hollow = _pipeline(_scene(filling=None)).run(Recorder(**recorder), tmp_path / "hollow", 4, progress=False)
+    assert summary["wind_work_J"] < 0.5 * hollow["wind_work_J"]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_filled_solid_on_a_gpu(formulation):
+    """The kernels take patches of no area; the same run as on the CPU."""
+    ends = []
+    for device in ("cpu", "cuda"):
+        pipeline = _pipeline(_scene(), formulation=formulation).to(device)
+        state, _ = pipeline.advance(pipeline.start())
+        ends.append(state.position.cpu())
+    torch.testing.assert_close(ends[0], ends[1], rtol=0, atol=1e-5)
+
+
+SMALL = ["--config", str(ROOT / "configs/sim/solid_surface_wind.yaml"), "--frames", "2", "--device", "cpu"]
+SMALL += ["--scene.generator.init_args.spacing", "0.1", "--solver.dx", "0.2", "--camera.init_args.width", "32"]
+SMALL += ["--camera.init_args.height", "18", "--material.E", "5e3"]
+
+
+def test_the_pair_of_the_experiment_differs_in_the_wind_alone(tmp_path):
+    """Wind on all Gaussians does more work on the same body."""
+    parser, scenes, work = build_parser(), [], []
+    for name, extra in (("surface", []), ("all", ["--config", str(ROOT / "configs/sim/variants/solid_all_wind.yaml")])):
+        pipeline, _ = build_pipeline(parser, parser.parse_args([*SMALL, *extra]))
+        scenes.append(pipeline.scene)
+        assert main([*SMALL, *extra, "--output", str(tmp_path / name)]) == 0
+        work.append(json.loads((tmp_path / name / "summary.json").read_text())["wind_work_J"])
+    assert torch.equal(scenes[0].points.position, scenes[1].points.position)
+    assert torch.equal(scenes[0].points.mass, scenes[1].points.mass)
+    assert float(scenes[1].patch_area.sum()) > float(scenes[0].patch_area.sum())
+    assert work[1] > work[0]
+
+
+def test_settings_on_the_command_line(tmp_path, capsys):
+    assert main([*SMALL, "--scene.filling.particles_per_cell", "8", "--output", str(tmp_path / "run")]) == 0
+    assert "points fill the inside" in capsys.readouterr().out
+    for option, words in (("threshold", "filling.threshold"), ("treshold", "treshold")):
+        assert main([*SMALL, f"--scene.filling.{option}", "-1", "--output", str(tmp_path / "no")]) == 2
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "no").exists()
