@@ -7,7 +7,8 @@
 ``python tools/bench.py pareto``     speed against error; writes docs/results/pareto_<device>.json
 ``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
 ``python tools/bench.py train``      trainings of a capture and of a generated flag; writes docs/results/train_cuda.json
-``python tools/bench.py pages``      docs/benchmarks.md, validation.md and training.md from all recorded JSON
+``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json
+``python tools/bench.py pages``      docs/benchmarks.md, validation.md, training.md and flag_benchmark.md from the JSON
 ``python tools/bench.py pictures``   the README's pictures from a finished run
 """
 
@@ -26,6 +27,7 @@ from typing import Any
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
 
 import accuracy as accuracy_cases
+import flags as flag_cases
 import pareto as pareto_cases
 import speed as speed_cases
 import torch
@@ -205,6 +207,20 @@ def train(options: argparse.Namespace) -> None:
     print(f"wrote {path}")
 
 
+def flags(options: argparse.Namespace) -> None:
+    """Train, simulate and compare the flags of the paper with Blender's cloth."""
+    device, result = _start(options)
+    options.device = device.type
+    name = f"flags_{device.type}"
+    path = Path(options.results) / f"{name}.json"
+    if path.exists():
+        kept = json.loads(path.read_text())
+        if kept["device"] == result["device"]:
+            result = kept | result
+    flag_cases.measure(options, result, lambda now: _write(options, name, now, quiet=True))
+    print(f"wrote {path}")
+
+
 def _gradient_lines(result: dict[str, Any]) -> list[str]:
     lines = ["## Gradients", "", f"{result['device']}; {', '.join(f'{k} {v}' for k, v in result['versions'].items())}."]
     lines += ["", "Forward and backward through a rollout of a flag, memory beyond that of the imports:", ""]
@@ -318,6 +334,11 @@ def pages(options: argparse.Namespace) -> None:
         page = Path(options.results).parent / "training.md"
         page.write_text("\n".join(training_cases.page(recorded)))
         print(f"wrote {page}")
+    compared = [json.loads(path.read_text()) for path in sorted(Path(options.results).glob("flags_*.json"))]
+    if compared:
+        page = Path(options.results).parent / "flag_benchmark.md"
+        page.write_text("\n".join(flag_cases.page(compared)))
+        print(f"wrote {page}")
 
 
 def _substep_table(result: dict[str, Any]) -> list[str]:
@@ -413,7 +434,7 @@ def main() -> None:
     """Parse and run one command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for function in (substep, speed, sim, accuracy, pareto, gradients, train, pages, pictures):
+    for function in (substep, speed, sim, accuracy, pareto, gradients, train, flags, pages, pictures):
         command = commands.add_parser(function.__name__, help=function.__doc__)
         command.set_defaults(run_command=function)
         command.add_argument("--results", default=str(RESULTS), help="folder of the recorded JSON")
@@ -421,7 +442,7 @@ def main() -> None:
             command.add_argument("--only", help="only the problems with this name (pareto: a list with commas)")
         if function is accuracy:
             command.add_argument("--thorough", action="store_true", help="finer grids and full 3D; for a GPU")
-        if function in (substep, speed, sim, accuracy, pareto, train):
+        if function in (substep, speed, sim, accuracy, pareto, train, flags):
             command.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
         if function is speed:
             command.add_argument("--counts", help="particles of the sheets, a list with commas")
@@ -429,6 +450,8 @@ def main() -> None:
             command.add_argument("--quick", action="store_true", help="tiny counts, only to see that it runs")
         if function is train:
             training_cases.add_arguments(command)
+        if function is flags:
+            flag_cases.add_arguments(command)
         if function is sim:
             command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
             command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")

@@ -95,7 +95,9 @@ class Scene:
         up: Direction in the scene that points up, for example [0, -1, 0].
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
-        area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface) or ``paper`` (pi s1 s2).
+        area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface), ``paper`` (pi s1 s2), or
+            ``equal``, the same for all, which together have the surface of ``coverage``: for comparison with a wind
+            that knows no patches.
         filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
         wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
             those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
@@ -117,7 +119,7 @@ class Scene:
     ) -> None:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
-        check_choice("scene.area", area, ("coverage", "paper"))
+        check_choice("scene.area", area, ("coverage", "paper", "equal"))
         if not any(check_vector("scene.up", up)):
             raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
         if not 0 <= opacity_threshold < 1:
@@ -190,7 +192,9 @@ class SimulatedScene(nn.Module):
         areas = cloud.means.new_zeros(len(simulated))
         for group in (outer, ~outer):  # what lies within takes no area from the surface
             part = cloud.select(simulated[group])
-            areas[group] = GaussianSurfaceModel.from_cloud(part, requires_grad=False).areas(scene.area)
+            mode = "coverage" if scene.area == "equal" else scene.area
+            found = GaussianSurfaceModel.from_cloud(part, requires_grad=False).areas(mode)
+            areas[group] = found.mean() if scene.area == "equal" and len(found) else found
         self.register_buffer("simulated", simulated)
         carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
         self.register_buffer("carried", carried)
@@ -309,6 +313,20 @@ class SimulatedScene(nn.Module):
             rest.normals.index_copy(0, index, normals),
             rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
         )
+
+
+    def on_gaussians(self, values: Tensor) -> Tensor:
+        """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.
+
+        Args:
+            values: One number per particle, shape (P,).
+
+        Returns:
+            Shape (N,), in the precision of the Gaussians.
+        """
+        own = values[: len(self.simulated)].to(self.model.means.dtype)
+        found = own.new_zeros(len(self.model.means))
+        return found.index_copy(0, self.moving, torch.cat([own, own[self.anchor]]))
 
 
 _MATERIAL_FIELDS = ("E", "nu", "density", "thickness")

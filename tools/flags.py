@@ -1,0 +1,297 @@
+"""The flag benchmark of ``bench.py flags``: train, simulate, compare with Blender's cloth, and make the page."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gaussian_swaying.metrics.compare import compare_run
+
+ROOT = Path(__file__).resolve().parent.parent
+BENCH = ROOT / "configs" / "bench"
+Row = dict[str, Any]
+
+PATTERNS = (1, 2, 3)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to simulate a flag.
+
+    Attributes:
+        title: What the tables say.
+        overlays: Files of configs/bench/variants on top of the matched configuration.
+        options: Further options of tools/sim.py.
+        patterns: Flags for which it differs from ``ours``.
+        weights: Further options of tools/train.py; a variant with some has a splat of its own.
+    """
+
+    title: str
+    overlays: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    patterns: tuple[int, ...] = PATTERNS
+    training: tuple[str, ...] = ()
+
+
+VARIANTS: dict[str, Variant] = {
+    "ours": Variant("ours (`total`, dx = 0.02 m)"),
+    "particle": Variant("PhysGaussian's way", ("particle",)),
+    "no_surface": Variant("no surface modelling", ("no_surface",), patterns=(2, 3)),
+    "no_shading": Variant("no shading", ("no_shading",)),
+    "gusts": Variant("flow randomised", ("gusts",), patterns=(2, 3)),
+    "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
+    "paper_area": Variant("areas π s1 s2", ("paper_area",)),
+    "total_04": Variant("`total`, dx = 0.04 m", options=("--solver.dx=0.04",)),
+    "total_01": Variant("`total`, dx = 0.01 m", options=("--solver.dx=0.01",)),
+    "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",)),
+    "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), ("--solver.dx=0.02",)),
+    "damped": Variant("damping 0.2 1/s", options=("--solver.damping=0.2",)),
+    "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
+    "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
+    "thin": Variant(
+        "half the thickness, twice E and density", options=("--material.thickness=0.005",), patterns=PATTERNS
+    ),
+    **{
+        f"b_{b:g}": Variant(
+            f"size loss b = {b:g}",
+            training=("--model.loss_terms.size=SizeLoss", f"--model.loss_terms.size.b={b:g}"),
+            patterns=(3,),
+        )
+        for b in (0.001, 0.004, 0.008, 0.02, 0.1)
+    },
+}
+"""All rows, by name."""
+
+_TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
+
+PAPER = {
+    "PhysGaussian": {1: (19.75, 0.0215), 2: (21.96, 0.0054), 3: (14.44, 0.0263)},
+    "Gaussian Swaying": {1: (21.44, 0.0178), 2: (22.26, 0.0052), 3: (18.60, 0.0066)},
+}
+"""PSNR [dB] and Chamfer distance of the paper's first table: of other data, so of another scale."""
+
+PAPER_ABLATION = {
+    "no flow randomisation": (17.93, 0.0070),
+    "no shading": (18.38, 0.0069),
+    "no surface modelling": (14.80, 0.0277),
+}
+"""The same of its third table, for pattern 3."""
+
+
+def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None, size: str | None) -> list[str]:
+    """Command line of tools/sim.py for a row."""
+    configs = [ROOT / "configs" / "sim" / f"flag{pattern}.yaml", BENCH / f"flag{pattern}.yaml"]
+    configs += [BENCH / "variants" / f"{name}.yaml" for name in variant.overlays]
+    arguments = [part for path in configs for part in ("--config", str(path))]
+    if splat is not None:
+        arguments += ["--scene.ply", str(splat)]
+    camera = dataset / f"pattern{pattern}" / "video" / "camera.json"
+    if camera.exists():
+        arguments += ["--camera=TransformsCamera", f"--camera.path={camera}"]
+        if size:
+            width, height = size.split("x")
+            arguments += [f"--camera.width={width}", f"--camera.height={height}"]
+    arguments += list(variant.options)
+    if pattern == 1 and ("particle" in variant.overlays):
+        arguments += ["--aero.C_F=0"]  # no air in the reference of this pattern
+    if variant is VARIANTS["thin"]:
+        modulus, density = _TWICE[pattern]
+        arguments += [f"--material.E={modulus}", f"--material.density={density}"]
+    return arguments
+
+
+def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
+    """Train a splat of a flag from its photographs, unless it is there."""
+    if (target / "point_cloud.ply").exists():
+        return {"kept": True}
+    command = [sys.executable, str(ROOT / "tools" / "train.py"), "fit"]
+    command += [f"--config={ROOT}/configs/train/default.yaml", f"--trainer.max_steps={steps}"]
+    command += [f"--trainer.val_check_interval={steps}", f"--checkpoint.every_n_train_steps={steps}"]
+    command += [f"--data.init_args.path={dataset / f'pattern{pattern}' / 'train'}"]
+    command += [f"--trainer.default_root_dir={target}", *variant.training]
+    begin = time.perf_counter()
+    with (target.parent / f"{target.name}.log").open("w") as log:
+        subprocess.run(command, check=True, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
+    return {"seconds": time.perf_counter() - begin, "steps": steps}
+
+
+def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | None, folder: Path) -> Row:
+    """Simulate a row and compare it with the reference."""
+    dataset = Path(options.dataset)
+    reference = dataset / f"pattern{pattern}"
+    output = folder / f"{name}_{pattern}"
+    command = [sys.executable, str(ROOT / "tools" / "sim.py")]
+    command += sim_arguments(pattern, VARIANTS[name], dataset, splat, options.size)
+    command += ["--device", options.device, "--output", str(output)]
+    command += [f"--frames={options.frames}"] if options.frames else []
+    command += options.more.split() if options.more else []
+    pictures = len(list((reference / "video" / "frames").glob("*.png")))
+    with_pictures = pictures == 250
+    if not with_pictures:  # they may still be in the making
+        bare = folder / f"surface_{pattern}"
+        bare.mkdir(exist_ok=True)
+        if not (bare / "cloth.npz").exists():
+            (bare / "cloth.npz").symlink_to((reference / "cloth.npz").resolve())
+        reference = bare
+        command += ["--recorder.images=false", "--recorder.video=false"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode not in (0, 3) or not (output / "summary.json").exists():
+        return {"failed": done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "no message"}
+    summary = json.loads((output / "summary.json").read_text())
+    row: Row = {
+        "status": summary["status"],
+        "reason": summary["reason"],
+        "particles": summary["particles"],
+        "frames": summary["frames"],
+        "substeps": summary["substeps"],
+        "ms_per_frame": 1e3 * sum(summary["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering")),
+        "device_memory_bytes": summary["peak_memory_bytes"]["device"],
+        "torn_particles": summary["torn_particles"],
+        "stretch_max": summary["stretch_max"],
+        "mass_kg": summary["mass_kg"],
+    }
+    row["ms_per_frame"] /= max(summary["frames"], 1)
+    found = compare_run(output, reference, frames=options.frames or summary["frames"], points=options.points)
+    row |= {key: found[key] for key in ("chamfer_share", "sampling_m", "psnr_of_mean_db") if key in found}
+    row["mean"] = found["mean"]
+    row["chamfer_per_frame_m"] = [entry.get("chamfer_m") for entry in found["per_frame"]]
+    return row
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py flags``."""
+    command.add_argument("--dataset", required=True, help="folder that tools/make_flag_dataset.py wrote")
+    command.add_argument("--rows", default=",".join(VARIANTS), help="a list with commas")
+    command.add_argument("--patterns", default="1,2,3", help="a list with commas")
+    command.add_argument("--splats", default="outputs/flags", help="folder of the trained splats; `made` for splats "
+                         "made in code, which no training has blurred")  # fmt: skip
+    command.add_argument("--train_steps", type=int, default=7000, help="images of a training")
+    command.add_argument("--frames", type=int, help="only the first frames")
+    command.add_argument("--size", help="of the pictures, as 960x540; that of the reference by default")
+    command.add_argument("--points", type=int, default=10_000, help="on the reference's surface")
+    command.add_argument("--more", help="further options of tools/sim.py, in quotes")
+
+
+def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
+    """Fill ``result["rows"]``, saving it after each run; rows that are there and not asked for are kept."""
+    names = options.rows.split(",")
+    if unknown := set(names) - set(VARIANTS):
+        raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
+    patterns = [int(p) for p in options.patterns.split(",")]
+    for pattern in patterns:
+        if not (Path(options.dataset) / f"pattern{pattern}" / "cloth.npz").exists():
+            raise SystemExit(
+                f"{options.dataset} has no pattern{pattern}/cloth.npz: make it with tools/make_flag_dataset.py"
+            )
+    result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
+    rows = result.setdefault("rows", {})
+    for pattern in patterns:
+        path = Path(options.dataset) / f"pattern{pattern}" / "uncertainty.json"
+        if path.exists():
+            known = json.loads(path.read_text())["variants"]
+            kept = {name: {k: v for k, v in found.items() if k != "chamfer_per_frame"} for name, found in known.items()}
+            result.setdefault("uncertainty", {})[str(pattern)] = kept
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in names:
+            variant = VARIANTS[name]
+            for pattern in [p for p in patterns if p in variant.patterns]:
+                splat = None
+                row: Row = {}
+                if options.splats != "made":
+                    home = Path(options.splats) / f"pattern{pattern}"
+                    home.mkdir(parents=True, exist_ok=True)
+                    target = home / (name if variant.training else "all_losses")
+                    row["training"] = train(pattern, variant, Path(options.dataset), target, options.train_steps)
+                    splat = target / "point_cloud.ply"
+                elif variant.training:
+                    continue  # there is nothing to train
+                row |= run_row(pattern, name, options, splat, Path(scratch))
+                rows.setdefault(name, {})[str(pattern)] = row
+                shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
+                print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)
+                save(result)
+
+
+# ---- the page
+
+
+def _chamfer(row: Row | None) -> str:
+    if row is None:
+        return "-"
+    if row.get("failed"):
+        return "failed"
+    if row["status"] != "complete":
+        return f"stopped at frame {row['frames']}"
+    value = row.get("chamfer_share")
+    torn = f" ({row['torn_particles']} torn)" if row["torn_particles"] else ""
+    return "-" if value is None else f"{100 * value:.2f} %{torn}"
+
+
+def _psnr(row: Row | None) -> str:
+    value = None if row is None else row.get("mean", {}).get("psnr_db")
+    return "-" if value is None else f"{value:.2f}"
+
+
+def page(recorded: list[Row]) -> list[str]:
+    """docs/flag_benchmark.md."""
+    lines = [
+        "# The flag benchmark",
+        "",
+        "Made by `python tools/bench.py flags` and `pages` from `docs/results/flags_*.json`. The reference is Blender's",
+        "cloth solver, which shares nothing with this package; how it was made, what is matched and what cannot be is in",
+        "[flag_dataset.md](flag_dataset.md). Chamfer distances are the average of both directions, mean over frames,",
+        "as a share of the flag's longer side.",
+        "",
+    ]
+    for result in recorded:
+        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
+        lines += [f"## {result['device']}", "", f"{stack}; seed {result['seed']}; splats {result['splats']}.", ""]
+        rows = result["rows"]
+        head = "| | " + " | ".join(f"pattern {p}: Chamfer | PSNR [dB]" for p in PATTERNS) + " |"
+        lines += [head, "|---" * 7 + "|"]
+        for name, variant in VARIANTS.items():
+            if name not in rows:
+                continue
+            cells = [f(rows[name].get(str(p))) for p in PATTERNS for f in (_chamfer, _psnr)]
+            lines.append(f"| {variant.title} | " + " | ".join(cells) + " |")
+        lines += ["", "How far the reference is from itself, solved otherwise (same measure):", ""]
+        for pattern, found in sorted(result.get("uncertainty", {}).items()):
+            shown = [
+                f"{name} ({v['cells']} cells, {v['quality']} steps, {v['frames_compared']} frames) "
+                f"{100 * v['chamfer']:.2f} %"
+                for name, v in found.items()
+            ]
+            lines.append(f"- pattern {pattern}: {', '.join(shown)}")
+        lines += ["", "### Time and memory", "", "| | particles | substeps | time a frame [ms] | device memory [GiB] |"]
+        lines += ["|---|---|---|---|---|"]
+        for name in ("ours", "particle"):
+            for pattern, row in sorted(rows.get(name, {}).items()):
+                if "substeps" in row:
+                    memory = row["device_memory_bytes"]
+                    on_device = "-" if memory is None else f"{memory / 2**30:.2f}"
+                    lines.append(
+                        f"| {VARIANTS[name].title}, pattern {pattern} | {row['particles']:,} | {row['substeps']:,} | "
+                        f"{row['ms_per_frame']:.1f} | {on_device} |"
+                    )
+        lines += [""]
+    lines += [
+        "## The paper's numbers",
+        "",
+        "Of other flags, other cameras and an unpublished protocol, so not to be compared in absolute terms.",
+        "",
+        "| | " + " | ".join(f"pattern {p}: PSNR [dB] | Chamfer" for p in PATTERNS) + " |",
+        "|---" * 7 + "|",
+    ]
+    for name, values in PAPER.items():
+        lines.append(f"| {name} | " + " | ".join(f"{values[p][0]:.2f} | {values[p][1]:.4f}" for p in PATTERNS) + " |")
+    for name, (psnr, chamfer) in PAPER_ABLATION.items():
+        lines.append(f"| {name} | - | - | - | - | {psnr:.2f} | {chamfer:.4f} |")
+    return [*lines, ""]
