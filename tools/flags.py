@@ -137,7 +137,7 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
     with_pictures = pictures == 250
     if not with_pictures:  # they may still be in the making
         bare = folder / f"surface_{pattern}"
-        bare.mkdir(exist_ok=True)
+        bare.mkdir(parents=True, exist_ok=True)
         if not (bare / "cloth.npz").exists():
             (bare / "cloth.npz").symlink_to((reference / "cloth.npz").resolve())
         reference = bare
@@ -245,10 +245,10 @@ def page(recorded: list[Row]) -> list[str]:
     lines = [
         "# The flag benchmark",
         "",
-        "Made by `python tools/bench.py flags` and `pages` from `docs/results/flags_*.json`. The reference is Blender's",
-        "cloth solver, which shares nothing with this package; how it was made, what is matched and what cannot be is in",
-        "[flag_dataset.md](flag_dataset.md). Chamfer distances are the average of both directions, mean over frames,",
-        "as a share of the flag's longer side.",
+        "Made by `python tools/bench.py flags` and `pages` from `docs/results/flags_*.json`. The reference is",
+        "Blender's cloth solver, which shares nothing with this package; how it was made, what is matched and what",
+        "cannot be is in [flag_dataset.md](flag_dataset.md). Chamfer distances are the average of both directions, mean",
+        "over frames, as a share of the flag's longer side.",
         "",
     ]
     for result in recorded:

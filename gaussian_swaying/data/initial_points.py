@@ -57,7 +57,9 @@ def initial_points(
     if path.suffix.lower() == ".ply":
         vertices, faces = read_ply_points(path)
         return vertices if faces is None else sample_mesh(vertices, faces, count, seed)
-    raise ValueError(f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply or .obj file.")
+    raise ValueError(
+        f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply or .obj file."
+    )
 
 
 def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -> PointCloud:

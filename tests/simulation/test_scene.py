@@ -204,6 +204,13 @@ def test_areas_as_in_the_paper(make_cloud, make_scene):
     torch.testing.assert_close(scene.patch_area, 4 * math.pi * s[:, 1] * s[:, 2])
 
 
+def test_equal_areas_have_the_same_sum(make_cloud, make_scene):
+    cloud = make_cloud()
+    areas = make_scene(cloud, area="equal").patch_area
+    assert areas.unique().numel() == 1
+    torch.testing.assert_close(areas.sum(), make_scene(cloud, area="coverage").patch_area.sum())
+
+
 def test_cell_rule(make_scene):
     """Three particles share one cell, one has another to itself."""
     position = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.4], [0.4, 0.4, 0.4], [-0.1, 0.1, 0.1]])

@@ -120,6 +120,38 @@ def test_a_splat_from_a_file(tmp_path, capsys):
     assert "96 of 96" in capsys.readouterr().out
 
 
+def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
+    """Further cameras by name, a path with keys, and renders beside the colour; the stored configuration keeps them."""
+    more = {
+        "cameras": {
+            "side": {"class_path": "OrbitCamera", "init_args": {"width": 16, "height": 8, "azimuth": 0.0}},
+            "flight": {
+                "class_path": "KeyframedCamera",
+                "init_args": {
+                    "keys": [
+                        {"time": 0.0, "azimuth": -70, "elevation": 8, "radius": 2},
+                        {"time": 1.0, "azimuth": -40},
+                    ],
+                    "width": 16,
+                    "height": 8,
+                },
+            },
+        },
+        "recorder": {"renders": ["color", "normal"], "normal_axes": "world"},
+    }
+    (tmp_path / "more.yaml").write_text(yaml.safe_dump(more))
+    out = tmp_path / "run"
+    assert _code([*SMALL, "--config", str(tmp_path / "more.yaml"), "--output", str(out)]) == 0
+    for name in ("side", "flight"):
+        assert (out / "cameras" / name / "frames" / "00001.png").exists()
+        assert f"wrote {out / 'cameras' / name / 'normal.mp4'}" in capsys.readouterr().out or name == "flight"
+    stored = yaml.safe_load((out / "config.yaml").read_text())
+    assert stored["cameras"]["flight"]["init_args"]["keys"][1]["azimuth"] == -40
+    (tmp_path / "more.yaml").write_text(yaml.safe_dump({"cameras": {"a/b": more["cameras"]["side"]}}))
+    words = ("name of `cameras`", "'a/b'")
+    check_refused([*SMALL, "--config", str(tmp_path / "more.yaml")], tmp_path / "no", capsys, *words)
+
+
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
 def test_every_shipped_configuration_builds(config, tmp_path):
     """Parsed, and its components made; the splat is exchanged where the user has to give one."""

@@ -1,0 +1,84 @@
+"""The flag benchmark: command lines that parse, a row from a run, and the page."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gaussian_swaying.simulation.config import build_parser
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def flags(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import flags
+
+    yield flags
+    sys.modules.pop("flags", None)
+
+
+def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
+    parser = build_parser()
+    for name, variant in flags.VARIANTS.items():
+        for pattern in variant.patterns:
+            settings = parser.parse_args(flags.sim_arguments(pattern, variant, tmp_path, None, None))
+            assert settings.recorder.trajectory
+            if name == "ours" and pattern > 1:
+                assert (settings.aero.C_D, settings.aero.C_F, settings.aero.law) == (1.28, 0.0, "projected")
+                assert not settings.wind.modulations
+            if name in ("particle", "no_surface"):
+                assert (0.0 if pattern == 1 else settings.aero.C_D) == settings.aero.C_F
+            if name == "thin":  # the same sheet: E h and density h
+                base = parser.parse_args(flags.sim_arguments(pattern, flags.VARIANTS["ours"], tmp_path, None, None))
+                for field in ("E", "density"):
+                    sheets = [getattr(s.material, field) * s.material.thickness for s in (settings, base)]
+                    assert sheets[0] == pytest.approx(sheets[1])
+
+
+def test_a_row_is_simulated_and_compared(flags, tmp_path):
+    """A flag in still air that cannot fall, against one at rest: what is left is the spacing of the points."""
+    u, v = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 1, 17), indexing="ij")
+    x, z = 1.2 * u.ravel(), 0.8 * v.ravel()
+    rest = np.stack([x, 0.003 * np.sin(3 * np.pi * u.ravel()), z], -1)
+    corner = (np.arange(24)[:, None] * 17 + np.arange(16)).ravel()
+    faces = np.stack([corner, corner + 17, corner + 18, corner + 1], -1)
+    folder = tmp_path / "data" / "pattern1"
+    folder.mkdir(parents=True)
+    settings = {"width": 1.2, "height": 0.8}
+    np.savez(folder / "cloth.npz", positions=np.repeat(rest[None], 2, 0), faces=faces, settings=json.dumps(settings))
+    options = type("Options", (), {})()
+    options.dataset, options.size, options.device, options.frames, options.points = (
+        tmp_path / "data",
+        None,
+        "cpu",
+        2,
+        500,
+    )
+    options.more = "--scene.generator.init_args.spacing=0.1 --solver.dx=0.2 --solver.gravity=[0,0,0] "
+    options.more += "--solver.boundaries=[]"
+    row = flags.run_row(1, "ours", options, None, tmp_path)
+    assert row["status"] == "complete"
+    assert row["frames"] == 2
+    assert row["mean"]["chamfer_m"] < 0.1  # the spacing
+    assert row["chamfer_share"] == pytest.approx(row["mean"]["chamfer_m"] / 1.2)
+    options.more = "--solver.dx=nonsense"
+    assert "solver.dx" in flags.run_row(1, "ours", options, None, tmp_path / "again")["failed"]
+
+
+def test_the_page_tells_what_was_and_what_was_not(flags):
+    row = {"status": "complete", "frames": 250, "torn_particles": 0, "chamfer_share": 0.0213, "mean": {"psnr_db": 22.5}}
+    row |= {"particles": 1000, "substeps": 5000, "ms_per_frame": 12.3, "device_memory_bytes": 2**30}
+    stopped = row | {"status": "diverged", "frames": 31}
+    result = {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0, "splats": "made in code"}
+    result["rows"] = {"ours": {"1": row, "3": stopped}, "particle": {"1": {"failed": "x"}}}
+    known = {"cells": 60, "quality": 16, "frames_compared": 250, "chamfer": 0.034}
+    result["uncertainty"] = {"1": {"coarser": known}}
+    text = "\n".join(flags.page([result]))
+    assert "| ours (`total`, dx = 0.02 m) | 2.13 % | 22.50 | - | - | stopped at frame 31 | 22.50 |" in text
+    assert "| PhysGaussian's way | failed | - | - | - | - | - |" in text
+    assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in text
+    assert "| Gaussian Swaying | 21.44 | 0.0178 |" in text

@@ -1,0 +1,505 @@
+"""The reference of the flag benchmark: what is asked of Blender, its files, cameras and resuming.
+
+Nothing here needs Blender, apart from the last tests, which are skipped without it.
+"""
+
+import json
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.data.capture import read_capture
+from gaussian_swaying.rendering.camera import TransformsCamera
+
+TOOLS = Path(__file__).parents[2] / "tools"
+NAMES = ("blender_cloth", "blender_checks", "blender_images", "flag_reference", "make_flag_dataset")
+
+
+@pytest.fixture(scope="module")
+def tool():
+    """tools/make_flag_dataset.py with the modules beside it."""
+    sys.path.insert(0, str(TOOLS))
+    try:
+        import make_flag_dataset
+
+        yield make_flag_dataset
+    finally:
+        sys.path.remove(str(TOOLS))
+        for name in NAMES:
+            sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def reference(tool):
+    return tool.reference
+
+
+@pytest.fixture(scope="module")
+def cloth(tool):
+    return sys.modules["blender_cloth"]
+
+
+# ---- physics
+
+
+def test_patterns_have_the_parameters_of_the_paper(reference):
+    """Young's modulus, density and flow of the table; mass, pressure and bending follow from them."""
+    expected = {1: (5e3, 50.0, (0, 0, 0)), 2: (3e3, 30.0, (2.5, 0.5, 0)), 3: (3e3, 20.0, (2, 0, 0))}
+    for number, (modulus, density, flow) in expected.items():
+        pattern = reference.PATTERNS[number]
+        assert (pattern.youngs_modulus, pattern.density, pattern.flow) == (modulus, density, flow)
+        assert (pattern.poisson_ratio, pattern.gravity, pattern.frames, pattern.fps) == (0.3, 9.8, 250, 25)
+        material = pattern.material()
+        assert material.areal_density == pytest.approx(density * pattern.thickness)
+        assert material.membrane == pytest.approx(modulus * pattern.thickness)
+        assert material.bending == pytest.approx(modulus * pattern.thickness**3 / 12 / 0.91)
+        speed = math.hypot(*flow)
+        assert pattern.pressure() == pytest.approx(0.5 * 1.225 * 1.28 * speed**2)
+
+
+def test_blender_is_asked_in_its_own_units(reference, cloth):
+    """The relations, turned round: whatever the mesh, the same mass, springs, damping, bending and wind in SI units."""
+    for cells in (30, 60, 120):
+        pattern = replace(reference.PATTERNS[2], cells=cells, quality=512)
+        grid, material, run = pattern.grid(), pattern.material(), pattern.run()
+        asked = cloth.blender_settings(grid, material, run)
+        assert asked["gravity"] == pytest.approx(-15.68)
+        assert asked["mass"] * grid.count == pytest.approx(0.3 * 1.2 * 0.8)
+        spring = asked["tension_stiffness"] * 625 / grid.cell
+        assert spring * 4 / 3 * grid.rim == pytest.approx(30.0)
+        assert asked["shear_stiffness"] == pytest.approx(0.5 * asked["tension_stiffness"])
+        assert asked["tension_damping"] * 25 / spring == pytest.approx(2.2e-3)
+        assert asked["bending_stiffness"] * cloth.BENDING * grid.cell**2 * 625 == pytest.approx(material.bending)
+        assert 0.02 * 25 * asked["strength"] == pytest.approx(pattern.pressure())
+        assert asked["strength"] / asked["flow"] == pytest.approx(math.hypot(2.5, 0.5))
+        assert asked["air_damping"] == 0.0
+    still = reference.PATTERNS[1]
+    asked = cloth.blender_settings(still.grid(), still.material(), still.run())
+    assert asked["strength"] == asked["flow"] == 0.0
+
+
+def test_steps_follow_the_mesh(reference, cloth):
+    """Blender's bending is explicit: its number grows with 1 / cell^4 and falls with the square of the steps."""
+    for number in (1, 2, 3):
+        pattern = reference.PATTERNS[number]
+        assert reference.least_quality(pattern) == pattern.quality
+        finer = replace(pattern, cells=2 * pattern.cells)
+        of = [cloth.bending_number(p.grid(), p.material(), p.run()) for p in (pattern, finer)]
+        assert of[0] < cloth.BENDING_LIMIT
+        assert of[1] / of[0] == pytest.approx(16, rel=0.05)
+        assert reference.least_quality(finer) == 4 * pattern.quality
+    grid, rough = pattern.grid(), replace(pattern, quality=8).run()
+    with pytest.raises(ValueError, match="`quality` of at least 39"):
+        cloth.solve_cloth(grid, grid.flat(), [], pattern.material(), rough)
+
+
+def test_pins_hold_the_same_part_of_the_flag_on_every_mesh(reference):
+    """An edge is a line of vertices, a corner a square of 4 cm; the lower left corner is free in pattern 2."""
+    for cells, side in ((60, 3), (120, 5)):
+        left, corners, top = (replace(reference.PATTERNS[n], cells=cells) for n in (1, 2, 3))
+        for pattern, count in ((left, left.grid().rows + 1), (top, top.grid().columns + 1), (corners, 3 * side**2)):
+            uv = pattern.grid().uv()
+            pins = pattern.pins(uv)
+            assert len(pins) == count
+            assert len(pins) == len(set(pins.tolist()))
+        held = corners.grid().uv()[corners.pins(corners.grid().uv())]
+        assert not ((held[:, 0] < 0.5) & (held[:, 1] < 0.5)).any()
+        for u, v in ((0, 1), (1, 1), (1, 0)):
+            assert (held == [u, v]).all(1).any()
+    np.testing.assert_array_equal(left.grid().uv()[left.pins(left.grid().uv())][:, 0], 0)
+    np.testing.assert_array_equal(top.grid().uv()[top.pins(top.grid().uv())][:, 1], 1)
+
+
+def test_rest_shape_has_its_true_normals_on_the_side_of_the_camera(reference):
+    for number in (1, 2, 3):
+        pattern = replace(reference.PATTERNS[number], ripple=0.01)
+        truth = pattern.truth()
+        corners = truth["vertices"][truth["faces"]]
+        facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = 0.5 * np.linalg.norm(facing, axis=-1)
+        assert area.sum() == pytest.approx(pattern.width * pattern.height, rel=0.02)
+        facing /= 2 * area[:, None]
+        # the normal turns by ripple (3 pi / width)^2 cell within a square
+        turn = 0.01 * (3 * math.pi / pattern.width) ** 2 * pattern.grid().cell
+        assert np.abs(facing - truth["normals"][truth["faces"][:, 0]]).max() < turn
+        assert (facing @ pattern.normal()).min() > 0.9
+    assert reference.PATTERNS[3].normal() @ [2, 0, 0] == pytest.approx(-2 * math.sin(math.radians(35)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("quality", 20), ("cells", 1), ("frames", 1), ("thickness", 0.0), ("pinned", "right"), ("drag", -1.0)],
+)
+def test_bad_patterns_name_the_field(reference, field, value):
+    with pytest.raises(ValueError, match=f"`{field}`"):
+        replace(reference.PATTERNS[1], **{field: value})
+
+
+def test_cells_must_be_squares(reference):
+    with pytest.raises(ValueError, match="`cells`"):
+        replace(reference.PATTERNS[1], height=0.05, cells=30).grid()
+
+
+# ---- files
+
+
+def _motion(reference, pattern, shape):
+    """A motion of which ``shape`` gives the points (V, 3) of a frame, as it would be read."""
+    grid = pattern.grid()
+    rest = pattern.rest(grid.uv())[0]
+    positions = np.stack([shape(rest, frame) for frame in range(pattern.frames)]).astype(np.float32)
+    settings = json.loads(json.dumps(pattern.cloth_settings()))
+    return reference.Cloth(positions, grid.faces(), grid.uv(), grid.columns, grid.rows, settings)
+
+
+def _fake_solver(monkeypatch, reference, calls):
+    def solve(grid, vertices, pins, material, run, report=None):
+        calls.append(run.quality)
+        drift = np.linspace(0, 0.5, run.frames, dtype=np.float32)
+        return vertices.astype(np.float32) + drift[:, None, None] * np.float32([0, 1, 0])
+
+    monkeypatch.setattr(reference, "solve_cloth", solve)
+
+
+def test_motion_is_solved_once_and_says_what_changed(reference, monkeypatch, tmp_path):
+    calls = []
+    _fake_solver(monkeypatch, reference, calls)
+    pattern, path = replace(reference.PATTERNS[2], cells=30, quality=8, frames=4), tmp_path / "flag/cloth.npz"
+    assert reference.solve_pattern(pattern, path)
+    assert not reference.solve_pattern(pattern, path)
+    assert calls == [8]
+    assert [item.name for item in path.parent.iterdir()] == ["cloth.npz"]  # nothing half-written stays
+    motion = reference.read_cloth(path)
+    assert motion.positions.shape == (4, 31 * 21, 3)
+    with np.load(path) as data:
+        assert data["areal_density"] == pytest.approx(0.3)
+        assert data["membrane_stiffness"] == pytest.approx(30)
+        np.testing.assert_allclose(data["gravity"], [0, 0, -9.8])
+        np.testing.assert_allclose(data["flow"], [2.5, 0.5, 0])
+        assert set(json.loads(str(data["units"]))) <= set(data.files)
+        assert str(data["hash"]) == reference.settings_hash(motion.settings)
+        np.testing.assert_array_equal(data["pins"], pattern.pins(motion.uv))
+    changed = replace(pattern, quality=16, drag=1.0)
+    with pytest.raises(ValueError, match=r"`drag` was 1.28 and is now 1.0; `quality` was 8 and is now 16"):
+        reference.solve_pattern(changed, path)
+    assert calls == [8]
+
+
+def test_what_is_no_motion_is_an_error(reference, tmp_path):
+    np.savez(tmp_path / "other.npz", x=1)
+    for name in ("other.npz", "missing.npz"):
+        with pytest.raises(ValueError, match="not the motion of a flag"):
+            reference.read_cloth(tmp_path / name)
+
+
+def test_hash_does_not_depend_on_order(reference):
+    assert reference.settings_hash({"a": 1, "b": 2}) == reference.settings_hash({"b": 2, "a": 1})
+    assert reference.settings_hash({"a": 1}) != reference.settings_hash({"a": 2})
+
+
+# ---- comparing solutions
+
+
+def test_sampling_is_exact_on_every_mesh(reference):
+    """Bilinear functions of the place on the flag are reproduced, so two meshes of one surface are 0 apart."""
+    pattern = replace(reference.PATTERNS[2], frames=2)
+
+    def bent(rest, frame):
+        x, _, z = rest.T
+        return np.stack([x, frame * x * z, z + 0.1 * frame * x], -1)
+
+    coarse, fine = (_motion(reference, replace(pattern, cells=cells), bent) for cells in (6, 30))
+    uv = reference.even_uv(pattern, along=12)
+    assert len(uv) == 12 * 8
+    x, z = uv.T * np.array([[1.2], [0.8]])
+    # a bilinear function is linear along each side of a square: exact on both, to float32
+    np.testing.assert_allclose(coarse.sample(uv)[1], np.stack([x, x * z, z + 0.1 * x], -1), atol=1e-6)
+    found = reference.difference(pattern, coarse, fine, along=12)
+    assert found["chamfer"] < 1e-6
+    assert found["corresponding"] < 1e-6
+
+
+def test_chamfer_distance_of_shifted_lattices(reference):
+    """Across the sheet by d it is d; along it by less than half the spacing too; order does not matter."""
+    grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(7.0), [0.0], indexing="ij"), -1).reshape(-1, 3)
+    for shift in ([0, 0, 0.7], [0.3, 0, 0]):
+        moved = (grid + shift)[::-1]
+        assert reference.chamfer_distance(grid, moved) == pytest.approx(np.linalg.norm(shift))
+    # one point against two: mean of 1 and (1 + 3) / 2
+    assert reference.chamfer_distance(np.zeros((1, 3)), np.array([[1.0, 0, 0], [0, 3.0, 0]])) == pytest.approx(1.5)
+
+
+def test_difference_is_a_share_of_the_longer_side(reference):
+    pattern = replace(reference.PATTERNS[3], cells=20, frames=3)
+    still = _motion(reference, pattern, lambda rest, frame: rest)
+    moving = _motion(reference, pattern, lambda rest, frame: rest + frame * 0.01 * pattern.normal())
+    found = reference.difference(pattern, still, moving, along=20)
+    np.testing.assert_allclose(found["chamfer_per_frame"], [0, 0.005, 0.01], atol=1e-6)  # over 2 m
+    assert found["chamfer"] == pytest.approx(0.005, abs=1e-6)
+    assert found["corresponding"] == pytest.approx(0.005, abs=1e-6)
+    with pytest.raises(ValueError, match="as many frames"):
+        reference.difference(pattern, still, replace(moving, positions=moving.positions[:2]))
+
+
+def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, tmp_path):
+    calls = []
+    _fake_solver(monkeypatch, reference, calls)
+    pattern = replace(reference.PATTERNS[1], cells=30, quality=8, frames=3)
+    lines = []
+    tool.make_uncertainty(pattern, tmp_path, list(reference.VARIANTS), lines.append, every=1, along=20)
+    written = json.loads((tmp_path / "uncertainty.json").read_text())
+    assert {name: (row["cells"], row["quality"]) for name, row in written["variants"].items()} == {
+        "steps doubled": (30, 16),
+        "coarser": (15, 8),
+        "finer": (45, 8),
+    }
+    # the fake moves them alike; what is left is the ripple between the vertices of a coarser mesh, a (k cell)^2 / 8
+    bound = 0.003 * (3 * math.pi / 15) ** 2 / 8 / 1.2
+    assert all(row["chamfer"] <= 1.5 * bound for row in written["variants"].values())
+    assert written["variants"]["steps doubled"]["chamfer"] == 0
+    assert calls == [8, 16, 8, 8]
+    tool.make_uncertainty(pattern, tmp_path, ["coarser"], lines.append, along=20)
+    assert len(calls) == 4
+
+
+# ---- cameras
+
+
+def _seen(fields_path, frame, points):
+    """Pixels at which a camera of this package sees points."""
+    camera = TransformsCamera(fields_path, frame)(0, 0.0, torch.zeros(3, dtype=torch.float64), torch.zeros(3), 1.0)
+    local = points @ camera.world_to_camera[:3, :3].T.numpy() + camera.world_to_camera[:3, 3].numpy()
+    image = local @ camera.intrinsics.numpy().T
+    return image[:, :2] / image[:, 2:], local[:, 2]
+
+
+def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, tmp_path):
+    """All corners are in every image, at the pixels that the camera in transforms.json gives."""
+    pattern = reference.PATTERNS[3]
+    views = reference.sphere_views(pattern, 40, 100)
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(reference.transforms_fields(views, [f"{i}.png" for i in range(40)])))
+    corners = pattern.rest(np.array([[0.0, 0], [0, 1], [1, 0], [1, 1]]))[0]
+    rays = []
+    for index, view in enumerate(views):
+        pixels, depth = _seen(path, index, corners)
+        np.testing.assert_allclose(pixels, view.project(corners), atol=1e-3)  # the package reads in float32
+        assert (depth > 0).all()
+        assert pixels.min() > 0
+        assert pixels.max() < 100
+        rays.append(view.pose[:3, 3] - pattern.center())
+        np.testing.assert_allclose(view.pose[:3, :3] @ view.pose[:3, :3].T, np.eye(3), atol=1e-12)
+    rays = np.array(rays) / np.linalg.norm(rays, axis=1, keepdims=True)
+    assert np.abs(rays.mean(0)).max() < 0.02  # even over the sphere
+    assert np.linalg.eigvalsh(rays.T @ rays / 40) == pytest.approx([1 / 3] * 3, abs=0.03)
+
+
+def test_reference_camera_looks_along_the_normal_and_holds_the_motion(reference, tmp_path):
+    pattern = replace(reference.PATTERNS[3], cells=20, frames=5)
+    motion = _motion(reference, pattern, lambda rest, t: rest + t * np.array([0.3, -0.2, -0.4]))
+    view = reference.reference_view(pattern, motion.positions, 320, 180)
+    np.testing.assert_allclose(view.pose[:3, 2], pattern.normal(), atol=1e-12)
+    (tmp_path / "camera.json").write_text(json.dumps(reference.transforms_fields([view], ["x.png"])))
+    pixels, depth = _seen(tmp_path / "camera.json", 0, motion.positions.reshape(-1, 3).astype(np.float64))
+    assert (depth > 0).all()
+    margin = np.minimum(pixels.min(0), [320, 180] - pixels.max(0))
+    assert margin.min() > 0
+    assert margin.min() < 0.1 * 180  # and no further away than it needs to be
+
+
+def test_frames_come_every_tenth_first(reference):
+    order = reference.frame_order(25)
+    assert order[:5] == [0, 10, 20, 1, 2]
+    assert sorted(order) == list(range(25))
+
+
+def test_textures_are_the_same_every_time_and_the_right_way_up(reference, tmp_path):
+    flag = reference.PATTERNS[2]
+    drawn = reference.draw_texture(flag, width=60)
+    assert drawn.shape == (40, 60, 3)
+    np.testing.assert_allclose(drawn[0, 0], [0.83, 0.30, 0.18], atol=1e-6)  # the upper band
+    np.testing.assert_allclose(drawn[20, 30], [0.93, 0.68, 0.20], atol=1e-6)  # the disc
+    np.testing.assert_array_equal(drawn, reference.draw_texture(flag, width=60))
+    assert np.ptp(reference.draw_texture(reference.PATTERNS[1])) == 0
+    from imageio.v3 import imwrite
+
+    imwrite(tmp_path / "own.png", np.full((3, 5, 3), 51, dtype=np.uint8))
+    own = reference.draw_texture(replace(flag, texture=str(tmp_path / "own.png")))
+    np.testing.assert_allclose(own, 0.2, atol=1e-6)
+    with pytest.raises(ValueError, match="Cannot read the texture"):
+        reference.draw_texture(replace(flag, texture=str(tmp_path / "none.png")))
+
+
+# ---- pictures and resuming
+
+
+class _FakeStudio:
+    """Writes a small picture for each photograph, and can be cut off."""
+
+    left = 1000
+
+    def __init__(self, *given, **named):
+        pass
+
+    def move(self, vertices):
+        pass
+
+    def photograph(self, view, path):
+        from imageio.v3 import imwrite
+
+        if _FakeStudio.left == 0:
+            raise KeyboardInterrupt
+        _FakeStudio.left -= 1
+        imwrite(path, np.zeros((view.height, view.width, 4), dtype=np.uint8))
+
+
+@pytest.fixture
+def small(tool, reference, monkeypatch, tmp_path):
+    """Everything at its smallest, without Blender: pattern, folder and pictures."""
+    _fake_solver(monkeypatch, reference, [])
+    monkeypatch.setattr(tool, "Studio", _FakeStudio)
+    monkeypatch.setattr(_FakeStudio, "left", 1000)
+    pattern = replace(reference.PATTERNS[2], cells=12, quality=8, frames=12)
+    reference.solve_pattern(pattern, tmp_path / "cloth.npz")
+    return pattern, tmp_path, tool.Pictures(size=(32, 18), samples=1, views=9, view_size=16)
+
+
+def test_training_views_are_a_capture_and_are_continued(tool, small, monkeypatch):
+    pattern, folder, pictures = small
+    monkeypatch.setattr(_FakeStudio, "left", 4)
+    with pytest.raises(KeyboardInterrupt):
+        tool.make_train(pattern, folder / "train", pictures, lambda line: None)
+    assert not (folder / "train/transforms.json").exists()
+    monkeypatch.setattr(_FakeStudio, "left", 1000)
+    assert tool.make_train(pattern, folder / "train", pictures, lambda line: None) == 5
+    assert tool.make_train(pattern, folder / "train", pictures, lambda line: None) == 0
+    capture = read_capture(folder / "train")
+    assert len(capture.views) == 9
+    assert tuple(capture.views[0].load().shape) == (16, 16, 4)
+    with pytest.raises(ValueError, match="`samples` was 1 and is now 2"):
+        tool.make_train(pattern, folder / "train", replace(pictures, samples=2), lambda line: None)
+
+
+def test_video_is_continued_and_joined_at_its_end(tool, small):
+    pattern, folder, pictures = small
+    cloth, video = folder / "cloth.npz", folder / "video"
+    assert tool.make_video(pattern, cloth, video, replace(pictures, every=10), lambda line: None) == 2
+    assert sorted(item.name for item in (video / "frames").iterdir()) == ["0000.png", "0010.png"]
+    assert not (video / "reference.mp4").exists()
+    assert tool.make_video(pattern, cloth, video, pictures, lambda line: None) == 10
+    from imageio.v2 import get_reader
+
+    with get_reader(video / "reference.mp4") as film:
+        assert film.get_meta_data()["fps"] == 25
+        assert film.count_frames() == 12
+    camera = json.loads((video / "camera.json").read_text())
+    assert (camera["w"], camera["h"], camera["fps"]) == (32, 18, 25)
+    np.testing.assert_allclose(camera["light"]["direction"], pattern.normal())
+    with pytest.raises(ValueError, match="`size` was"):
+        tool.make_video(pattern, cloth, video, replace(pictures, size=(64, 36)), lambda line: None)
+
+
+def test_truth_is_written_as_mesh_and_arrays(tool, small):
+    from plyfile import PlyData
+
+    pattern, folder, _ = small
+    tool.make_truth(pattern, folder)
+    with np.load(folder / "truth.npz") as data:
+        assert data["area"] == pytest.approx(0.96)
+        truth = {name: data[name] for name in data.files}
+    mesh = PlyData.read(folder / "mesh.ply")
+    normals = np.stack([mesh["vertex"][name] for name in ("nx", "ny", "nz")], -1)
+    np.testing.assert_allclose(normals, truth["normals"], atol=1e-6)
+    assert len(mesh["face"].data) == 2 * 12 * 8 == len(truth["faces"])
+
+
+# ---- command line
+
+
+def test_without_blender_one_sentence_names_the_extra(tool, monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, "bpy", None)
+    assert tool.main(["--preview", "--out", str(tmp_path / "flags")]) == 1
+    said = capsys.readouterr().err
+    assert "gaussian-swaying[blender]" in said
+    assert len(said.strip().splitlines()) == 1
+    assert not (tmp_path / "flags").exists()
+
+
+def test_options_reach_the_flag_and_the_pictures(tool, reference):
+    shape = ["--cells", "60", "--frames", "50", "--flag-size", "0.6", "0.4", "--texture", "white", "--drag", "0.5"]
+    options = tool.parse([*shape, "--size", "640x360", "--samples", "4"])
+    flag, pictures = tool.flag_of(2, options), tool.pictures_of(options)
+    assert (flag.cells, flag.frames, flag.width, flag.height) == (60, 50, 0.6, 0.4)
+    assert (flag.texture, flag.drag) == ("white", 0.5)
+    assert flag.quality == reference.least_quality(flag) == 64  # half the size and half the cells: the same cell
+    assert (pictures.size, pictures.samples, pictures.views) == ((640, 360), 4, 200)
+    default = tool.parse([])
+    for number in (1, 2, 3):
+        assert tool.flag_of(number, default) == reference.PATTERNS[number]
+    assert tool.pictures_of(default) == tool.Pictures()
+    preview = tool.parse(["--preview", "--views", "3"])
+    assert tool.pictures_of(preview) == replace(tool.PREVIEW, views=3)
+    assert tool.flag_of(1, preview).cells == 30
+    with pytest.raises(ValueError, match="`samples`"):
+        tool.pictures_of(tool.parse(["--samples", "0"]))
+
+
+def test_bad_options_are_one_sentence(tool, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tool, "require_bpy", lambda: None)
+    assert tool.main(["--pattern", "1", "--quality", "20", "--out", str(tmp_path / "flags")]) == 1
+    assert "`quality`" in capsys.readouterr().err
+    assert not (tmp_path / "flags").exists()
+
+
+# ---- with Blender
+
+
+def test_blender_gives_the_same_motion_twice_and_falls_as_it_should(reference, cloth):
+    pytest.importorskip("bpy", reason="needs the extra [blender]")
+    pattern = replace(reference.PATTERNS[2], cells=12, quality=8, frames=6)
+    grid = pattern.grid()
+    rest, pins = pattern.rest(grid.uv())[0], pattern.pins(grid.uv())
+    one, other = (cloth.solve_cloth(grid, rest, pins, pattern.material(), pattern.run()) for _ in range(2))
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(one[0], rest, atol=1e-6)
+    np.testing.assert_allclose(one[:, pins], np.broadcast_to(rest[pins], one[:, pins].shape), atol=1e-6)
+    assert np.abs(one[-1] - rest).max() > 0.01
+
+
+def test_relations_hold_on_panels(tool):
+    """One mesh. Discretisation: a first-order step in the wind, a finite strain of about 1 % in the panel."""
+    pytest.importorskip("bpy", reason="needs the extra [blender]")
+    found = tool.check_relations(fine=None)
+    ratios = {row["name"]: row["ratio"] for row in found["checks"]}
+    for name, ratio in ratios.items():
+        assert ratio == pytest.approx(1.0, abs=1e-3 if name.startswith("gravity") else 0.08), name
+
+
+def test_photograph_shows_the_flag_where_the_camera_says(tool, reference, tmp_path):
+    """White cloth across the light has its own value; alpha ends where the corners are projected to."""
+    pytest.importorskip("bpy", reason="needs the extra [blender]")
+    from imageio.v3 import imread
+
+    images = sys.modules["blender_images"]
+    pattern = replace(reference.PATTERNS[1], cells=12, quality=8, frames=2)
+    pictures = tool.Pictures(samples=4, views=1, view_size=120)
+    lamps = np.stack([reference.lamp_position(pattern, side) for side in (1, -1)])
+    studio = tool._studio(pattern, reference.draw_texture(pattern), lamps, pictures, True)
+    studio.move(pattern.rest(pattern.grid().uv())[0])
+    for side in (1, -1):
+        eye = pattern.center() + side * 2.3 * pattern.normal() + [0.2, 0, 0.3]
+        view = images.View(images.look_at(eye, pattern.center()), 0.7, 120, 90)
+        studio.photograph(view, tmp_path / "view.png")
+        image = imread(tmp_path / "view.png")
+        assert image.shape == (90, 120, 4)
+        assert np.median(image[40:50, 50:70, :3]) == pytest.approx(0.9 * 255, abs=5)
+        corners = view.project(pattern.rest(np.array([[0.0, 0], [0, 1], [1, 0], [1, 1]]))[0])
+        rows, columns = np.nonzero(image[..., 3] > 127)
+        found = [columns.min(), columns.max() + 1, rows.min(), rows.max() + 1]
+        expected = [corners[:, 0].min(), corners[:, 0].max(), corners[:, 1].min(), corners[:, 1].max()]
+        np.testing.assert_allclose(found, expected, atol=1.0)

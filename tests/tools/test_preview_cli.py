@@ -1,0 +1,154 @@
+"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.simulation import config
+from gaussian_swaying.simulation.preview_cli import main
+
+ROOT = Path(__file__).parents[2]
+FLAG = ROOT / "configs/sim/flag.yaml"
+
+
+@pytest.fixture
+def splat(tmp_path):
+    path = tmp_path / "flag.ply"
+    write_ply(path, FlagScene(spacing=0.08).generate())
+    return path
+
+
+def preview(splat, output, *options):
+    scene = [] if splat is None else [str(splat)]
+    return main([*scene, "--output", str(output), "--device", "cpu", "--height", "96", *options])
+
+
+def check_refused(splat, tmp_path, capsys, *options, words):
+    capsys.readouterr()
+    before = sorted(tmp_path.rglob("*"))
+    assert preview(splat, tmp_path / "out", *options) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert words in error, error
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_starter_runs_unchanged(splat, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert preview(splat, out, "--frames", "3") == 0
+    report = capsys.readouterr().out
+    assert sorted(path.name for path in out.iterdir()) == ["preview.json", "preview.png", "starter.yaml"]
+    data = json.loads((out / "preview.json").read_text())
+    assert data["suggestion"]["up"]["direction"] == [0, 0, 1]
+    assert data["suggestion"]["hold"]["end"] == "side"
+    assert data["run"]["held"] == 30  # three columns of ten
+    assert data["cost"]["frames"] == 3
+    for words in ("150 Gaussians", "confidence medium", "dx = 0.14 m", f"--config {out / 'starter.yaml'}"):
+        assert words in report
+    assert "a floor" not in report
+    small = ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--recorder.video", "false"]
+    assert config.main(["--config", str(out / "starter.yaml"), "--output", str(tmp_path / "run"), *small]) == 0
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert summary["frames"] == 3
+    assert summary["lost_particles"] == 0
+    assert summary["displacement_mean_max_m"] > 1e-4
+
+
+def test_edited_starter_is_kept(splat, tmp_path):
+    out = tmp_path / "out"
+    for change in ("", "# mine\n", "# mine too\n"):
+        if change:
+            (out / "starter.yaml").write_text(change)
+        assert preview(splat, out) == 0
+    assert (out / "starter.1.yaml").read_text() == "# mine\n"
+    assert (out / "starter.2.yaml").read_text() == "# mine too\n"
+    assert preview(splat, out) == 0  # the same again: nothing to keep
+    assert not (out / "starter.3.yaml").exists()
+
+
+def test_options_replace_guesses(splat, tmp_path, capsys):
+    assert preview(splat, tmp_path / "a", "--up", "-y", "--hold", "+x", "--longest-side", "2") == 0
+    found = json.loads((tmp_path / "a/preview.json").read_text())["suggestion"]
+    assert found["up"]["direction"] == [0, -1, 0]
+    assert found["hold"]["direction"] == [1, 0, 0]
+    assert found["longest_side_m"] == 2
+    starter = yaml.safe_load((tmp_path / "a/starter.yaml").read_text())
+    assert starter["scene"]["up"] == [0, -1, 0]
+    assert "given" in capsys.readouterr().out
+    assert preview(splat, tmp_path / "b", "--up", "0", "-1", "0.5", "--region", "0", "-1", "0", "0.6", "1", "1") == 0
+    other = json.loads((tmp_path / "b/preview.json").read_text())
+    assert other["suggestion"]["up"]["direction"][2] == pytest.approx(0.2**0.5)
+    assert other["run"]["simulated"] == 80  # 8 of 15 columns of 10
+
+
+def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
+    options = ["--config", str(FLAG)]
+    assert preview(splat, tmp_path / "out", *options) == 2  # its pole is thinner than this flag's spacing
+    assert "holds no particle" in capsys.readouterr().err
+    mine = tmp_path / "mine.yaml"
+    pin = {"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {
+        "min": [None] * 3, "max": [0.1, None, None]}}}}  # fmt: skip
+    mine.write_text(yaml.safe_dump({"scene": {"region": {"class_path": "Box", "init_args": {
+        "min": [None] * 3, "max": [None, None, 0.5]}}}, "frames": 7, "solver": {"dx": 0.2, "boundaries": [pin]},
+        "wind": {"flow": [1.0, 2.0, 0.0]}, "recorder": {"images": False, "video": False}}))  # fmt: skip
+    assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
+    report = capsys.readouterr().out
+    data = json.loads((tmp_path / "out/preview.json").read_text())
+    assert data["run"]["simulated"] == 15 * 6
+    assert data["run"]["held"] == 6
+    assert data["run"]["flow"] == [1, 2, 0]
+    assert data["cost"]["frames"] == 7
+    assert data["cost"]["picture_seconds"] is None
+    assert "PinnedRegion: 6 particles" in report
+    assert not (tmp_path / "out/starter.yaml").exists()
+
+
+def test_normalised_space_is_honoured(splat, tmp_path):
+    """The pole side of the flag lies at x = 0.5 where the longest side is 1 and the centre at 1."""
+    pin = {"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": {
+        "min": [0.49, 0, 0], "max": [0.52, 2, 2]}}}}  # fmt: skip
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(yaml.safe_dump({"normalisation": {"scale": 1.0}, "solver": {"dx": 0.15, "boundaries": [pin]}}))
+    assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
+    assert json.loads((tmp_path / "out/preview.json").read_text())["run"]["held"] == 10
+
+
+def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
+    broken = tmp_path / "broken.ply"
+    broken.write_text("not a splat")
+    typo = tmp_path / "typo.yaml"
+    typo.write_text("solver:\n  dxx: 1\n")
+    for scene, options, words in (
+        (tmp_path / "none.ply", [], "none.ply"),
+        (broken, [], "broken.ply"),
+        (None, [], "give SCENE.ply"),
+        (splat, ["--up", "sideways"], "`--up`"),
+        (splat, ["--up", "0", "1"], "`--up`"),
+        (splat, ["--up", "0", "0", "0"], "`--up`"),
+        (splat, ["--up", "a", "b", "c"], "`--up`"),
+        (splat, ["--hold", "left"], "`--hold`"),
+        (splat, ["--region", "5", "5", "5", "6", "6", "6"], "`--region`"),
+        (splat, ["--region", "5", "5", "5", "4", "6", "6"], "`min` to be below `max`"),
+        (splat, ["--longest-side", "-1"], "`--longest-side`"),
+        (splat, ["--wind", "nan"], "`--wind`"),
+        (splat, ["--frames", "0"], "`--frames`"),
+        (splat, ["--height", "7"], "`--height`"),
+        (splat, ["--config", str(typo)], "dxx"),
+        (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
+    ):
+        check_refused(scene, tmp_path, capsys, *options, words=words)
+
+
+def test_script_answers_help():
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "tools/preview.py"), "--help"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert "--up" in done.stdout

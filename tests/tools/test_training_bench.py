@@ -1,0 +1,85 @@
+"""The page of the training benchmark says what the JSON says."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def training(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import training
+
+    yield training
+    sys.modules.pop("training", None)
+
+
+def _row(**values):
+    base = {"psnr_db": 25.0, "ssim": 0.8, "gaussians": 1000, "seconds": 40.0, "memory_bytes": 2**29, "steps": 7000}
+    return base | values
+
+
+def _result(**sections):
+    return {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0} | sections
+
+
+def test_goals_are_judged_from_the_medians(training):
+    pair = {
+        "bare": [_row(), _row(seconds=44.0), _row(seconds=39.0, psnr_db=25.2)],
+        "lightning": [_row(seconds=43.9, psnr_db=24.95), _row(seconds=43.0, psnr_db=24.8), _row(seconds=60.0)],
+    }
+    found = {goal: (value, reached) for goal, value, reached in training.goals(_result(pair=pair))}
+    assert found["capture: test PSNR within 0.1 dB of the bare loop"] == ("-0.05 dB", True)
+    assert found["capture: at most 1.10 times the time of the bare loop"] == ("1.10 times", True)
+    assert found["capture: GPU memory within 1 GiB"] == ("0.50 GiB", True)
+    pair["lightning"] = [_row(seconds=44.1, psnr_db=24.89, memory_bytes=2**31)]
+    assert [reached for _, _, reached in training.goals(_result(pair=pair))] == [False, False, False]
+    variants = {"mcmc": _row(psnr_db=25.4), "absgrad": {"failed": "x"}, "surface": _row(psnr_db=24.0)}
+    best = training.goals(_result(pair=pair, variants=variants))[3]
+    assert best[1:] == ("+0.40 dB (MCMC, 300,000 Gaussians)", True)
+
+
+def test_the_page_shows_every_row_that_did_not_fail(training):
+    quality = {
+        "round_share": 0.9,
+        "decided_share": 0.8,
+        "small_share": 0.7,
+        "angle_median_deg": 4.0,
+        "angle_p90_deg": 9,
+    }
+    quality |= {"distance_median_m": 1e-3, "distance_p90_m": 2e-3, "area_paper_ratio": 2.0, "area_coverage_ratio": 1.1}
+    flag = {"flag:size": _row(**quality, steps=30_000), "flag:none": {"failed": "x"}}
+    text = "\n".join(training.page([_result(flag=flag, variants={"mcmc": _row(), "surface": {"failed": "x"}})]))
+    assert (
+        "| + size (all) | 90.0 % | 80.0 % | 70.0 % | 4.0, 9.0 | 1.00, 2.00 | 2.00 | 1.10 | 25.00 | 1,000 | 40 |" in text
+    )
+    assert "training_flag_size.png" in text
+    assert "training_flag_none.png" not in text
+    assert "| all surface losses, paper's weights | failed |" in text
+    assert "| flag, all losses: PSNR of 35 dB | 25.0 dB | no |" in text
+
+
+def test_every_run_is_a_command_line_that_parses(training, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, (_, more) in training.FOX_VARIANTS.items():
+        cli = training.make_cli(
+            [*training._arguments("fox", more, 10, tmp_path), "--trainer.accelerator=cpu"], run=False
+        )
+        surface = [cli.model.loss.weights[term] for term in ("anisotropy", "entropy", "size")]
+        assert surface == ([10.0, 0.01, 0.01] if name == "surface" else [0.0, 0.0, 0.0])
+    for name, (_, weights) in training.FLAG_ROWS.items():
+        more = training._weights(**weights)
+        cli = training.make_cli(
+            [*training._arguments("flag", more, 10, tmp_path), "--trainer.accelerator=cpu"], run=False
+        )
+        used = set(cli.model.loss.terms) - {"rgb"}
+        assert len(used) == list(training.FLAG_ROWS).index(name)
+
+
+def test_a_run_of_its_own_fails_with_its_message(training, tmp_path):
+    found = {}
+    training.run_apart([("bare", str(tmp_path / "none"), 3, None)], tmp_path, 2, found.__setitem__)
+    assert "does not exist" in found["bare"]["failed"]

@@ -1,0 +1,127 @@
+"""The relations between Blender's cloth settings and SI units, measured on panels whose answers are known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from blender_cloth import POISSON_RATIO, ClothMaterial, ClothRun, Grid, require_bpy, solve_cloth
+
+SHEET = ClothMaterial(areal_density=0.3, membrane=30.0, bending=2.75e-4)
+AIR_DENSITY, DRAG = 1.225, 1.28
+NOTHING = np.empty(0, dtype=np.int64)
+
+
+def _row(name: str, measured: float, expected: float, unit: str, means: str) -> dict[str, Any]:
+    return {
+        "name": name,
+        "measured": measured,
+        "expected": expected,
+        "ratio": measured / expected,
+        "unit": unit,
+        "expected_from": means,
+    }
+
+
+def free_fall(cell: float, quality: int) -> dict[str, Any]:
+    """Acceleration of a panel that nothing holds."""
+    grid = Grid(20 * cell, 20 * cell, 20, 20)
+    run = ClothRun(frames=12, quality=quality)
+    height = solve_cloth(grid, grid.flat(), NOTHING, SHEET, run)[..., 2].astype(np.float64).mean(1)
+    measured = -np.diff(height, 2)[1:].mean() * run.fps**2
+    return _row(f"gravity, free fall, {cell} m cells", float(measured), run.gravity, "m/s^2", "gravity")
+
+
+def hanging_panel(cell: float, quality: int, shear: bool = True) -> list[dict[str, Any]]:
+    """Stretch of a panel under its own weight, held by its upper edge, and how much narrower it gets."""
+    columns, rows, gravity = round(0.4 / cell), round(0.8 / cell), 2.0
+    grid = Grid(columns * cell, rows * cell, columns, rows)
+    material = replace(SHEET, air_rate=20.0, shear=shear)
+    run = ClothRun(frames=75, quality=quality, gravity=gravity)
+    pins = np.flatnonzero(grid.uv()[:, 1] > 1 - 1e-9)
+    last = solve_cloth(grid, grid.flat(), pins, material, run)[-1].astype(np.float64)
+    last = last.reshape(columns + 1, rows + 1, 3)
+    strain = np.diff(last[:, :, 2].mean(0)) / grid.cell - 1
+    lower = slice(2, rows // 2)  # well away from the edge that cannot get narrower
+    # a row of squares carries the rows of vertices below it; summed over all, that is rho g L^2 / 2E
+    carried = material.areal_density * grid.height * gravity * np.arange(1, rows + 1) / (rows + 1)
+    measured = carried[lower].sum() / strain[lower].sum()
+    # a section across has one spring more than squares, which the mesh counts as the mean of both directions
+    expected = material.membrane * (1 + 1 / columns) / grid.rim
+    kind = f"{cell} m cells" + ("" if shear else ", no shear springs")
+    result = [_row(f"E h, hanging panel, {kind}", measured, expected, "N/m", "stretch under its weight")]
+    if shear:
+        width = np.diff(last[[0, -1], :, 0], axis=0)[0] / grid.width - 1
+        ratio = -0.5 * (width[:-1] + width[1:])[lower].sum() / strain[lower].sum()
+        result.append(_row(f"Poisson's ratio, hanging panel, {kind}", ratio, POISSON_RATIO, "1", "isotropic lattice"))
+    return result
+
+
+def wind(cell: float, quality: int, speed: float = 2.0, incidence: float = 90.0) -> list[dict[str, Any]]:
+    """Pressure on a free panel without gravity, and the speed that it reaches (not where it would turn)."""
+    grid = Grid(20 * cell, 20 * cell, 20, 20)
+    angle = math.radians(incidence)
+    flow = (speed * math.cos(angle), speed * math.sin(angle), 0.0)
+    pressure = 0.5 * AIR_DENSITY * DRAG * speed**2
+    turns = incidence != 90.0
+    run = ClothRun(frames=5 if turns else 40, quality=quality, gravity=0.0, flow=flow, pressure=pressure)
+    place = solve_cloth(grid, grid.flat(), NOTHING, SHEET, run).astype(np.float64).mean(1)
+    velocity = np.diff(place[:, 1]) * run.fps
+    # sigma dv/dt = p (sin a - v / U): v = U sin a (1 - exp(-t / tau)), tau = sigma U / p
+    ends = speed * math.sin(angle)
+    rate = -np.diff(np.log(1 - velocity[:4] / ends)).mean() * run.fps
+    if turns:  # the rate tells the slope with v; the pressure at rest is that of the first frame
+        through = 1 - math.exp(-1 / (run.fps * SHEET.areal_density * speed / pressure))
+        share = 1 - through * SHEET.areal_density * speed / pressure * run.fps
+        rate = velocity[0] / (ends * share) * pressure / (SHEET.areal_density * speed)
+    measured = float(rate * SHEET.areal_density * ends)
+    kind = f"{cell} m cells, {incidence:g} degrees"
+    expected = pressure * math.sin(angle)
+    rows = [_row(f"pressure, {kind}", measured, expected, "Pa", "1/2 rho C U^2 sin(incidence)")]
+    if not turns:
+        rows.append(_row(f"speed reached, {kind}", float(velocity[-1]), ends, "m/s", "flow"))
+    return rows
+
+
+def cantilever(cell: float, quality: int) -> dict[str, Any]:
+    """Sag of a level strip that is clamped at one end."""
+    columns, rows, gravity = round(0.16 / cell), round(0.08 / cell), 0.2
+    grid = Grid(columns * cell, rows * cell, columns, rows)
+    flat = grid.flat()[:, [0, 2, 1]]  # in the x-y plane
+    material = replace(SHEET, air_rate=4.0, shear=False)
+    run = ClothRun(frames=125, quality=quality, gravity=gravity)
+    pins = np.flatnonzero(flat[:, 0] < 1.5 * cell)  # two rows
+    last = solve_cloth(grid, flat, pins, material, run)[-1].astype(np.float64).reshape(columns + 1, rows + 1, 3)
+    sag = -last[-1, :, 2].mean()
+    # squares on hinges, the first at the clamp: each turns by its moment over D / cell, and lowers the end by its arm
+    arm = cell * np.arange(columns - 1, 0, -1)
+    weight = material.areal_density * grid.width / (columns + 1) * gravity  # of a row of vertices, per length across
+    moment = np.array([weight * arm[k:][::-1].sum() for k in range(len(arm))])
+    measured = (moment * arm).sum() * cell / sag
+    return _row(f"D, cantilever, {cell} m cells", float(measured), material.bending, "N m", "sag of a chain of hinges")
+
+
+def check_relations(
+    coarse: tuple[float, int] = (0.02, 16), fine: tuple[float, int] | None = (0.01, 64)
+) -> dict[str, Any]:
+    """Measure all relations.
+
+    Args:
+        coarse: Cell [m] and steps a frame.
+        fine: The same of a second mesh, or None.
+
+    Returns:
+        ``blender``, its version, and ``checks``, a list with ``name``, ``measured``, ``expected``, ``ratio``, ``unit``
+        and ``expected_from``.
+    """
+    rows: list[dict[str, Any]] = []
+    for cell, quality in filter(None, (coarse, fine)):
+        rows.append(free_fall(cell, quality))
+        rows += hanging_panel(cell, quality)
+        rows += wind(cell, quality)
+        rows.append(cantilever(cell, quality))
+    rows += hanging_panel(*coarse, shear=False)
+    rows += wind(coarse[0], 4 * coarse[1], incidence=35.0)  # read from the first frame: it needs short steps
+    return {"blender": require_bpy().app.version_string, "checks": rows}

@@ -1,0 +1,305 @@
+"""Blender's cloth solver in SI units: what ``tools/make_flag_dataset.py`` asks it, and the relations it is asked with.
+
+This is the only file that runs the solver; ``bpy`` is imported when a cloth is solved. The relations between
+Blender's settings and SI units are measured (``make_flag_dataset.py --check`` measures them again), since Blender
+documents none of them. Blender's cloth counts time in frames: a stiffness in its units is one in N/m divided by fps².
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+LATTICE = 4 / 3
+"""E h over the stiffness of a spring, in a square lattice whose diagonals have half the stiffness of its sides: the
+value of isotropic lattices, and the measured one once the rim is counted (see ``Grid.rim``)."""
+
+BENDING = 0.0505
+"""Bending stiffness D [N m] over ``bending_stiffness`` x edge² x fps², measured on a cantilever taken as what it is: a
+chain of stiff squares on hinges, the first at the clamp. Taken as a continuous beam, which ten squares are not, the
+same sag gives 0.040 to 0.044."""
+
+POISSON_RATIO = 1 / 3
+"""Poisson's ratio of that lattice, which no setting changes; measured 0.33 to 0.34."""
+
+BENDING_LIMIT = 1.25
+"""Blender's bending is explicit: ``bending_number`` must stay below this; above 1.66 the motion is wrong."""
+
+SPRING_TIME = 2.2e-3
+"""Damping of a membrane spring over its stiffness [s]: what Blender's defaults amount to on flags of 2 cm cells."""
+
+BENDING_DAMPING = 0.5 / 0.3
+"""``bending_damping`` over vertex mass: Blender's defaults for the mass that they assume. It is explicit too: over
+vertex mass and quality, 0.4 crumpled a flag of 1 cm cells at the scale of its mesh, 0.1 and less did not."""
+
+
+def require_bpy() -> Any:
+    """Import ``bpy``.
+
+    Raises:
+        ImportError: If it is not there; the message names the extra.
+    """
+    try:
+        import bpy
+    except ImportError as error:
+        raise ImportError(
+            "The flag data set needs Blender as a Python module: install it with "
+            "`pip install 'gaussian-swaying[blender]'`, under Python 3.11."
+        ) from error
+    return bpy
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A rectangular cloth as a mesh of squares in the x-z plane.
+
+    Vertex ``i * (rows + 1) + j`` stands at x = i cell, z = j cell.
+
+    Attributes:
+        width: Length along x [m].
+        height: Length along z [m].
+        columns: Number of squares along x.
+        rows: Number of squares along z.
+    """
+
+    width: float
+    height: float
+    columns: int
+    rows: int
+
+    @classmethod
+    def of_cells(cls, width: float, height: float, cells: int) -> Grid:
+        """The mesh with ``cells`` squares along the longer side.
+
+        Raises:
+            ValueError: If the shorter side is not a whole number of squares, to 5 %.
+        """
+        cell = max(width, height) / cells
+        columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
+        if abs(height / rows / (width / columns) - 1) > 0.05:
+            raise ValueError(
+                f"Expected `cells` to cut {width} m x {height} m into squares, but {cells} gives cells of "
+                f"{width / columns:.4f} m x {height / rows:.4f} m: choose a number of cells that divides both sides."
+            )
+        return cls(width, height, columns, rows)
+
+    @property
+    def cell(self) -> float:
+        """Side of a square [m]."""
+        return self.width / self.columns
+
+    @property
+    def rim(self) -> float:
+        """How much more springs a section of the sheet has than squares, as the mean of both directions.
+
+        Springs and vertices of the rim are as stiff and heavy as those within. Mass and stiffness are therefore set for
+        the whole sheet, and are lower within by about this factor.
+        """
+        return 1 + 0.5 * (1 / self.columns + 1 / self.rows)
+
+    @property
+    def count(self) -> int:
+        """Number of vertices."""
+        return (self.columns + 1) * (self.rows + 1)
+
+    def uv(self) -> np.ndarray:
+        """Place of each vertex on the cloth, in 0 to 1, float64, shape (V, 2)."""
+        u, v = np.linspace(0, 1, self.columns + 1), np.linspace(0, 1, self.rows + 1)
+        return np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
+
+    def faces(self) -> np.ndarray:
+        """Squares as indices of vertices, turned so that their normal is on the -y side; int64, shape (Q, 4)."""
+        corner = (np.arange(self.columns)[:, None] * (self.rows + 1) + np.arange(self.rows)).reshape(-1)
+        return np.stack([corner, corner + self.rows + 1, corner + self.rows + 2, corner + 1], -1)
+
+    def flat(self) -> np.ndarray:
+        """Vertices [m] of the flat cloth, float64, shape (V, 3)."""
+        u, v = self.uv().T
+        return np.stack([u * self.width, np.zeros_like(u), v * self.height], -1)
+
+
+@dataclass(frozen=True)
+class ClothMaterial:
+    """A sheet in SI units.
+
+    Attributes:
+        areal_density: Mass per area [kg/m²].
+        membrane: Young's modulus times thickness, E h [N/m].
+        bending: Bending stiffness D [N m].
+        spring_time: Damping of a membrane spring over its stiffness [s].
+        shear: Whether the squares have diagonals; without, Poisson's ratio is 0.
+        air_rate: Rate at which every velocity decays [1/s]; only for finding a state of rest.
+    """
+
+    areal_density: float
+    membrane: float
+    bending: float
+    spring_time: float = SPRING_TIME
+    shear: bool = True
+    air_rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class ClothRun:
+    """What is done to a sheet.
+
+    Attributes:
+        frames: Number of frames, of which the first is the rest shape.
+        fps: Frames a second.
+        quality: Steps of the solver a frame.
+        gravity: Along -z [m/s²].
+        flow: Velocity of the air [m/s].
+        pressure: Pressure of the air on a face at rest across the flow [Pa].
+        self_collision: Whether the sheet keeps half a cell away from itself.
+    """
+
+    frames: int
+    fps: int = 25
+    quality: int = 16
+    gravity: float = 9.8
+    flow: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pressure: float = 0.0
+    self_collision: bool = False
+
+
+def bending_number(grid: Grid, material: ClothMaterial, run: ClothRun) -> float:
+    """The number that must stay below ``BENDING_LIMIT``: bending stiffness over vertex mass and quality squared."""
+    settings = blender_settings(grid, material, run)
+    return settings["bending_stiffness"] / (settings["mass"] * run.quality**2)
+
+
+def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict[str, float]:
+    """Blender's settings for a sheet, by the measured relations.
+
+    Args:
+        grid: The mesh.
+        material: What it is made of.
+        run: What is done to it.
+
+    Returns:
+        ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind.
+    """
+    rate2 = run.fps**2
+    mass = material.areal_density * grid.width * grid.height / grid.count  # the same at every vertex, rim or not
+    spring = material.membrane / (grid.rim * (LATTICE if material.shear else 1.0))  # N/m
+    tension = spring * grid.cell / rate2
+    bending = material.bending / (BENDING * grid.cell**2 * rate2)
+    damping = material.spring_time * spring / run.fps
+    speed = math.hypot(*run.flow)
+    field = run.pressure / (0.02 * run.fps)
+    return {
+        "mass": mass,
+        "tension_stiffness": tension,
+        "compression_stiffness": tension,
+        "shear_stiffness": 0.5 * tension if material.shear else 0.0,
+        "bending_stiffness": bending,
+        "tension_damping": damping,
+        "compression_damping": damping,
+        "shear_damping": 0.5 * damping if material.shear else 0.0,
+        "bending_damping": BENDING_DAMPING * mass,
+        "air_damping": material.air_rate * mass / (0.01 * run.fps),
+        "gravity": -1000.0 * run.gravity / rate2,
+        "strength": field,
+        "flow": field / speed if speed else 0.0,
+    }
+
+
+def solve_cloth(
+    grid: Grid,
+    vertices: np.ndarray,
+    pins: Sequence[int] | np.ndarray,
+    material: ClothMaterial,
+    run: ClothRun,
+    report: Any = None,
+) -> np.ndarray:
+    """Let Blender move a sheet.
+
+    Args:
+        grid: Its mesh.
+        vertices: Rest shape [m], in which no spring is stretched; shape (V, 3).
+        pins: Vertices that stay where they are.
+        material: What it is made of.
+        run: What is done to it.
+        report: Called after each frame with its number, from 1.
+
+    Returns:
+        Vertices at each frame [m], float32, shape (frames, V, 3).
+
+    Raises:
+        ImportError: If ``bpy`` is not there.
+        ValueError: If ``quality`` is too low for the bending of this mesh.
+        ArithmeticError: If the solver blew up.
+    """
+    number = bending_number(grid, material, run)
+    if number > BENDING_LIMIT:
+        needed = math.ceil(run.quality * math.sqrt(number / BENDING_LIMIT))
+        raise ValueError(
+            f"Expected `quality` of at least {needed} for cells of {grid.cell:.4f} m and this bending stiffness "
+            f"(Blender's bending is explicit), but got {run.quality}."
+        )
+    bpy = require_bpy()
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.fps = run.fps
+    scene.frame_start, scene.frame_end = 1, run.frames
+    settings = blender_settings(grid, material, run)
+    scene.use_gravity = run.gravity != 0.0
+    scene.gravity = (0.0, 0.0, settings["gravity"])
+
+    mesh = bpy.data.meshes.new("sheet")
+    mesh.from_pydata(np.asarray(vertices, dtype=np.float64).tolist(), [], grid.faces().tolist())
+    sheet = bpy.data.objects.new("sheet", mesh)
+    scene.collection.objects.link(sheet)
+    if settings["strength"]:
+        _add_wind(bpy, scene, run, settings)
+    bpy.context.view_layer.objects.active = sheet
+    modifier = sheet.modifiers.new("cloth", "CLOTH")
+    cloth = modifier.settings
+    cloth.quality, cloth.time_scale = run.quality, 1.0
+    cloth.bending_model = "ANGULAR"
+    for name in settings.keys() - {"gravity", "strength", "flow"}:
+        setattr(cloth, name, settings[name])
+    for name in ("tension", "compression", "shear", "bending"):  # no vertex group scales a stiffness
+        setattr(cloth, f"{name}_stiffness_max", settings[f"{name}_stiffness"])
+    cloth.use_pressure = cloth.use_internal_springs = cloth.use_dynamic_mesh = False
+    modifier.collision_settings.use_collision = False
+    modifier.collision_settings.use_self_collision = run.self_collision
+    modifier.collision_settings.self_distance_min = 0.5 * grid.cell
+    pins = np.asarray(pins, dtype=np.int64)
+    if len(pins):
+        group = sheet.vertex_groups.new(name="pins")
+        group.add(pins.tolist(), 1.0, "REPLACE")
+        cloth.vertex_group_mass = "pins"
+        cloth.pin_stiffness = 1.0
+    modifier.point_cache.frame_start, modifier.point_cache.frame_end = 1, run.frames
+
+    positions = np.empty((run.frames, grid.count, 3), dtype=np.float32)
+    flat = np.empty(grid.count * 3, dtype=np.float32)
+    for frame in range(1, run.frames + 1):
+        scene.frame_set(frame)
+        moved = sheet.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        moved.data.vertices.foreach_get("co", flat)
+        positions[frame - 1] = flat.reshape(-1, 3)
+        if not np.isfinite(flat).all():
+            raise ArithmeticError(f"Blender's cloth blew up in frame {frame}: raise `quality`.")
+        if report:
+            report(frame)
+    return positions
+
+
+def _add_wind(bpy: Any, scene: Any, run: ClothRun, settings: dict[str, float]) -> None:
+    from mathutils import Vector
+
+    bpy.ops.object.effector_add(type="WIND")  # flow, wind factor and shape as needed; forcefield_toggle leaves them 0
+    wind = bpy.context.object
+    wind.rotation_mode = "QUATERNION"
+    wind.rotation_quaternion = Vector((0.0, 0.0, 1.0)).rotation_difference(Vector(run.flow))
+    field = wind.field
+    field.shape, field.falloff_power, field.noise, field.wind_factor = "PLANE", 0.0, 0.0, 1.0
+    field.apply_to_location, field.apply_to_rotation, field.use_absorption = True, True, False
+    field.strength, field.flow = settings["strength"], settings["flow"]
+    bpy.context.view_layer.update()

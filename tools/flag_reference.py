@@ -1,0 +1,562 @@
+"""The three flags of the paper's benchmark as an independent cloth solver sees them, and what their files hold.
+
+Parameters are those of the paper's table; what it leaves open is chosen here and said so. Nothing in this file needs
+Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` puts it together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from blender_cloth import (
+    BENDING_LIMIT,
+    ClothMaterial,
+    ClothRun,
+    Grid,
+    bending_number,
+    blender_settings,
+    solve_cloth,
+)
+from blender_images import View, look_at
+
+UNITS = {
+    "positions": "m",
+    "rest_normals": "1",
+    "uv": "1",
+    "pin_uv": "1",
+    "fps": "1/s",
+    "areal_density": "kg/m^2",
+    "membrane_stiffness": "N/m",
+    "bending_stiffness": "N m",
+    "youngs_modulus": "Pa",
+    "density": "kg/m^3",
+    "thickness": "m",
+    "gravity": "m/s^2",
+    "flow": "m/s",
+    "air_density": "kg/m^3",
+    "pressure": "Pa",
+}
+PINNED = ("left", "corners", "top")
+
+
+@dataclass(frozen=True)
+class FlagPattern:
+    """One flag of the benchmark: what it is made of, how it hangs, and what moves it.
+
+    Seen from the -y side the flag spans ``width`` to the right (x) and ``height`` upwards (z) from the origin; ``yaw``
+    then turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
+
+    Attributes:
+        youngs_modulus: E [Pa]; paper.
+        poisson_ratio: nu; paper. Blender's springs have 0.32 to 0.33.
+        density: [kg/m³]; paper.
+        flow: Velocity of the air [m/s], constant and uniform; paper.
+        pinned: ``left`` edge, ``top`` edge, or three ``corners`` with the lower left one free; paper.
+        texture: ``white``, ``stripes``, or the path of an image. White for pattern 1: paper.
+        paper_drag: C_D, C_F and C_L of the paper's table, which are those of its own law of force. Kept for the record:
+            Blender's wind is not that law.
+        thickness: [m]; the paper gives none.
+        width: [m]; the paper gives none, nor ``height``.
+        height: [m].
+        yaw: Angle about z [degrees].
+        ripple: Amplitude of one and a half waves along x in the rest shape [m], without which a flat flag under gravity
+            alone buckles by rounding.
+        corner: Side of the square that is held at a pinned corner [m], the same on every mesh.
+        gravity: Along -z [m/s²]; paper.
+        air_density: [kg/m³]; the paper gives none.
+        drag: C of the pressure ½ ρ C U² that the wind exerts on a face at rest across it: that of a square plate.
+        cells: Squares of the mesh along the longer side.
+        quality: Steps of Blender's solver a frame; a power of two.
+        frames: Number of frames, of which the first is the rest shape; paper.
+        fps: Frames a second; paper.
+        self_collision: Whether the cloth keeps away from itself.
+    """
+
+    youngs_modulus: float
+    poisson_ratio: float
+    density: float
+    flow: tuple[float, float, float]
+    pinned: str
+    texture: str = "stripes"
+    paper_drag: tuple[float, float, float] | None = (0.1, 0.3, 0.005)
+    thickness: float = 0.01
+    width: float = 1.2
+    height: float = 0.8
+    yaw: float = 0.0
+    ripple: float = 0.0
+    corner: float = 0.04
+    gravity: float = 9.8
+    air_density: float = 1.225
+    drag: float = 1.28
+    cells: int = 120
+    quality: int = 64
+    frames: int = 250
+    fps: int = 25
+    self_collision: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            ValueError: If one is out of range; the message names it.
+        """
+        for name in ("youngs_modulus", "density", "thickness", "width", "height", "corner"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"Expected `{name}` to be positive and finite, but got {getattr(self, name)}.")
+        for name in ("ripple", "gravity", "air_density", "drag"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"Expected `{name}` not to be negative, but got {getattr(self, name)}.")
+        for name, least in (("cells", 2), ("quality", 1), ("frames", 2), ("fps", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"Expected `{name}` to be at least {least}, but got {getattr(self, name)}.")
+        if self.quality & (self.quality - 1):
+            raise ValueError(
+                "Expected `quality` to be a power of two, since Blender adds up its steps in float32, but got "
+                f"{self.quality}."
+            )
+        if self.pinned not in PINNED:
+            raise ValueError(f"Expected `pinned` to be one of {', '.join(PINNED)}, but got {self.pinned!r}.")
+        if len(self.flow) != 3:
+            raise ValueError(f"Expected `flow` to have 3 numbers, but got {self.flow}.")
+
+    # ---- shape
+
+    @property
+    def longer_side(self) -> float:
+        """The longer side [m]."""
+        return max(self.width, self.height)
+
+    def turn(self) -> np.ndarray:
+        """Rotation from the flag's own axes to those of the world, shape (3, 3)."""
+        c, s = math.cos(math.radians(self.yaw)), math.sin(math.radians(self.yaw))
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def normal(self) -> np.ndarray:
+        """Initial unit normal, towards the reference camera, shape (3,)."""
+        return self.turn() @ np.array([0.0, -1.0, 0.0])
+
+    def center(self) -> np.ndarray:
+        """Middle of the flag at rest [m], shape (3,)."""
+        return self.turn() @ np.array([0.5 * self.width, 0.0, 0.5 * self.height])
+
+    def grid(self) -> Grid:
+        """The mesh."""
+        return Grid.of_cells(self.width, self.height, self.cells)
+
+    def rest(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points [m] and unit normals of the rest shape at places (..., 2) of the cloth, each (..., 3)."""
+        u, v = uv[..., 0], uv[..., 1]
+        wave = 3 * math.pi
+        slope = self.ripple * wave / self.width * np.cos(wave * u)
+        points = np.stack([u * self.width, self.ripple * np.sin(wave * u), v * self.height], -1)
+        normals = np.stack([slope, -np.ones_like(u), np.zeros_like(u)], -1)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        return points @ self.turn().T, normals @ self.turn().T
+
+    def pin_uv(self) -> np.ndarray:
+        """What is held, as boxes (u low, u high, v low, v high) on the cloth, shape (K, 4)."""
+        if self.pinned == "left":
+            return np.array([[0.0, 0.0, 0.0, 1.0]])
+        if self.pinned == "top":
+            return np.array([[0.0, 1.0, 1.0, 1.0]])
+        u, v = self.corner / self.width, self.corner / self.height
+        return np.array([[0.0, u, 1 - v, 1.0], [1 - u, 1.0, 1 - v, 1.0], [1 - u, 1.0, 0.0, v]])
+
+    def pins(self, uv: np.ndarray) -> np.ndarray:
+        """Indices of the places (V, 2) that are held."""
+        eps = 1e-9
+        inside = [
+            (uv[:, 0] >= a - eps) & (uv[:, 0] <= b + eps) & (uv[:, 1] >= c - eps) & (uv[:, 1] <= d + eps)
+            for a, b, c, d in self.pin_uv()
+        ]
+        return np.flatnonzero(np.any(inside, axis=0))
+
+    def truth(self) -> dict[str, np.ndarray]:
+        """The rest shape as ``vertices``, ``normals``, triangles ``faces`` and ``uv``, normals on the camera's side."""
+        grid = self.grid()
+        vertices, normals = self.rest(grid.uv())
+        squares = grid.faces()
+        triangles = np.concatenate([squares[:, [0, 1, 2]], squares[:, [0, 2, 3]]])
+        return {"vertices": vertices, "normals": normals, "faces": triangles, "uv": grid.uv()}
+
+    # ---- physics
+
+    def material(self) -> ClothMaterial:
+        """The sheet that a plate of this thickness is."""
+        bending = self.youngs_modulus * self.thickness**3 / (12 * (1 - self.poisson_ratio**2))
+        return ClothMaterial(self.density * self.thickness, self.youngs_modulus * self.thickness, bending)
+
+    def pressure(self) -> float:
+        """½ ρ C U² [Pa]."""
+        return 0.5 * self.air_density * self.drag * sum(u * u for u in self.flow)
+
+    def run(self) -> ClothRun:
+        """What is done to the sheet."""
+        x, y, z = (float(u) for u in self.flow)
+        return ClothRun(
+            self.frames, self.fps, self.quality, self.gravity, (x, y, z), self.pressure(), self.self_collision
+        )
+
+    def cloth_settings(self) -> dict[str, Any]:
+        """All that the motion depends on."""
+        own = {name: value for name, value in asdict(self).items() if name not in ("texture", "paper_drag")}
+        blender = blender_settings(self.grid(), self.material(), self.run())
+        return own | {f"blender.{name}": value for name, value in blender.items()}
+
+
+def least_quality(pattern: FlagPattern, least: int = 8) -> int:
+    """The smallest power of two steps a frame, from ``least``, that Blender's bending allows on this mesh."""
+    number = bending_number(pattern.grid(), pattern.material(), replace(pattern, quality=1).run())
+    quality = least
+    while number / quality**2 > BENDING_LIMIT:
+        quality *= 2
+    return quality
+
+
+PATTERNS = {
+    1: FlagPattern(5e3, 0.3, 50.0, (0.0, 0.0, 0.0), "left", texture="white", paper_drag=None, ripple=0.003),
+    2: FlagPattern(3e3, 0.3, 30.0, (2.5, 0.5, 0.0), "corners"),
+    3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=160),
+}
+"""The paper's three patterns. The wind of pattern 3 would blow along the flag's plane: the flag stands at 35 degrees to
+it, so that in patterns 2 and 3 alike the air comes from the camera's side."""
+
+
+# ---- pictures
+
+_BANDS = ((0.83, 0.30, 0.18), (0.95, 0.92, 0.85), (0.13, 0.33, 0.55))
+_DISC, _WHITE = (0.93, 0.68, 0.20), 0.9
+
+
+def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
+    """Colours of a flag in 0 to 1, upper row first, shape (H, W, 3), float32.
+
+    ``white`` is plain, ``stripes`` has three bands and a disc, anything else is the path of an image.
+
+    Raises:
+        ValueError: If the image cannot be read.
+    """
+    if pattern.texture == "white":
+        return np.full((2, 2, 3), _WHITE, dtype=np.float32)
+    if pattern.texture != "stripes":
+        import imageio.v3 as iio
+
+        try:
+            image = iio.imread(pattern.texture)
+        except Exception as error:  # the readers of the formats raise what they like
+            raise ValueError(
+                f"Cannot read the texture {pattern.texture} ({error}): give white, stripes or an image."
+            ) from error
+        if image.dtype != np.uint8 or image.ndim != 3:
+            raise ValueError(f"The texture {pattern.texture} is not an image of 8 bits in colour: export it as such.")
+        return (image[..., :3] / 255).astype(np.float32)
+    height = max(2, round(width * pattern.height / pattern.width))
+    x = (np.arange(width) + 0.5) / width * pattern.width
+    z = (1 - (np.arange(height) + 0.5) / height)[:, None] * pattern.height
+    band = ((1 - z / pattern.height) * 3).astype(np.int64).clip(0, 2)
+    colors = np.array(_BANDS)[np.broadcast_to(band, (height, width))]
+    disc = np.hypot(x - 0.5 * pattern.width, z - 0.5 * pattern.height) < 0.2 * pattern.height
+    colors[disc] = _DISC
+    return colors.astype(np.float32)
+
+
+def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = math.radians(40.0)) -> list[View]:
+    """Cameras all around the flag at rest, spread evenly over a sphere on a golden spiral, upright in z.
+
+    Args:
+        pattern: The flag; each image holds all of it.
+        count: Number of cameras.
+        size: Width and height of their images [pixels].
+        angle: Field of view [radians].
+    """
+    radius = 1.1 * 0.5 * math.hypot(pattern.width, pattern.height, 2 * pattern.ripple) / math.sin(0.5 * angle)
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    turn = math.pi * (1 + math.sqrt(5)) * index
+    flat = np.sqrt(1 - z * z)
+    rays = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], -1)
+    center = pattern.center()
+    return [View(look_at(center + radius * ray, center), angle, size, size) for ray in rays]
+
+
+def reference_view(
+    pattern: FlagPattern, positions: np.ndarray, width: int, height: int, angle: float = math.radians(40.0)
+) -> View:
+    """The camera of the reference video: it looks along the initial normal and holds the whole motion.
+
+    Args:
+        pattern: The flag.
+        positions: The motion [m], shape (F, V, 3).
+        width: Of the image [pixels].
+        height: Of the image [pixels].
+        angle: Horizontal field of view [radians].
+    """
+    normal = pattern.normal()
+    frame = look_at(pattern.center() + normal, pattern.center())[:3, :3]
+    seen = positions.reshape(-1, 3).astype(np.float64) @ frame  # right, up, towards the camera
+    middle = 0.5 * (seen.min(0) + seen.max(0))
+    tangent = math.tan(0.5 * angle) * np.array([1.0, height / width]) / 1.08  # 4 % of margin on each side
+    middle[2] = max((np.abs(seen[:, k] - middle[k]) / tangent[k] + seen[:, 2]).max() for k in (0, 1))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = frame, frame @ middle
+    return View(pose, angle, width, height)
+
+
+def lamp_position(pattern: FlagPattern, side: int = 1) -> np.ndarray:
+    """Where the area light stands [m]: on the initial normal, six flag lengths away; ``side`` -1 mirrors it."""
+    return pattern.center() + side * 6.0 * pattern.longer_side * pattern.normal()
+
+
+def frame_order(count: int, stride: int = 10) -> list[int]:
+    """Frames in the order in which they are made: every ``stride``-th first, so that a part shows the whole."""
+    return sorted(range(count), key=lambda frame: (frame % stride != 0, frame))
+
+
+def transforms_fields(views: list[View], names: list[str]) -> dict[str, Any]:
+    """The fields of a ``transforms.json`` for cameras that differ in pose alone."""
+    view = views[0]
+    frames = [{"file_path": name, "transform_matrix": v.pose.tolist()} for v, name in zip(views, names, strict=True)]
+    return {
+        "camera_angle_x": view.angle_x,
+        "fl_x": view.focal,
+        "fl_y": view.focal,
+        "cx": 0.5 * view.width,
+        "cy": 0.5 * view.height,
+        "w": view.width,
+        "h": view.height,
+        "frames": frames,
+    }
+
+
+# ---- settings and files
+
+
+def settings_hash(settings: dict[str, Any]) -> str:
+    """Hash of settings that does not depend on their order."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Raise a ValueError that names each setting in which ``found``, of the output ``where``, is not as ``wanted``."""
+    wanted = json.loads(json.dumps(wanted))  # tuples become lists
+    changed = [
+        f"`{name}` was {found.get(name)!r} and is now {wanted.get(name)!r}"
+        for name in sorted(found.keys() | wanted.keys())
+        if found.get(name) != wanted.get(name)
+    ]
+    if changed:
+        raise ValueError(
+            f"{where} was made with other settings: {'; '.join(changed)}. Give another `--out`, the old settings, or "
+            "remove it."
+        )
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Let ``write`` fill a file beside ``path`` and then give it its name, so that no half-written file is left."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{path.name}")
+    write(partial)
+    os.replace(partial, path)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON, whole or not at all."""
+    write_whole(path, lambda partial: partial.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8"))
+
+
+@dataclass(frozen=True, eq=False)
+class Cloth:
+    """The motion of a flag.
+
+    Attributes:
+        positions: Vertices at each frame [m], float32, shape (F, V, 3).
+        faces: Squares as indices of vertices, their normals on the camera's side; shape (Q, 4).
+        uv: Place of each vertex on the flag, in 0 to 1, shape (V, 2).
+        columns: Squares along u. Vertex i (rows + 1) + j is at u = i / columns, v = j / rows.
+        rows: Squares along v.
+        settings: Fields of the :class:`FlagPattern` that rule the motion.
+    """
+
+    positions: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    columns: int
+    rows: int
+    settings: dict[str, Any]
+
+    def sample(self, uv: np.ndarray) -> np.ndarray:
+        """Points on the surface at each frame [m] at places (P, 2) of the flag, shape (F, P, 3); bilinear."""
+        place = uv * np.array([self.columns, self.rows])
+        corner = np.minimum(place.astype(np.int64), np.array([self.columns - 1, self.rows - 1]))
+        share = (place - corner).astype(np.float32)
+        at = self.positions.reshape(len(self.positions), self.columns + 1, self.rows + 1, 3)
+        i, j = corner.T
+        s, t = share[:, :1], share[:, 1:]
+        low = (1 - t) * at[:, i, j] + t * at[:, i, j + 1]
+        high = (1 - t) * at[:, i + 1, j] + t * at[:, i + 1, j + 1]
+        return (1 - s) * low + s * high
+
+
+def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
+    """Solve a flag and write its motion, unless the file is there already.
+
+    Args:
+        pattern: The flag.
+        path: The ``.npz`` to write, see :func:`read_cloth`.
+        report: Called after each frame.
+
+    Returns:
+        Whether it was solved.
+
+    Raises:
+        ImportError: If ``bpy`` is not there.
+        ValueError: If the file is there, but of other settings; or if ``quality`` is too low for the mesh.
+    """
+    settings = pattern.cloth_settings()
+    if path.exists():
+        check_settings(path, read_cloth(path).settings, settings)
+        return False
+    grid, material, run = pattern.grid(), pattern.material(), pattern.run()
+    uv = grid.uv()
+    rest, normals = pattern.rest(uv)
+    pins = pattern.pins(uv)
+    positions = solve_cloth(grid, rest, pins, material, run, report)
+    arrays: dict[str, Any] = {
+        "positions": positions,
+        "faces": grid.faces().astype(np.int32),
+        "uv": uv,
+        "columns": grid.columns,
+        "rows": grid.rows,
+        "rest_normals": normals,
+        "pins": pins,
+        "pin_uv": pattern.pin_uv(),
+        "fps": run.fps,
+        "areal_density": material.areal_density,
+        "membrane_stiffness": material.membrane,
+        "bending_stiffness": material.bending,
+        "youngs_modulus": pattern.youngs_modulus,
+        "poisson_ratio": pattern.poisson_ratio,
+        "density": pattern.density,
+        "thickness": pattern.thickness,
+        "gravity": np.array([0.0, 0.0, -pattern.gravity]),
+        "flow": np.array(run.flow),
+        "air_density": pattern.air_density,
+        "drag": pattern.drag,
+        "pressure": run.pressure,
+        "units": json.dumps(UNITS),
+        "settings": json.dumps(settings),
+        "hash": settings_hash(settings),
+    }
+
+    def write(partial: Path) -> None:
+        with partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    write_whole(path, write)
+    return True
+
+
+def read_cloth(path: str | os.PathLike[str]) -> Cloth:
+    """Read a motion.
+
+    Args:
+        path: The ``.npz``. Beside the fields of :class:`Cloth` it holds ``rest_normals``, ``pins`` (indices),
+            ``pin_uv`` (boxes), ``areal_density``, ``membrane_stiffness``, ``bending_stiffness``, ``gravity``, ``flow``
+            and more, with their ``units``, and the ``hash`` of ``settings``.
+
+    Raises:
+        ValueError: If it is no such file.
+    """
+    try:
+        with np.load(path) as data:
+            settings = json.loads(str(data["settings"]))
+            positions, faces, uv = (data[name] for name in ("positions", "faces", "uv"))
+            return Cloth(positions, faces, uv, int(data["columns"]), int(data["rows"]), settings)
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is not the motion of a flag ({error}): make it again.") from error
+
+
+# ---- how well the reference knows itself
+
+
+def even_uv(pattern: FlagPattern, along: int = 80) -> np.ndarray:
+    """Places spread evenly over the flag at rest, ``along`` on the longer side, shape (P, 2)."""
+    spacing = pattern.longer_side / along
+    counts = [max(1, round(side / spacing)) for side in (pattern.width, pattern.height)]
+    axes = [(np.arange(count) + 0.5) / count for count in counts]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+
+
+def chamfer_distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Half the sum of the mean distances from each set of points to the nearest of the other.
+
+    Args:
+        a: Points, shape (P, 3).
+        b: Points, shape (Q, 3).
+
+    Returns:
+        Not squared, in the unit of the points.
+    """
+    import torch
+
+    from gaussian_swaying.metrics.chamfer import chamfer_distance as between
+
+    one, other = (torch.from_numpy(np.ascontiguousarray(points)) for points in (a, b))
+    return float(between(one, other, direction="average"))
+
+
+def difference(pattern: FlagPattern, a: Cloth, b: Cloth, every: int = 1, along: int = 80) -> dict[str, Any]:
+    """How far two solutions of one flag are apart.
+
+    Args:
+        pattern: The flag.
+        a: One.
+        b: The other, on any mesh.
+        every: Compare every how many-th frame.
+        along: Points along the longer side, see :func:`even_uv`.
+
+    Returns:
+        As shares of the longer side: ``chamfer``, the mean of :func:`chamfer_distance` over the frames;
+        ``chamfer_per_frame``; and ``corresponding``, the mean distance between the same places of the cloth.
+
+    Raises:
+        ValueError: If the numbers of frames differ.
+    """
+    if len(a.positions) != len(b.positions):
+        raise ValueError(f"Expected as many frames in both solutions, but got {len(a.positions)}, {len(b.positions)}.")
+    uv = even_uv(pattern, along)
+    one, other = (cloth.sample(uv)[::every] for cloth in (a, b))
+    distances = [chamfer_distance(p, q) / pattern.longer_side for p, q in zip(one, other, strict=True)]
+    apart = np.linalg.norm(one - other, axis=-1).mean() / pattern.longer_side
+    return {
+        "chamfer": float(np.mean(distances)),
+        "corresponding": float(apart),
+        "chamfer_per_frame": [round(value, 6) for value in distances],
+        "frames_compared": len(distances),
+        "points": len(uv),
+    }
+
+
+VARIANTS = ("steps doubled", "coarser", "finer")
+
+
+def variants(pattern: FlagPattern, names: Iterable[str] = VARIANTS) -> dict[str, FlagPattern]:
+    """The same flag with twice the steps, and on a mesh of half and of one and a half times as many cells along a side.
+
+    Where the mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
+    """
+    coarser, finer = replace(pattern, cells=pattern.cells // 2), replace(pattern, cells=3 * pattern.cells // 2)
+    table = {
+        "steps doubled": replace(pattern, quality=2 * pattern.quality),
+        "coarser": replace(coarser, quality=least_quality(coarser)),
+        "finer": replace(finer, quality=least_quality(finer)),
+    }
+    return {name: table[name] for name in names}
