@@ -247,8 +247,8 @@ def page(recorded: list[Row]) -> list[str]:
         "",
         "Made by `python tools/bench.py flags` and `pages` from `docs/results/flags_*.json`. The reference is",
         "Blender's cloth solver, which shares nothing with this package; how it was made, what is matched and what",
-        "cannot be is in [flag_dataset.md](flag_dataset.md). Chamfer distances are the average of both directions, mean",
-        "over frames, as a share of the flag's longer side.",
+        "cannot be is in [flag_dataset.md](flag_dataset.md). Chamfer distances are the average of both directions,",
+        "mean over frames, as a share of the flag's longer side.",
         "",
     ]
     for result in recorded:
