@@ -74,6 +74,15 @@ class TrainCLI(LightningCLI):
             kwargs["callbacks"] = [*callbacks, TQDMProgressBar(refresh_rate=20)]
         return super().instantiate_trainer(**kwargs)
 
+    def after_fit(self) -> None:
+        """Keep a checkpoint of the last image too, where ``every_n_train_steps`` does not divide their number."""
+        checkpoint = self._get(self.config_init, "checkpoint")
+        if checkpoint is None or checkpoint.dirpath is None:
+            return
+        path = Path(checkpoint.dirpath) / f"step_{self.trainer.global_step:06d}.ckpt"
+        if not path.exists():
+            self.trainer.save_checkpoint(path)
+
 
 def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainCLI:
     """Parse a command line and, with ``run``, do what it says.

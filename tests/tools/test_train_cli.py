@@ -111,6 +111,15 @@ def test_a_resumed_run_is_the_same_bit_for_bit(capture, tmp_path):
         assert torch.equal(getattr(resumed.model.splat, name), getattr(straight.splat, name)), name
 
 
+def test_the_last_image_is_in_a_checkpoint(capture, tmp_path):
+    """13 images with a checkpoint every 10."""
+    main(["fit", *_arguments(capture, tmp_path, **{"trainer.max_steps": 13, "checkpoint.save_top_k": 1})])
+    names = sorted(path.name for path in (tmp_path / "checkpoints").glob("*.ckpt"))
+    assert "step_000013.ckpt" in names
+    state = torch.load(tmp_path / "checkpoints/step_000013.ckpt", weights_only=False)
+    assert state["global_step"] == 13
+
+
 OWN = """
 import torch
 from gaussian_swaying.training.losses import LossTerm
