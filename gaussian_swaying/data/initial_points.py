@@ -13,6 +13,8 @@ from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.data.capture import Capture, nearest_to_axes
 from gaussian_swaying.data.point_cloud import PointCloud, read_obj_mesh, read_ply_points, sample_mesh
 
+_ATTEMPTS = 100
+
 
 def initial_points(
     capture: Capture,
@@ -22,6 +24,9 @@ def initial_points(
     half_side: float | None = None,
 ) -> PointCloud:
     """Points that the training of a capture starts from.
+
+    Random points are not nearer to a camera than half of its distance to the point that all cameras look at: what
+    starts there ends as haze that only this camera sees.
 
     Args:
         capture: The capture.
@@ -48,7 +53,7 @@ def initial_points(
         return PointCloud(capture.points, capture.colors)
     if source in ("auto", "random"):
         center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
-        return random_points(center, reach, count, seed)
+        return _away_from_cameras(capture, center, reach, count, seed)
     if source == "consistent":
         return consistent_points(capture, count, seed, half_side)
     path = Path(source)
@@ -78,6 +83,28 @@ def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -
     return PointCloud(center.float() + half_side * (2 * draw[:, :3] - 1), draw[:, 3:].contiguous())
 
 
+def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: int, seed: int) -> PointCloud:
+    """Random points of a cube, of which those close to a camera are drawn again."""
+    points = colors = torch.zeros(0, 3)
+    for attempt in range(_ATTEMPTS):
+        more = random_points(center, reach, count, seed + 1_000_003 * attempt)
+        kept = _clear(capture, center, more.points)
+        points, colors = torch.cat([points, more.points[kept]]), torch.cat([colors, more.colors[kept]])
+        if len(points) >= count:
+            return PointCloud(points[:count], colors[:count])
+    raise ValueError(
+        f"The cameras of {capture.path} leave no room for random initial points between them: set the initial points "
+        "to consistent or to a .ply or .obj file, or give a larger half side."
+    )
+
+
+def _clear(capture: Capture, center: Tensor, points: Tensor) -> Tensor:
+    """Which points (N, 3) no camera has closer than half its distance to the centre, shape (N,)."""
+    eyes = torch.stack([view.camera.position for view in capture.split("train")]).float()
+    limit = 0.5 * (eyes - center.float()).norm(dim=-1)
+    return torch.cat([(torch.cdist(part, eyes) >= limit).all(-1) for part in points.split(1 << 16)])
+
+
 def consistent_points(
     capture: Capture, count: int, seed: int = 0, half_side: float | None = None, candidates: int = 8, width: int = 160
 ) -> PointCloud:
@@ -99,7 +126,7 @@ def consistent_points(
         The points, with the mean of the colours that the photos show there.
 
     Raises:
-        ValueError: If fewer than ``count`` candidates are in three photos.
+        ValueError: If fewer than ``count`` candidates are in three photos and not close to a camera.
     """
     center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
     generator = torch.Generator().manual_seed(seed)
@@ -109,6 +136,7 @@ def consistent_points(
     ray = torch.nn.functional.normalize(torch.randn(outer, 3, generator=generator), dim=-1)
     far = ray * 10.0 ** torch.rand(outer, 1, generator=generator)
     points = center.float() + reach * torch.cat([near, far])
+    clear = _clear(capture, center, points)
     seen, total, squares = torch.zeros(len(points)), torch.zeros(len(points), 3), torch.zeros(len(points))
     for view in capture.split("train"):
         pixels = view.load()[..., :3].permute(2, 0, 1)[None].float() / 255
@@ -127,7 +155,7 @@ def consistent_points(
         squares[inside] += found.square().sum(-1)
     mean = total / seen.clamp_min(1)[:, None]
     spread = squares / seen.clamp_min(1) - mean.square().sum(-1)
-    spread[seen < 3] = math.inf
+    spread[(seen < 3) | ~clear] = math.inf
     parts = ((spread[:inner], 0, count - count // 2), (spread[inner:], inner, count // 2))
     chosen = torch.cat([begin + part.topk(number, largest=False).indices for part, begin, number in parts])
     missing = int(spread[chosen].isinf().sum())

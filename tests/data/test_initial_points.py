@@ -40,6 +40,24 @@ def test_random_points_fill_what_the_cameras_see(capture):
     assert float((small.points - torch.tensor([0.0, 0.0, 0.2])).abs().max()) <= 0.1 + 1e-6
 
 
+def test_random_points_keep_away_from_the_cameras(capture):
+    """Half a camera's distance, also where the cube holds the cameras; all of the rest is filled."""
+    middle = torch.tensor([0.0, 0.0, 0.2])
+    cloud = initial_points(capture, "random", count=20_000, half_side=4.0)
+    assert len(cloud) == 20_000
+    eyes = torch.stack([view.camera.position for view in capture.views])
+    ratio = torch.cdist(cloud.points, eyes) / (eyes - middle).norm(dim=-1)
+    assert 0.5 <= float(ratio.min()) < 0.53
+    reach = (cloud.points - middle).abs().amax(0)
+    torch.testing.assert_close(reach, torch.full((3,), 4.0), rtol=0.01, atol=0)
+
+
+def test_random_points_without_room(capture, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.data.initial_points._ATTEMPTS", 1)
+    with pytest.raises(ValueError, match="leave no room"):
+        initial_points(capture, "random", count=1000, half_side=4.0)
+
+
 def test_consistent_points_lie_where_the_photos_agree(tmp_path):
     """Of points around a flag seen from all sides, those near it; the mean of their colours is the flag's there."""
     flag = GeneratedCapture(views=24, size=48)
@@ -114,8 +132,7 @@ def test_bad_sources_are_named(tmp_path, capture, capture_tools):
 
 
 def test_cameras_that_look_apart_need_points(tmp_path, capture_tools):
-    from gaussian_swaying.rendering.camera import look_at_camera
-
+    
     eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
     capture = read_capture(capture_tools.transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
