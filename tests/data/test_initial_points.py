@@ -132,7 +132,8 @@ def test_bad_sources_are_named(tmp_path, capture, capture_tools):
 
 
 def test_cameras_that_look_apart_need_points(tmp_path, capture_tools):
-    
+    from gaussian_swaying.rendering.camera import look_at_camera
+
     eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
     capture = read_capture(capture_tools.transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
