@@ -8,7 +8,8 @@
 ``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
 ``python tools/bench.py train``      trainings of a capture and of a generated flag; writes docs/results/train_cuda.json
 ``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json
-``python tools/bench.py pages``      docs/benchmarks.md, validation.md, training.md and flag_benchmark.md from the JSON
+``python tools/bench.py gallery``    the paper's scenes; writes docs/results/gallery_<device>.json and pictures
+``python tools/bench.py pages``      docs/benchmarks.md, validation.md, training.md, flag_benchmark.md and gallery.md
 ``python tools/bench.py pictures``   the README's pictures from a finished run
 """
 
@@ -28,6 +29,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch
 
 import accuracy as accuracy_cases
 import flags as flag_cases
+import gallery as gallery_cases
 import pareto as pareto_cases
 import speed as speed_cases
 import torch
@@ -221,6 +223,21 @@ def flags(options: argparse.Namespace) -> None:
     print(f"wrote {path}")
 
 
+def gallery(options: argparse.Namespace) -> None:
+    """Run and picture the paper's scenes."""
+    device, result = _start(options)
+    options.device = device.type
+    options.preset = options.preset or ("preview" if device.type == "cpu" else None)
+    name = f"gallery_{device.type}"
+    path = Path(options.results) / f"{name}.json"
+    if path.exists():
+        kept = json.loads(path.read_text())
+        if kept["device"] == result["device"]:
+            result = kept | result
+    gallery_cases.measure(options, result, lambda now: _write(options, name, now, quiet=True))
+    print(f"wrote {path}")
+
+
 def _gradient_lines(result: dict[str, Any]) -> list[str]:
     lines = ["## Gradients", "", f"{result['device']}; {', '.join(f'{k} {v}' for k, v in result['versions'].items())}."]
     lines += ["", "Forward and backward through a rollout of a flag, memory beyond that of the imports:", ""]
@@ -339,6 +356,11 @@ def pages(options: argparse.Namespace) -> None:
         page = Path(options.results).parent / "flag_benchmark.md"
         page.write_text("\n".join(flag_cases.page(compared)))
         print(f"wrote {page}")
+    scenes = [json.loads(path.read_text()) for path in sorted(Path(options.results).glob("gallery_*.json"))]
+    if scenes:
+        page = Path(options.results).parent / "gallery.md"
+        page.write_text("\n".join(gallery_cases.page(scenes)))
+        print(f"wrote {page}")
 
 
 def _substep_table(result: dict[str, Any]) -> list[str]:
@@ -434,7 +456,7 @@ def main() -> None:
     """Parse and run one command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for function in (substep, speed, sim, accuracy, pareto, gradients, train, flags, pages, pictures):
+    for function in (substep, speed, sim, accuracy, pareto, gradients, train, flags, gallery, pages, pictures):
         command = commands.add_parser(function.__name__, help=function.__doc__)
         command.set_defaults(run_command=function)
         command.add_argument("--results", default=str(RESULTS), help="folder of the recorded JSON")
@@ -442,7 +464,7 @@ def main() -> None:
             command.add_argument("--only", help="only the problems with this name (pareto: a list with commas)")
         if function is accuracy:
             command.add_argument("--thorough", action="store_true", help="finer grids and full 3D; for a GPU")
-        if function in (substep, speed, sim, accuracy, pareto, train, flags):
+        if function in (substep, speed, sim, accuracy, pareto, train, flags, gallery):
             command.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
         if function is speed:
             command.add_argument("--counts", help="particles of the sheets, a list with commas")
@@ -452,6 +474,8 @@ def main() -> None:
             training_cases.add_arguments(command)
         if function is flags:
             flag_cases.add_arguments(command)
+        if function is gallery:
+            gallery_cases.add_arguments(command)
         if function is sim:
             command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
             command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")

@@ -1,0 +1,63 @@
+"""The gallery: each scene has its files, a run is pictured, and the page says what was lost."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from imageio.v3 import imread
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def gallery(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    import gallery
+
+    yield gallery
+    sys.modules.pop("gallery", None)
+
+
+def test_each_scene_has_its_files(gallery):
+    for name in gallery.SCENES:
+        files = [Path(part) for part in gallery.arguments(name, "preview") if part != "--config"]
+        assert all(file.is_file() for file in files), files
+        assert len(files) >= (2 if not name.startswith("solid_surface") else 1)
+
+
+def test_a_scene_is_run_and_pictured(gallery, tmp_path):
+    options = type("Options", (), {})()
+    options.preset, options.device, options.frames = "preview", "cpu", 3
+    options.more = "--scene.generator.init_args.spacing=0.05 --solver.dx=0.1 --camera.width=64 --camera.height=36"
+    row = gallery.run_scene("flag2", options, tmp_path)
+    assert row["frames"] == 3
+    assert row["displacement_share"] == pytest.approx(row["displacement_mean_max_m"] / row["size_m"])
+    assert row["size_m"] == pytest.approx(1.2, abs=0.2)
+    picture = imread(tmp_path / "gallery_flag2.png")
+    assert picture.shape[1] == 5 * 360
+    assert picture.max() > 100
+    options.more = "--solver.dx=nonsense"
+    assert "solver.dx" in gallery.run_scene("flag2", options, tmp_path)["failed"]
+
+
+def test_whole_means_all_of_it(gallery):
+    row = {"status": "complete", "frames": 250, "frames_wanted": 250, "lost_particles": 0, "displacement_share": 0.1}
+    assert gallery.whole(row)
+    changes = {"status": "diverged"}, {"frames": 249}, {"lost_particles": 1}, {"displacement_share": 0.009}
+    for change in (*changes, {"displacement_share": 0.51}, {"displacement_share": None}):
+        assert not gallery.whole(row | change)
+    row |= {
+        "particles": 1000,
+        "formulation": "total",
+        "substeps": 2490,
+        "wall_s": {"simulation": 2.5},
+        "process_s": 4.0,
+    }
+    row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview"}
+    result = {"device": "CPU", "versions": {}, "seed": 0, "scenes": {"ficus": row, "sand": {"failed": "x"}}}
+    text = "\n".join(gallery.page([result]))
+    shown = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
+    assert shown in text
+    assert "| Sand | failed" in text
+    assert "gallery_ficus.png" in text
+    assert "gallery_sand.png" not in text
