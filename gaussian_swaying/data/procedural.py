@@ -33,6 +33,7 @@ class FlagScene(ProceduralScene):
         overlap: Standard deviation of a Gaussian as a share of the spacing.
         ripple: Amplitude of the ripple along y [m].
         pattern: ``stripes`` (three bands of colour and a disc) or ``white``.
+        yaw: Angle by which the flag is turned about its pole side, counter-clockwise seen from above [degrees].
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class FlagScene(ProceduralScene):
         overlap: float = 0.6,
         ripple: float = 0.003,
         pattern: str = "stripes",
+        yaw: float = 0.0,
     ) -> None:
         for name, value in (("width", width), ("height", height), ("spacing", spacing), ("overlap", overlap)):
             check_positive(f"generator.{name}", value)
@@ -53,6 +55,9 @@ class FlagScene(ProceduralScene):
             raise ValueError(f"Expected `generator.spacing` below the flag's sides, but got {spacing} m.")
         self.width, self.height, self.spacing = float(width), float(height), float(spacing)
         self.overlap, self.ripple, self.pattern = float(overlap), float(ripple), pattern
+        if not math.isfinite(yaw):
+            raise ValueError(f"Expected `generator.yaw` to be a finite angle in degrees, but got {yaw}.")
+        self.yaw = float(yaw)
 
     def generate(self) -> GaussianCloud:
         """Make the flag."""
@@ -63,10 +68,12 @@ class FlagScene(ProceduralScene):
         x, z = (g.reshape(-1) for g in torch.meshgrid(u, v, indexing="ij"))
         wave = 2 * math.pi * 1.5 / self.width
         y = self.ripple * torch.sin(wave * x)
-        means = torch.stack([x, y, z], dim=-1)
+        turn = math.radians(self.yaw)
+        turned_x, turned_y = math.cos(turn) * x - math.sin(turn) * y, math.sin(turn) * x + math.cos(turn) * y
+        means = torch.stack([turned_x, turned_y, z], dim=-1)
         # the smallest axis is the local z of the Gaussian; turn it onto the normal (-y', 1, 0) of the rippled sheet:
-        # first by -90 degrees about x, then by the angle of the slope about z
-        yaw = torch.atan(self.ripple * wave * torch.cos(wave * x))
+        # first by -90 degrees about x, then by the angle of the slope, and that of the flag, about z
+        yaw = torch.atan(self.ripple * wave * torch.cos(wave * x)) + turn
         cosine, sine = torch.cos(yaw / 2), torch.sin(yaw / 2)
         quats = math.sqrt(0.5) * torch.stack([cosine, -cosine, -sine, sine], dim=-1)
         sigma = self.overlap * h

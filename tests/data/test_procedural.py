@@ -44,6 +44,16 @@ def test_the_same_arguments_give_the_same_splat():
         assert torch.equal(getattr(one, name), getattr(two, name)), name
 
 
+def test_yaw_turns_the_flag_about_its_pole():
+    """Centres and normals turn by the same angle, counter-clockwise from above; the pole side stays."""
+    plain, turned = (FlagScene(spacing=0.1, ripple=0.03, yaw=yaw).generate() for yaw in (0.0, -35.0))
+    c, s = math.cos(math.radians(35)), math.sin(math.radians(35))
+    turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(turned.means, plain.means @ turn.T)
+    before, after = (GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).normals() for cloud in (plain, turned))
+    torch.testing.assert_close(after, before @ turn.T, atol=1e-6, rtol=0)
+
+
 def test_patterns():
     stripes, white = (FlagScene(spacing=0.1, pattern=name).generate() for name in ("stripes", "white"))
     assert len(stripes.sh.unique(dim=0)) == 4  # three bands and the disc
@@ -61,6 +71,7 @@ def test_patterns():
         ("overlap", 0.0),
         ("ripple", -0.1),
         ("pattern", "dots"),
+        ("yaw", float("inf")),
         ("spacing", 0.9),
     ],
 )
