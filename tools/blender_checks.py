@@ -27,41 +27,50 @@ def _row(name: str, measured: float, expected: float, unit: str, means: str) -> 
 
 def free_fall(cell: float, quality: int) -> dict[str, Any]:
     """Acceleration of a panel that nothing holds."""
-    grid = Grid(20 * cell, 20 * cell, 20, 20)
+    grid = Grid.of_cells(20 * cell, 20 * cell, 20)
     run = ClothRun(frames=12, quality=quality)
     height = solve_cloth(grid, grid.flat(), NOTHING, SHEET, run)[..., 2].astype(np.float64).mean(1)
     measured = -np.diff(height, 2)[1:].mean() * run.fps**2
     return _row(f"gravity, free fall, {cell} m cells", float(measured), run.gravity, "m/s^2", "gravity")
 
 
+def damped_fall(cell: float, quality: int, rate: float = 2.0) -> dict[str, Any]:
+    """Rate at which the velocity of a falling panel decays: v(t) = g / rate (1 - exp(-rate t))."""
+    grid = Grid.of_cells(20 * cell, 20 * cell, 20)
+    run = ClothRun(frames=26, quality=quality)
+    material = replace(SHEET, air_rate=rate)
+    height = solve_cloth(grid, grid.flat(), NOTHING, material, run)[..., 2].astype(np.float64).mean(1)
+    velocity = np.diff(height) * run.fps
+    measured = -np.diff(np.log(-np.diff(velocity)[1:])).mean() * run.fps
+    return _row(f"damping, fall, {cell} m cells", float(measured), rate, "1/s", "decay of the acceleration")
+
+
 def hanging_panel(cell: float, quality: int, shear: bool = True) -> list[dict[str, Any]]:
     """Stretch of a panel under its own weight, held by its upper edge, and how much narrower it gets."""
-    columns, rows, gravity = round(0.4 / cell), round(0.8 / cell), 2.0
-    grid = Grid(columns * cell, rows * cell, columns, rows)
+    width, height, gravity = 0.4, 0.8, 2.0
+    grid = Grid.of_cells(width, height, round(height / cell))
     material = replace(SHEET, air_rate=20.0, shear=shear)
     run = ClothRun(frames=75, quality=quality, gravity=gravity)
     pins = np.flatnonzero(grid.uv()[:, 1] > 1 - 1e-9)
-    last = solve_cloth(grid, grid.flat(), pins, material, run)[-1].astype(np.float64)
-    last = last.reshape(columns + 1, rows + 1, 3)
-    strain = np.diff(last[:, :, 2].mean(0)) / grid.cell - 1
-    lower = slice(2, rows // 2)  # well away from the edge that cannot get narrower
-    # a row of squares carries the rows of vertices below it; summed over all, that is rho g L^2 / 2E
-    carried = material.areal_density * grid.height * gravity * np.arange(1, rows + 1) / (rows + 1)
+    shape = (grid.columns + 1, grid.rows + 1, 3)
+    last = solve_cloth(grid, grid.flat(), pins, material, run)[-1].astype(np.float64).reshape(shape)
+    strain = np.diff(last[:, :, 2].mean(0)) / np.diff(grid.flat().reshape(shape)[0, :, 2]) - 1
+    lower = slice(2, grid.rows // 2)  # well away from the edge that cannot get narrower
+    # a row of faces carries the rows of vertices below it; summed over all, that is rho g L^2 / 2E
+    carried = material.areal_density * height * gravity * np.arange(1, grid.rows + 1) / (grid.rows + 1)
     measured = carried[lower].sum() / strain[lower].sum()
-    # a section across has one spring more than squares, which the mesh counts as the mean of both directions
-    expected = material.membrane * (1 + 1 / columns) / grid.rim
     kind = f"{cell} m cells" + ("" if shear else ", no shear springs")
-    result = [_row(f"E h, hanging panel, {kind}", measured, expected, "N/m", "stretch under its weight")]
+    result = [_row(f"E h, hanging panel, {kind}", measured, material.membrane, "N/m", "stretch under its weight")]
     if shear:
-        width = np.diff(last[[0, -1], :, 0], axis=0)[0] / grid.width - 1
-        ratio = -0.5 * (width[:-1] + width[1:])[lower].sum() / strain[lower].sum()
+        narrower = np.diff(last[[0, -1], :, 0], axis=0)[0] / width - 1
+        ratio = -0.5 * (narrower[:-1] + narrower[1:])[lower].sum() / strain[lower].sum()
         result.append(_row(f"Poisson's ratio, hanging panel, {kind}", ratio, POISSON_RATIO, "1", "isotropic lattice"))
     return result
 
 
 def wind(cell: float, quality: int, speed: float = 2.0, incidence: float = 90.0) -> list[dict[str, Any]]:
     """Pressure on a free panel without gravity, and the speed that it reaches (not where it would turn)."""
-    grid = Grid(20 * cell, 20 * cell, 20, 20)
+    grid = Grid.of_cells(20 * cell, 20 * cell, 20)
     angle = math.radians(incidence)
     flow = (speed * math.cos(angle), speed * math.sin(angle), 0.0)
     pressure = 0.5 * AIR_DENSITY * DRAG * speed**2
@@ -87,19 +96,21 @@ def wind(cell: float, quality: int, speed: float = 2.0, incidence: float = 90.0)
 
 def cantilever(cell: float, quality: int) -> dict[str, Any]:
     """Sag of a level strip that is clamped at one end."""
-    columns, rows, gravity = round(0.16 / cell), round(0.08 / cell), 0.2
-    grid = Grid(columns * cell, rows * cell, columns, rows)
+    length, gravity = 0.16, 0.2
+    grid = Grid.of_cells(length, 0.08, round(length / cell))
     flat = grid.flat()[:, [0, 2, 1]]  # in the x-y plane
     material = replace(SHEET, air_rate=4.0, shear=False)
     run = ClothRun(frames=125, quality=quality, gravity=gravity)
-    pins = np.flatnonzero(flat[:, 0] < 1.5 * cell)  # two rows
-    last = solve_cloth(grid, flat, pins, material, run)[-1].astype(np.float64).reshape(columns + 1, rows + 1, 3)
+    pins = np.flatnonzero(flat[:, 0] < 3 * cell)  # three rows: the first face that turns is one cell wide
+    shape = (grid.columns + 1, grid.rows + 1, 3)
+    last = solve_cloth(grid, flat, pins, material, run)[-1].astype(np.float64).reshape(shape)
     sag = -last[-1, :, 2].mean()
-    # squares on hinges, the first at the clamp: each turns by its moment over D / cell, and lowers the end by its arm
-    arm = cell * np.arange(columns - 1, 0, -1)
-    weight = material.areal_density * grid.width / (columns + 1) * gravity  # of a row of vertices, per length across
-    moment = np.array([weight * arm[k:][::-1].sum() for k in range(len(arm))])
-    measured = (moment * arm).sum() * cell / sag
+    # faces on hinges: each turns by its moment over D / cell, and lowers the end by its distance to it
+    along = flat.reshape(shape)[:, 0, 0]
+    weight = material.areal_density * length / (grid.columns + 1) * gravity  # of a row of vertices, per length across
+    hinges = along[2:-1]
+    moment = weight * np.maximum(along - hinges[:, None], 0).sum(1)
+    measured = (moment * (length - hinges)).sum() * cell / sag
     return _row(f"D, cantilever, {cell} m cells", float(measured), material.bending, "N m", "sag of a chain of hinges")
 
 
@@ -118,7 +129,7 @@ def check_relations(
     """
     rows: list[dict[str, Any]] = []
     for cell, quality in filter(None, (coarse, fine)):
-        rows.append(free_fall(cell, quality))
+        rows += [free_fall(cell, quality), damped_fall(cell, quality)]
         rows += hanging_panel(cell, quality)
         rows += wind(cell, quality)
         rows.append(cantilever(cell, quality))

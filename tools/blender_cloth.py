@@ -16,7 +16,7 @@ import numpy as np
 
 LATTICE = 4 / 3
 """E h over the stiffness of a spring, in a square lattice whose diagonals have half the stiffness of its sides: the
-value of isotropic lattices, and the measured one once the rim is counted (see ``Grid.rim``)."""
+value of isotropic lattices, and the measured one."""
 
 BENDING = 0.0505
 """Bending stiffness D [N m] over ``bending_stiffness`` x edge² x fps², measured on a cantilever taken as what it is: a
@@ -55,15 +55,20 @@ def require_bpy() -> Any:
 
 @dataclass(frozen=True)
 class Grid:
-    """A rectangular cloth as a mesh of squares in the x-z plane.
+    """A rectangular cloth as a mesh in the x-z plane, of which every vertex stands for the same share of the cloth.
 
-    Vertex ``i * (rows + 1) + j`` stands at x = i cell, z = j cell.
+    Blender gives every vertex the same mass and every line of springs the same stiffness, at the rim or not. So the
+    cloth is cut into equal cells with a vertex in the middle of each, and only those of the rim are moved out to it: a
+    mesh of squares with an outer ring one and a half cells wide. Were it one cell wide, a vertex of the rim would have
+    the mass of a cell and half its area, an error of first order in the cell.
+
+    Vertex ``i * (rows + 1) + j`` stands at x = (i + 1/2) cell, z = (j + 1/2) cell, or at the rim.
 
     Attributes:
         width: Length along x [m].
         height: Length along z [m].
-        columns: Number of squares along x.
-        rows: Number of squares along z.
+        columns: Number of faces along x; there is one cell more.
+        rows: Number of faces along z.
     """
 
     width: float
@@ -73,33 +78,31 @@ class Grid:
 
     @classmethod
     def of_cells(cls, width: float, height: float, cells: int) -> Grid:
-        """The mesh with ``cells`` squares along the longer side.
+        """The mesh with ``cells`` square cells along the longer side.
 
         Raises:
-            ValueError: If the shorter side is not a whole number of squares, to 5 %.
+            ValueError: If the shorter side is not a whole number of cells, to 5 %, or less than two.
         """
         cell = max(width, height) / cells
-        columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
-        if abs(height / rows / (width / columns) - 1) > 0.05:
+        across, up = max(1, round(width / cell)), max(1, round(height / cell))
+        if abs(height / up / (width / across) - 1) > 0.05 or min(across, up) < 2:
             raise ValueError(
-                f"Expected `cells` to cut {width} m x {height} m into squares, but {cells} gives cells of "
-                f"{width / columns:.4f} m x {height / rows:.4f} m: choose a number of cells that divides both sides."
+                f"Expected `cells` to cut {width} m x {height} m into squares, two at least each way, but {cells} "
+                f"gives {across} x {up} of {width / across:.4f} m x {height / up:.4f} m: choose a number of cells that "
+                "divides both sides."
             )
-        return cls(width, height, columns, rows)
+        return cls(width, height, across - 1, up - 1)
 
     @property
     def cell(self) -> float:
-        """Side of a square [m]."""
-        return self.width / self.columns
+        """Side of a cell [m]."""
+        return self.width / (self.columns + 1)
 
     @property
-    def rim(self) -> float:
-        """How much more springs a section of the sheet has than squares, as the mean of both directions.
-
-        Springs and vertices of the rim are as stiff and heavy as those within. Mass and stiffness are therefore set for
-        the whole sheet, and are lower within by about this factor.
-        """
-        return 1 + 0.5 * (1 / self.columns + 1 / self.rows)
+    def spring(self) -> float:
+        """Mean length of the springs along the sides of faces [m], by which Blender divides every stiffness."""
+        along, up = self.columns * (self.rows + 1), self.rows * (self.columns + 1)
+        return (self.width * (self.rows + 1) + self.height * (self.columns + 1)) / (along + up)
 
     @property
     def count(self) -> int:
@@ -108,11 +111,11 @@ class Grid:
 
     def uv(self) -> np.ndarray:
         """Place of each vertex on the cloth, in 0 to 1, float64, shape (V, 2)."""
-        u, v = np.linspace(0, 1, self.columns + 1), np.linspace(0, 1, self.rows + 1)
+        u, v = (np.r_[0.0, (np.arange(1, faces) + 0.5) / (faces + 1), 1.0] for faces in (self.columns, self.rows))
         return np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
 
     def faces(self) -> np.ndarray:
-        """Squares as indices of vertices, turned so that their normal is on the -y side; int64, shape (Q, 4)."""
+        """Faces as indices of vertices, turned so that their normal is on the -y side; int64, shape (Q, 4)."""
         corner = (np.arange(self.columns)[:, None] * (self.rows + 1) + np.arange(self.rows)).reshape(-1)
         return np.stack([corner, corner + self.rows + 1, corner + self.rows + 2, corner + 1], -1)
 
@@ -132,7 +135,7 @@ class ClothMaterial:
         bending: Bending stiffness D [N m].
         spring_time: Damping of a membrane spring over its stiffness [s].
         shear: Whether the squares have diagonals; without, Poisson's ratio is 0.
-        air_rate: Rate at which every velocity decays [1/s]; only for finding a state of rest.
+        air_rate: Rate at which every velocity decays [1/s].
     """
 
     areal_density: float
@@ -184,9 +187,9 @@ def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict
         ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind.
     """
     rate2 = run.fps**2
-    mass = material.areal_density * grid.width * grid.height / grid.count  # the same at every vertex, rim or not
-    spring = material.membrane / (grid.rim * (LATTICE if material.shear else 1.0))  # N/m
-    tension = spring * grid.cell / rate2
+    mass = material.areal_density * grid.width * grid.height / grid.count
+    spring = material.membrane / (LATTICE if material.shear else 1.0)  # N/m
+    tension = spring * grid.spring / rate2
     bending = material.bending / (BENDING * grid.cell**2 * rate2)
     damping = material.spring_time * spring / run.fps
     speed = math.hypot(*run.flow)

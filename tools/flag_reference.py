@@ -72,8 +72,9 @@ class FlagPattern:
         corner: Side of the square that is held at a pinned corner [m], the same on every mesh.
         gravity: Along -z [m/s²]; paper.
         air_density: [kg/m³]; the paper gives none.
+        damping: Rate at which every velocity decays [1/s].
         drag: C of the pressure ½ ρ C U² that the wind exerts on a face at rest across it: that of a square plate.
-        cells: Squares of the mesh along the longer side.
+        cells: Cells along the longer side, each with a vertex.
         quality: Steps of Blender's solver a frame; a power of two.
         frames: Number of frames, of which the first is the rest shape; paper.
         fps: Frames a second; paper.
@@ -96,8 +97,9 @@ class FlagPattern:
     gravity: float = 9.8
     air_density: float = 1.225
     drag: float = 1.28
-    cells: int = 120
-    quality: int = 64
+    damping: float = 0.0
+    cells: int = 90
+    quality: int = 32
     frames: int = 250
     fps: int = 25
     self_collision: bool = False
@@ -111,7 +113,7 @@ class FlagPattern:
         for name in ("youngs_modulus", "density", "thickness", "width", "height", "corner"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"Expected `{name}` to be positive and finite, but got {getattr(self, name)}.")
-        for name in ("ripple", "gravity", "air_density", "drag"):
+        for name in ("ripple", "gravity", "air_density", "drag", "damping"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"Expected `{name}` not to be negative, but got {getattr(self, name)}.")
         for name, least in (("cells", 2), ("quality", 1), ("frames", 2), ("fps", 1)):
@@ -192,7 +194,9 @@ class FlagPattern:
     def material(self) -> ClothMaterial:
         """The sheet that a plate of this thickness is."""
         bending = self.youngs_modulus * self.thickness**3 / (12 * (1 - self.poisson_ratio**2))
-        return ClothMaterial(self.density * self.thickness, self.youngs_modulus * self.thickness, bending)
+        return ClothMaterial(
+            self.density * self.thickness, self.youngs_modulus * self.thickness, bending, air_rate=self.damping
+        )
 
     def pressure(self) -> float:
         """½ ρ C U² [Pa]."""
@@ -224,7 +228,7 @@ def least_quality(pattern: FlagPattern, least: int = 8) -> int:
 PATTERNS = {
     1: FlagPattern(5e3, 0.3, 50.0, (0.0, 0.0, 0.0), "left", texture="white", paper_drag=None, ripple=0.003),
     2: FlagPattern(3e3, 0.3, 30.0, (2.5, 0.5, 0.0), "corners"),
-    3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=160),
+    3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=120),
 }
 """The paper's three patterns. The wind of pattern 3 would blow along the flag's plane: the flag stands at 35 degrees to
 it, so that in patterns 2 and 3 alike the air comes from the camera's side."""
@@ -379,9 +383,9 @@ class Cloth:
     Attributes:
         positions: Vertices at each frame [m], float32, shape (F, V, 3).
         faces: Squares as indices of vertices, their normals on the camera's side; shape (Q, 4).
-        uv: Place of each vertex on the flag, in 0 to 1, shape (V, 2).
-        columns: Squares along u. Vertex i (rows + 1) + j is at u = i / columns, v = j / rows.
-        rows: Squares along v.
+        uv: Place of each vertex on the flag, in 0 to 1, shape (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
+        columns: Faces along u.
+        rows: Faces along v.
         settings: Fields of the :class:`FlagPattern` that rule the motion.
     """
 
@@ -394,15 +398,18 @@ class Cloth:
 
     def sample(self, uv: np.ndarray) -> np.ndarray:
         """Points on the surface at each frame [m] at places (P, 2) of the flag, shape (F, P, 3); bilinear."""
-        place = uv * np.array([self.columns, self.rows])
-        corner = np.minimum(place.astype(np.int64), np.array([self.columns - 1, self.rows - 1]))
-        share = (place - corner).astype(np.float32)
+        i, s = _between(self.uv[:: self.rows + 1, 0], uv[:, 0])
+        j, t = _between(self.uv[: self.rows + 1, 1], uv[:, 1])
         at = self.positions.reshape(len(self.positions), self.columns + 1, self.rows + 1, 3)
-        i, j = corner.T
-        s, t = share[:, :1], share[:, 1:]
         low = (1 - t) * at[:, i, j] + t * at[:, i, j + 1]
         high = (1 - t) * at[:, i + 1, j] + t * at[:, i + 1, j + 1]
         return (1 - s) * low + s * high
+
+
+def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The interval of ascending ``nodes`` that each place (P,) is in, and its share of that, float32, shape (P, 1)."""
+    low = np.searchsorted(nodes[1:-1], places, side="right")
+    return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
 
 
 def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
@@ -549,11 +556,11 @@ VARIANTS = ("steps doubled", "coarser", "finer")
 
 
 def variants(pattern: FlagPattern, names: Iterable[str] = VARIANTS) -> dict[str, FlagPattern]:
-    """The same flag with twice the steps, and on a mesh of half and of one and a half times as many cells along a side.
+    """The same flag with twice the steps, and on a mesh of two and of four thirds as many cells along a side.
 
     Where the mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
     """
-    coarser, finer = replace(pattern, cells=pattern.cells // 2), replace(pattern, cells=3 * pattern.cells // 2)
+    coarser, finer = (replace(pattern, cells=times * pattern.cells // 3) for times in (2, 4))
     table = {
         "steps doubled": replace(pattern, quality=2 * pattern.quality),
         "coarser": replace(coarser, quality=least_quality(coarser)),

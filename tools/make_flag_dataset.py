@@ -77,8 +77,8 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
 
 
 def picture_settings(pattern: FlagPattern, texture: np.ndarray, pictures: Pictures) -> dict[str, Any]:
-    """What all pictures of a flag depend on."""
-    shape = {name: getattr(pattern, name) for name in ("width", "height", "yaw", "ripple", "cells")}
+    """What all pictures of a flag depend on; those of its motion depend on that as well."""
+    shape = {name: getattr(pattern, name) for name in ("width", "height", "yaw", "ripple")}
     digest = hashlib.sha256(np.ascontiguousarray(texture).tobytes()).hexdigest()[:16]
     return shape | {"texture": digest, "samples": pictures.samples, "transfer": pictures.transfer}
 
@@ -258,8 +258,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), default=sorted(PATTERNS), help="which flags")
     add("--only", nargs="+", choices=PARTS, default=list(PARTS), help="which parts")
     add("--preview", action="store_true", help="coarse mesh, small pictures, every tenth frame")
-    add("--cells", type=int, help="squares of the mesh along the longer side (120, 120, 160)")
-    add("--quality", type=int, help="steps of the solver a frame, a power of two (64; else what the mesh needs)")
+    add("--cells", type=int, help="cells of the mesh along the longer side (90, 90, 120)")
+    add("--quality", type=int, help="steps of the solver a frame, a power of two (32; else what the mesh needs)")
     add("--frames", type=int, help="number of frames, of which the first is the rest shape (250)")
     add("--flag-size", type=float, nargs=2, metavar=("WIDTH", "HEIGHT"), help="sides of the flag [m]")
     add("--texture", help="white, stripes, or the path of an image")
@@ -291,7 +291,7 @@ def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
         given["width"], given["height"] = options.flag_size
     pattern = PATTERNS[number]
     if options.preview:
-        given = {"cells": pattern.cells // 4} | given
+        given = {"cells": pattern.cells // 3} | given
     pattern = replace(pattern, **given)
     return replace(pattern, quality=options.quality or reference.least_quality(pattern))
 

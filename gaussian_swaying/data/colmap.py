@@ -55,18 +55,12 @@ def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str],
     Raises:
         ValueError: If a file is missing or damaged, or a camera model has a distortion that cannot be undone here.
     """
-    lenses: dict[int, Lens] = _read(model, "cameras", _binary_cameras, _text_cameras)
-    rows: list[tuple[str, tuple[float, ...], int]] = _read(model, "images", _binary_images, _text_images)
     posed: list[PosedImage] = []
     missing: list[str] = []
-    for name, pose, camera in rows:
-        where = f"The image {name} of the COLMAP model {model}"
-        if camera not in lenses:
-            raise ValueError(f"{where} names camera {camera}, which is not in `cameras`: export the model again.")
-        world_to_camera = _pose(where, pose)
+    for name, lens, world_to_camera in read_colmap_views(model):
         path = images / name
         if path.is_file():
-            posed.append(PosedImage(name, path, lenses[camera], world_to_camera))
+            posed.append(PosedImage(name, path, lens, world_to_camera))
         else:
             missing.append(name)
     if not any((model / f"points3D{suffix}").is_file() for suffix in (".bin", ".txt")):
@@ -78,6 +72,29 @@ def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str],
         return posed, missing, None
     points, colors = torch.from_numpy(table[:, :3]).float(), torch.from_numpy(table[:, 3:]).float() / 255
     return posed, missing, (points, colors)
+
+
+def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
+    """Read the cameras of a sparse model alone; the images themselves need not be there.
+
+    Args:
+        model: Folder of the model.
+
+    Returns:
+        Name, lens and world-to-camera matrix (float64, shape (4, 4)) of each image, in the order of the file.
+
+    Raises:
+        ValueError: If a file is missing or damaged, or a camera model has a distortion that cannot be undone here.
+    """
+    lenses: dict[int, Lens] = _read(model, "cameras", _binary_cameras, _text_cameras)
+    rows: list[tuple[str, tuple[float, ...], int]] = _read(model, "images", _binary_images, _text_images)
+    views = []
+    for name, pose, camera in rows:
+        where = f"The image {name} of the COLMAP model {model}"
+        if camera not in lenses:
+            raise ValueError(f"{where} names camera {camera}, which is not in `cameras`: export the model again.")
+        views.append((name, lenses[camera], _pose(where, pose)))
+    return views
 
 
 def _pose(where: str, pose: tuple[float, ...]) -> Tensor:

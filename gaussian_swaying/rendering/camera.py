@@ -288,34 +288,62 @@ def camera_from_transforms(
         ValueError: If the file is missing, is not JSON, lacks a field or has a bad one. The message names the file,
             the field and the remedy.
     """
-    where = f"`{path}`"
     if isinstance(frame, bool) or not isinstance(frame, int):
         raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
-    for name, size in (("width", width), ("height", height)):
-        if size is not None:
-            _check_pixels(name, size)
-    data = load_transforms(path)
+    return camera_of_transforms(path, load_transforms(path), frame, width, height, near)
+
+
+def camera_of_transforms(
+    path: str | Path,
+    data: dict[str, Any],
+    frame: int,
+    width: int | None = None,
+    height: int | None = None,
+    near: float = 0.01,
+) -> Camera:
+    """One camera of a ``transforms.json`` that :func:`load_transforms` has read; see :func:`camera_from_transforms`."""
+    where = f"`{path}`"
     frames = data["frames"]
     if not 0 <= frame < len(frames):
         raise ValueError(f"The camera file {where} has no frame {frame}: set `frame` between 0 and {len(frames) - 1}.")
-    fields = {**data, **frames[frame]}
-    pixels = read_intrinsics(where, fields, width, height)
-    native_width, native_height, fx, fy, cx, cy = pixels
-    if width is None and height is None:
-        width, height = round(native_width), round(native_height)
-    elif width is None and height is not None:
-        width = max(1, round(height * native_width / native_height))
-    elif width is not None and height is None:
-        height = max(1, round(width * native_height / native_width))
-    assert width is not None
-    assert height is not None
-    scale_x, scale_y = width / native_width, height / native_height
-    intrinsics = torch.tensor(
-        [[fx * scale_x, 0.0, cx * scale_x], [0.0, fy * scale_y, cy * scale_y], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )
-    camera_to_world = read_pose(where, frame, frames[frame])
-    world_to_camera = torch.linalg.inv(camera_to_world)
+    for name, size in (("width", width), ("height", height)):
+        if size is not None:
+            _check_pixels(name, size)
+    pixels = read_intrinsics(where, {**data, **frames[frame]}, width, height)
+    intrinsics, width, height = resized_intrinsics(*pixels, width, height)
+    world_to_camera = torch.linalg.inv(read_pose(where, frame, frames[frame]))
     return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
+
+
+def resized_intrinsics(
+    w: float, h: float, fx: float, fy: float, cx: float, cy: float, width: int | None, height: int | None
+) -> tuple[Tensor, int, int]:
+    """Intrinsics of the same view in another number of pixels.
+
+    Args:
+        w: Width that the intrinsics belong to [pixels].
+        h: Height that they belong to [pixels].
+        fx: Focal length along the rows [pixels].
+        fy: Focal length along the columns [pixels].
+        cx: Column of the principal point [pixels].
+        cy: Row of the principal point [pixels].
+        width: Wanted width [pixels]; by default the present one, or the one that keeps the aspect ratio.
+        height: Wanted height [pixels], likewise.
+
+    Returns:
+        Matrix in float64, shape (3, 3), width and height.
+    """
+    if width is None:
+        width = round(w) if height is None else max(1, round(height * w / h))
+        height = round(h) if height is None else height
+    elif height is None:
+        height = max(1, round(width * h / w))
+    x, y = width / w, height / h
+    return (
+        torch.tensor([[fx * x, 0.0, cx * x], [0.0, fy * y, cy * y], [0.0, 0.0, 1.0]], dtype=torch.float64),
+        width,
+        height,
+    )
 
 
 def load_transforms(path: str | Path) -> dict[str, Any]:
@@ -405,7 +433,13 @@ def read_pose(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
 
 
 class CameraPath(ABC):
-    """Base class of the camera paths that a configuration can name."""
+    """Base class of the camera paths that a configuration can name.
+
+    Attributes:
+        captured: Whether the cameras stood where photographs were taken, be it within the object's box.
+    """
+
+    captured: bool = False
 
     @abstractmethod
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
@@ -551,6 +585,8 @@ class TransformsCamera(CameraPath):
         TypeError: If an argument has the wrong type.
         ValueError: If a number is out of range; at the first frame, if the file is bad.
     """
+
+    captured = True
 
     def __init__(
         self,

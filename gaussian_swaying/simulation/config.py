@@ -15,11 +15,15 @@ import torch
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.data.capture_camera import CaptureCamera
+from gaussian_swaying.mpm.boundary import RegionInFrame
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.camera import CameraPath, OrbitCamera
+from gaussian_swaying.rendering.keyframes import KeyframedCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.physgaussian import Normalisation, convert, read_config, to_yaml
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.physgaussian import Normalisation, PhysGaussianCamera, convert, read_config, to_yaml
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
@@ -27,6 +31,8 @@ from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
+# imported so that a configuration can name them without their modules
+CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
 # what may change between a run and the one that resumes it
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
 
@@ -48,6 +54,27 @@ class PhysGaussianAction(Action):
             print(f"note: {note}", file=sys.stderr)
 
 
+class PresetAction(Action):
+    """Takes the file of the same name in a folder beside the configuration given before."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Merge the preset into what was parsed so far."""
+        from jsonargparse import ActionConfigFile
+
+        given = [file for file in namespace.get("config") or [] if file is not None]
+        if not given:
+            raise TypeError("Expected --config before --preset, which belongs to a configuration.")
+        config = Path(str(given[-1]))
+        preset = config.parent / str(values) / config.name
+        if not preset.is_file():
+            there = sorted(path.parent.name for path in config.parent.glob(f"*/{config.name}"))
+            raise TypeError(
+                f"There is no preset `{values}` of {config}: {preset} is missing"
+                + (f"; there is {', '.join(there)}." if there else "; leave out --preset.")
+            )
+        ActionConfigFile.apply_config(parser, namespace, "config", str(preset))
+
+
 def build_parser() -> ArgumentParser:
     """The parser of ``tools/sim.py``: one group of options per component, typos are errors."""
     from jsonargparse import ActionYesNo, ArgumentParser
@@ -64,6 +91,13 @@ def build_parser() -> ArgumentParser:
         action=PhysGaussianAction,
         default=SUPPRESS,
         help="The same for a JSON file of PhysGaussian, which is converted.",
+    )
+    parser.add_argument(
+        "--preset",
+        action=PresetAction,
+        default=SUPPRESS,
+        help="preview: fewer Gaussians, a coarser grid and a small picture, for a laptop; options given after it "
+        "override it.",
     )
     parser.add_argument("--output", type=str | None, help="Folder of the results. Default: outputs/<config name>.")
     parser.add_argument(
@@ -94,6 +128,20 @@ def build_parser() -> ArgumentParser:
     parser.add_class_arguments(AeroForce, "aero")
     parser.add_subclass_arguments(Shader, "shader", required=False, help="Shading; null keeps the splat's colours.")
     parser.add_subclass_arguments(CameraPath, "camera", required=False, help="Where each frame is seen from.")
+    parser.add_argument(
+        "--edits",
+        type=list[Edit],
+        default=[],
+        help="Changes of a part of the object: its `region` (at rest, scene units; null for all that moves), the "
+        "`time` from which they hold [s], any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a `color` (red, "
+        "green, blue in [0, 1]) with the part `detail` of the old differences in brightness.",
+    )
+    parser.add_argument(
+        "--cameras",
+        type=dict[str, CameraPath] | None,
+        default=None,
+        help="Further cameras by name; their pictures and videos are in the folders cameras/NAME.",
+    )
     parser.add_class_arguments(Recorder, "recorder")
     return parser
 
@@ -127,7 +175,12 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
     parts = parser.instantiate(settings)
     solver = parts.solver
     if parts.normalisation is not None:
-        parts.normalisation.place(parts.scene, parts.material, solver, parts.get("camera"))
+        frame = parts.normalisation.place(parts.scene, parts.material, solver, parts.get("camera"))
+        for path in (parts.get("cameras") or {}).values():
+            if isinstance(path, PhysGaussianCamera):
+                path.frame = frame
+        for edit in parts.edits:
+            edit.region = None if edit.region is None else RegionInFrame(edit.region, frame)
     scene = SimulatedScene(parts.scene, parts.material, solver.dx, getattr(torch, settings.dtype))
     pipeline = SimulationPipeline(
         scene,
@@ -139,6 +192,8 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
         background=check_vector("background", settings.background),
         frame_dt=settings.frame_dt,
         device=device,
+        cameras=parts.get("cameras"),
+        edits=parts.edits,
     )
     return pipeline, parts.recorder
 

@@ -6,7 +6,7 @@ import math
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -21,11 +21,12 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale
+from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering import passes
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
-from gaussian_swaying.rendering.camera import Camera, CameraPath, TransformsCamera
+from gaussian_swaying.rendering.camera import Camera, CameraPath
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
@@ -35,7 +36,8 @@ from gaussian_swaying.simulation.diagnostics import (
     diagnose,
     measure,
 )
-from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.edits import Edit, SceneEditor
+from gaussian_swaying.simulation.recorder import Recorder, check_camera_name, frame_folder
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_RETRIES = 4
@@ -60,6 +62,8 @@ class SimulationPipeline(nn.Module):
         frame_dt: Time between frames [s].
         device: Where to run.
         renderer: Draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
+        cameras: Further cameras by name, each with pictures and videos of its own.
+        edits: Changes of material or colour, at load or during the run.
     """
 
     def __init__(
@@ -74,17 +78,23 @@ class SimulationPipeline(nn.Module):
         frame_dt: float = 0.04,
         device: torch.device | str = "cpu",
         renderer: Renderer | None = None,
+        cameras: Mapping[str, CameraPath] | None = None,
+        edits: Sequence[Edit] = (),
     ) -> None:
         super().__init__()
         check_positive("frame_dt", frame_dt)
         self.scene, self.solver, self.wind, self.aero, self.shader = scene, solver, wind, aero, shader
-        self.camera, self.frame_dt = camera, float(frame_dt)
+        self.camera, self.cameras, self.frame_dt = camera, dict(cameras or {}), float(frame_dt)
+        for name in self.cameras:
+            check_camera_name(name)
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
         self.background: Tensor
         self.to(device)
+        self.editor = SceneEditor(scene, edits)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
         self._most_substeps = sys.maxsize
         self.idle = self.aero.idle  # asked once, as it makes the host wait
+        self._force_end = self.force_scale()  # likewise
         self._tearing: TearingGauge | None = None
         self._load: WindLoad | None = None
         self._load_parts: tuple[object, ...] = ()
@@ -97,18 +107,75 @@ class SimulationPipeline(nn.Module):
     # ---- simulation
 
     def start(self) -> MPMState:
-        """The state at rest, time zero.
+        """The state at rest, time zero, with the edits of that time.
 
         Raises:
-            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long.
+            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long, now or after one
+                of the edits.
         """
-        state = self.solver.init_state(self.scene.points, frame=self.scene.frame)
-        self.idle = self.aero.idle
+        editor, frame = self.editor, self.scene.frame
+        editor.reset()
+        for later in (moment for moment in editor.times if moment > 0):  # what they make impossible is refused now
+            self._edit(editor.due(0.0))
+            self._edit(editor.due(later), flowed=True)
+            rehearsed = self.solver.init_state(self.scene.points, frame=frame)
+            self.solver.fused()
+            self.solver.substeps(rehearsed, self.frame_dt)
+        editor.reset()
+        self._edit(editor.due(0.0))
+        state = self.solver.init_state(self.scene.points, frame=frame)
+        self.idle, self._force_end = self.aero.idle, self.force_scale()
         check_spacing(self.solver)
         self.solver.fused()  # what its kernels refuse is refused here
         self._most_substeps = MAX_GROWTH * self.solver.substeps(state, self.frame_dt)
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
+
+    def edit(self, state: MPMState, *edits: Edit) -> MPMState:
+        """Change material or colour now, between two frames; the time of the edits is not looked at.
+
+        The solver takes the material anew, and with it its kernels and CUDA graphs. Positions, velocities and
+        deformations stay, so momentum changes with the mass and elastic energy with the stiffness.
+
+        Args:
+            state: The state now.
+            edits: What to change, in this order.
+
+        Returns:
+            The state with which the run goes on.
+
+        Raises:
+            ValueError: If a region holds nothing, or a law flows in the ``total`` formulation.
+        """
+        return self._take(state, self._edit(edits, flowed=True))
+
+    def _edit(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
+        """Change the scene; which particles (P,) have another law then, None if the material is the same."""
+        changed = [self.editor.apply(edit, flowed) for edit in edits]
+        changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
+        return torch.stack(changed).any(0) if changed else None
+
+    def _take(self, state: MPMState, changed: Tensor | None) -> MPMState:
+        """Bind the solver to the material of the scene; ``changed`` as of :meth:`_edit`."""
+        if changed is None:
+            return state
+        start = self.solver.init_state(self.scene.points, frame=self.scene.frame).internal
+        if start is not None and state.internal is not None:
+            start = torch.where(changed, start, state.internal)
+        state = state.replace(internal=start)
+        self.solver.fused()
+        self._most_substeps = max(self._most_substeps, MAX_GROWTH * self.solver.substeps(state, self.frame_dt))
+        if self._tearing is not None:
+            elastic = self.solver.laws.elastic_particles()
+            if elastic is not None:  # what has flowed apart before is no tear
+                self._tearing.elastic = elastic if self._tearing.elastic is None else elastic & self._tearing.elastic
+        return state
+
+    def _edit_due(self, state: MPMState, resumed: bool = False) -> MPMState:
+        """The state after the edits up to its time; a resumed state has seen them already."""
+        edits = self.editor.due(float(state.time) + 1e-3 * self.frame_dt)
+        edited = self._take(state, self._edit(edits, flowed=True))
+        return state if resumed else edited
 
     @property
     def load(self) -> WindLoad:
@@ -196,30 +263,37 @@ class SimulationPipeline(nn.Module):
 
     # ---- picture
 
-    def camera_at(self, frame: int) -> Camera:
-        """The camera of a frame, on the device and in the precision of the Gaussians; one copy, which nobody awaits."""
-        return self._camera(frame).to(self.device, self.scene.model.means.dtype)
+    def camera_at(self, frame: int, name: str = "") -> Camera:
+        """The camera of a frame, on the device and in the precision of the Gaussians; one copy, which nobody awaits.
 
-    def _camera(self, frame: int) -> Camera:
+        Args:
+            frame: Frame number.
+            name: Which of ``cameras``; empty for ``camera``.
+        """
+        return self._camera(frame, name).to(self.device, self.scene.model.means.dtype)
+
+    def _camera(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, in float64 on the host."""
-        scene = self.scene
-        return self.camera(frame, frame * self.frame_dt, scene.center, scene.frame.rotation[2], scene.size)
+        scene, path = self.scene, self.cameras[name] if name else self.camera
+        return path(frame, frame * self.frame_dt, scene.center, scene.frame.rotation[2], scene.size)
 
     def check_camera(self, frame: int) -> None:
-        """Raise ValueError if the camera of a frame lies inside the box of the object at rest.
+        """Raise ValueError if a camera of a frame lies inside the box of the object at rest.
 
         Not asked of cameras of a capture, which stood where they stood: around an object or in a room.
         """
-        if isinstance(self.camera, TransformsCamera):
-            return
-        camera, (low, high) = self._camera(frame), self.scene.bounds
-        eye = camera.position.to(low)
-        if bool(((eye > low) & (eye < high)).all()):
-            raise ValueError(
-                f"The camera at {[round(v, 3) for v in eye.tolist()]} lies inside the object, whose box reaches from "
-                f"{[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene units): move "
-                "it out with `camera.init_args.radius` or `eye`."
-            )
+        low, high = self.scene.bounds
+        for name, path in {"": self.camera, **self.cameras}.items():
+            if path.captured:
+                continue
+            eye = self._camera(frame, name).position.to(low)
+            if bool(((eye > low) & (eye < high)).all()):
+                field = f"cameras.{name}" if name else "camera"
+                raise ValueError(
+                    f"The camera at {[round(v, 3) for v in eye.tolist()]} lies inside the object, whose box reaches "
+                    f"from {[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene "
+                    f"units): move it out with `{field}.init_args.radius` or `eye`."
+                )
 
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
         """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
@@ -252,6 +326,48 @@ class SimulationPipeline(nn.Module):
         camera = self.camera_at(frame)
         gaussians, colours = self.shade(state, camera)
         return self.draw(gaussians, colours, camera)
+
+    def wind_pressure(self, state: MPMState) -> Tensor:
+        """Force of the wind per area of the patches as they are now [Pa], shape (P,); 0 for what feels no wind."""
+        area = self.scene.patch_area
+        if self.idle:
+            return torch.zeros_like(area)
+        normal, _ = deform_patch(state.F_total, self.scene.patch_normal, area)
+        wind = self.load.winds(state.time, 0.0, 1)[0]
+        force = self.aero(wind, state.velocity, normal, torch.ones_like(area))
+        return torch.where(area > 0, torch.linalg.vector_norm(force, dim=-1), 0.0)
+
+    def force_scale(self) -> float:
+        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
+        speed = float(torch.linalg.vector_norm(self.wind.flows, dim=-1).amax())
+        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).abs().sum())
+        return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
+
+    def draw_normals(self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera") -> Tensor:
+        """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3).
+
+        Args:
+            gaussians: In scene units.
+            camera: The camera, on the device of the Gaussians.
+            axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (z up).
+        """
+        normals = passes.facing(gaussians.normals, gaussians.means - camera.position.to(gaussians.means))
+        picture = self._draw(gaussians, normals, camera)
+        if axes == "world":
+            rotation = self.scene.frame.direction_to_sim(self.scene.identity).mT  # its rows are the scene's axes
+        else:
+            rotation = torch.cat([camera.world_to_camera[:1, :3], -camera.world_to_camera[1:3, :3]])
+        return passes.normal_colors(picture.color, picture.alpha, rotation)
+
+    def draw_force(self, state: MPMState, gaussians: DeformedGaussians, camera: Camera, largest: float) -> Tensor:
+        """Picture of :meth:`wind_pressure`, its colours ending at ``largest`` [Pa], shape (H, W, 3)."""
+        pressure = self.scene.on_gaussians(self.wind_pressure(state))
+        picture = self._draw(gaussians, pressure[:, None].expand(-1, 3), camera)
+        return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest)
+
+    def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
+        """Blend any three numbers of each Gaussian."""
+        return self.renderer(gaussians.means, gaussians.covariances, self.scene.model.opacity(), values, camera)
 
     def cloud(self, gaussians: DeformedGaussians) -> GaussianCloud:
         """Deformed Gaussians in storage form, harmonics turned with the patches."""
@@ -307,7 +423,7 @@ class SimulationPipeline(nn.Module):
         for frame in range(frames):
             self.check_camera(frame)
         state = self.start()  # what is refused is refused before anything is written
-        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt)
+        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt, tuple(self.cameras))
         first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
         if checkpoint is not None:
             state = MPMState.from_state_dict(checkpoint["state"], self.device)
@@ -316,6 +432,7 @@ class SimulationPipeline(nn.Module):
                     f"The checkpoint in {output} holds {len(state.position)} particles, but the scene has "
                     f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
                 )
+            state = self._edit_due(state, resumed=True)
             first, log = checkpoint["frame"] + 1, checkpoint["log"]
             if first > frames:
                 raise ValueError(
@@ -330,6 +447,7 @@ class SimulationPipeline(nn.Module):
                 with walls("simulation"):
                     if frame > 0:
                         state, health = self.advance(state)
+                        state = self._edit_due(state)
                     else:
                         health = diagnose(self.solver, state, 0, 0.0)
                 self._record(recorder, state, frame, walls)
@@ -363,6 +481,8 @@ class SimulationPipeline(nn.Module):
             bar.close()
             summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log[:done], frames, walls, peak) | (settings or {})
+            if recorder.images and "force" in recorder.renders:
+                summary["force_scale_Pa"] = recorder.force_scale or self._force_end
             # the video of a run that was stopped early is made too: nothing that was recorded is lost
             self.files = []
             try:
@@ -380,19 +500,46 @@ class SimulationPipeline(nn.Module):
         exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
         if recorder.images or exporting:
             with walls("shading"):
-                camera = self.camera_at(frame)
-                gaussians, colours = self.shade(state, camera)
+                gaussians = self.scene.deformed(state, rotations=self.scene.model.view_dependent)
         if recorder.images:
-            with walls("rendering"):
-                image = self.draw(gaussians, colours, camera).color
-            with walls("writing"):
-                recorder.write_image(frame, image)
+            for name in ("", *self.cameras):
+                self._picture(recorder, state, gaussians, frame, name, walls)
         with walls("writing"):
             if exporting:
-                cloud = self.cloud(gaussians)
-                recorder.write_ply(frame, lambda path: write_ply(path, cloud))
+                recorder.write_splat(frame, self.cloud(gaussians), self.scene.frame)
             if recorder.trajectory:
                 recorder.write_trajectory(frame, state.position, state.F_total)
+
+    def _picture(
+        self, recorder: Recorder, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str, walls: _Walls
+    ) -> None:
+        """Draw and hand over what is wanted of a frame from one camera."""
+        with walls("shading"):
+            camera = self.camera_at(frame, name)
+            colours = self.colors(gaussians, camera)
+        images: dict[str, Tensor] = {}
+        with walls("rendering"):
+            if {"color", "depth"} & set(recorder.renders):
+                picture = self.draw(gaussians, colours, camera)
+                images["color"] = picture.color
+            if "depth" in recorder.renders:
+                depth, (near, far) = passes.mean_depth(picture), self._depth_range(frame, name)
+                images["depth"] = passes.depth_colors(depth, near, far)
+                steps = passes.depth_steps(depth, recorder.depth_step / self.scene.frame.metres_per_unit)
+            if "normal" in recorder.renders:
+                images["normal"] = self.draw_normals(gaussians, camera, recorder.normal_axes)
+            if "force" in recorder.renders:
+                images["force"] = self.draw_force(state, gaussians, camera, recorder.force_scale or self._force_end)
+        with walls("writing"):
+            for render in recorder.renders:
+                recorder.write_image(frame, images[render], frame_folder(render, name))
+            if "depth" in recorder.renders:
+                recorder.write_depth(frame, steps, frame_folder("depth", name))
+
+    def _depth_range(self, frame: int, name: str) -> tuple[float, float]:
+        """Ends of the depth's colours [scene units]: the object's longest side before its centre, and behind it."""
+        distance = float((self._camera(frame, name).position.to(self.scene.center) - self.scene.center).norm())
+        return distance - self.scene.size, distance + self.scene.size
 
     def _summary(
         self, state: MPMState, log: list[dict[str, float]], frames: int, walls: _Walls, peak: _PeakMemory
@@ -417,9 +564,11 @@ class SimulationPipeline(nn.Module):
                 "rotation": self.scene.frame.rotation.tolist(),
                 "metres_per_unit": self.scene.frame.metres_per_unit,
             },
+            "size_m": self.scene.size * self.scene.frame.metres_per_unit,
             "frames": len(log),
             "frames_wanted": frames,
             "frame_dt_s": self.frame_dt,
+            "edits": self.editor.applied,
             "substeps": int(sum(entry["substeps"] for entry in log)),
             "simulated_s": float(state.time),
             "wall_s": walls.read(wait=True),

@@ -18,7 +18,9 @@ from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder, Not, Region, Union
-from gaussian_swaying.gaussians.surface import smallest_axis_normal
+from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, smallest_axis_normal
+from gaussian_swaying.simulation.frame import SimFrame
+from gaussian_swaying.simulation.lean import SHELL_E, SHELL_THICKNESS, cantilever_lean, stiffness_for, thinned
 
 CELLS = 24  # along the longest side: enough to bend, few enough for a laptop
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
@@ -122,9 +124,13 @@ def bounds(points: Tensor, share: float = 0.005) -> dict[str, list[float]]:
         ``min``, ``max``, ``robust_min`` and ``robust_max``, 3 numbers each.
     """
     check_shape("points", points, None, 3)
-    low, high = (torch.stack([_quantile(c, q) for c in points.unbind(-1)]) for q in (share, 1 - share))
-    corners = {"min": points.amin(0), "max": points.amax(0), "robust_min": low, "robust_max": high}
-    return {name: [float(v) for v in corner] for name, corner in corners.items()}
+    low, high = ([_quantile(c, q) for c in points.unbind(-1)] for q in (share, 1 - share))
+    return {
+        "min": [float(v) for v in points.amin(0)],
+        "max": [float(v) for v in points.amax(0)],
+        "robust_min": low,
+        "robust_max": high,
+    }
 
 
 def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
@@ -148,6 +154,148 @@ def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
         "S2_over_S3": _three(s2 / s3),
         "size_share": _three(s1 / max(longest, 1e-30)),
     }
+
+
+# ---- all of it
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Everything that a first configuration needs.
+
+    Attributes:
+        up: Which way is up.
+        region: What is simulated.
+        hold: At which end it is held.
+        pin: That end as a region, None if it is not held.
+        longest_side: Length given to the longest side of the object [m].
+        metres_per_unit: Length of a scene unit that follows [m].
+        size: Sides of the object along the z-up axes [m].
+        spacing: Particle spacing [m], see :func:`particle_spacing`.
+        dx: Grid spacing [m].
+        sheet: Whether the object is a thin sheet.
+        azimuth: Azimuth of a camera that sees the broad side [degrees].
+        flow: Wind across the picture, or along a sheet from where it is held [m/s], z up.
+        youngs_modulus: Young's modulus of what is no sheet [Pa].
+        thickness: Its thickness [m].
+        stiffness_reason: Why, in words.
+    """
+
+    up: UpGuess
+    region: RegionGuess
+    hold: HoldGuess
+    pin: Region | None
+    longest_side: float
+    metres_per_unit: float
+    size: tuple[float, ...]
+    spacing: float
+    dx: float
+    sheet: bool
+    azimuth: float
+    flow: tuple[float, ...]
+    youngs_modulus: float
+    thickness: float
+    stiffness_reason: str
+
+
+def suggest(
+    cloud: GaussianCloud,
+    up: Sequence[float] | str | None = None,
+    hold: str | None = None,
+    region: tuple[Sequence[float], Sequence[float]] | None = None,
+    longest_side: float = 1.0,
+    speed: float = 6.0,
+) -> Suggestion:
+    """Guess a first configuration.
+
+    Args:
+        cloud: The splat.
+        up: Direction that points up, as 3 numbers or as ``+x`` to ``-z``; guessed if None.
+        hold: ``top``, ``bottom``, ``none`` or ``+x`` to ``-z``; guessed if None.
+        region: Corners of the box to simulate [scene units]; guessed if None.
+        longest_side: Length of the longest side of the object [m].
+        speed: Speed of the wind [m/s].
+
+    Returns:
+        The suggestion.
+
+    Raises:
+        ValueError: If the splat has too few Gaussians, or what was given does not fit it.
+    """
+    check_positive("--longest-side", longest_side)
+    check_positive("--wind", speed, allow_zero=True)
+    if len(cloud) < FEWEST:
+        raise ValueError(
+            f"The splat holds {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed."
+        )
+    means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
+    normals = smallest_axis_normal(cloud.quats, cloud.scales)
+    upward = guess_up(means, normals, weight) if up is None else given_up(up, means, normals, weight)
+    corner = bounds(means)
+    side = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
+    if side <= 0:
+        raise ValueError("All Gaussians of the splat lie at one point: there is no object to simulate.")
+    if region is None:
+        cell = max(side / CELLS, 2 * particle_spacing(means))
+        chosen = suggest_region(means, opacity, weight, upward.ground, cell)
+    else:
+        chosen = given_region(means, opacity, weight, *region)
+    points, visible = means[chosen.simulated], weight[chosen.simulated]
+    frame = SimFrame.fit(points, upward.direction, longest_side)
+    metres = frame.point_to_sim(points.double())
+    spacing = particle_spacing(points) * frame.metres_per_unit
+    dx = suggest_spacing(longest_side, spacing)
+    ground = bool(upward.ground.any())
+    held = guess_hold(points, visible, upward.direction, ground) if hold is None else given_hold(hold, upward.direction)
+    pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
+    azimuth = broad_side(metres)
+    flow = _across_picture(azimuth, speed)
+    flat = sheet_normal(points)
+    if held.end == "side" and flat is not None:  # from the pole on, and a little onto the sheet
+        away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
+        onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
+        flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
+    elif flat is not None:  # a curtain is moved by wind onto it
+        flow = _across_picture(azimuth - 90, speed)
+    modulus, why = SHELL_E, "soft rubber"
+    thickness = SHELL_THICKNESS * longest_side
+    if held.end == "bottom" and flat is None and pin is not None and speed > 0:
+        part = thinned(cloud.select(chosen.simulated))
+        patches = GaussianSurfaceModel.from_cloud(part, requires_grad=False)
+        area = frame.area_to_sim(patches.areas("coverage").double())
+        normal = frame.direction_to_sim(patches.normals().double())
+        foot = metres[pin.contains(points)]
+        where = frame.point_to_sim(part.means.double())
+        height = (where[:, 2] - foot[:, 2].amax()).clamp(min=0)
+        lean = cantilever_lean(where, height, normal, area, flow, SHELL_E, thickness, dx) / longest_side
+        modulus, gain = stiffness_for(lean)
+        flow = tuple(c * gain for c in flow)
+        why = (
+            f"as a beam it then leans by about {lean * SHELL_E / modulus * gain**2:.2g} of its longest side on average"
+        )
+    return Suggestion(
+        up=upward,
+        region=chosen,
+        hold=held,
+        pin=pin,
+        longest_side=float(longest_side),
+        metres_per_unit=frame.metres_per_unit,
+        size=tuple(float(v) for v in metres.amax(0) - metres.amin(0)),
+        spacing=spacing,
+        dx=dx,
+        sheet=flat is not None,
+        azimuth=round(azimuth + 20.0, 1),
+        flow=tuple(round(c, 2) + 0.0 for c in flow),
+        youngs_modulus=modulus,
+        thickness=thickness,
+        stiffness_reason=why,
+    )
+
+
+def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
+    """Horizontal flow to the right of a picture from an azimuth [degrees]."""
+    angle = math.radians(azimuth)
+    return (-speed * math.sin(angle), speed * math.cos(angle), 0.0)
 
 
 # ---- up
@@ -207,11 +355,22 @@ def sheet_normal(points: Tensor) -> tuple[float, ...] | None:
     return _snapped(axes[:, 0])
 
 
+def _floor_score(points: Tensor, floor: Tensor, up: Sequence[float]) -> float:
+    """3 for a floor from which something rises by 0.3 of its width or more, less for what is flat, as on a wall."""
+    axis = torch.tensor(up, dtype=torch.float64)
+    rest = points[~floor].double() @ axis
+    width = min(
+        _quantile(c, 0.98) - _quantile(c, 0.02) for c in (points[floor].double() @ a for a in _plane_axes(axis))
+    )
+    return 3 * min(1.0, (_quantile(rest, 0.98) - _quantile(rest, 0.02)) / max(0.3 * width, 1e-30))
+
+
 def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
     """The scene axis that most likely points up.
 
     Each of the six directions along an axis collects points: for convention (z up and y down 0.75, y up 0.5, others
-    -1), for a floor below (3), for the origin at the lower end (1), and for the axis being the longest
+    -1), for a floor below (3, less if
+    what is on it is flat), for the origin at the lower end (1), and for the axis being the longest
     (log2 of its ratio to the next, up to 1.5); a thin sheet hangs, so its normal loses 1. A lead of 2 over the
     next is called high confidence, of 1 medium.
 
@@ -239,8 +398,9 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
             reasons.append(f"{convention[name]} (+{points_for:g})")
         floors[name] = floor_mask(points, normals, weight, direction)
         if bool(floors[name].any()):
-            points_for += 3
-            reasons.append("a level floor lies at the lower end (+3)")
+            gain = _floor_score(points, floors[name], direction)
+            points_for += gain
+            reasons.append(f"a level floor lies at the lower end (+{gain:.2g})")
         near, far = (low[axis], high[axis]) if name[0] == "+" else (high[axis], low[axis])
         if side[axis] > 0 and abs(near) < 0.05 * side[axis] < abs(far):
             points_for += 1
@@ -332,7 +492,7 @@ def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tens
     """The main object without floor and specks.
 
     The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks within its box are
-    cut out by boxes of their own, the heaviest first.
+    cut out by boxes of their own, the largest first.
 
     Args:
         points: Centres [scene units], shape (N, 3).
@@ -365,13 +525,10 @@ def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tens
         low, high = _without(low, high, points[chosen], points[ground])
     box = Box(low, high)
     holes: list[tuple[list[float], list[float]]] = []
-    inside = box.contains(points) & solid
-    stray = index[inside[index] & (part != main)]
-    by_part = dict(zip(index.tolist(), part.tolist(), strict=True))
-    counts: dict[int, list[int]] = {}
-    for i in stray.tolist():
-        counts.setdefault(by_part[i], []).append(i)
-    for members in sorted(counts.values(), key=len, reverse=True):
+    stray = box.contains(points[index]) & (part != main)
+    numbers, counts = part[stray].unique(return_counts=True)
+    for number in numbers[counts.argsort(descending=True)][: 4 * MAX_BOXES].tolist():
+        members = index[stray & (part == number)]
         hole = _padded(points[members], 0.05 * cell)
         caught = Box(*hole).contains(points) & chosen
         if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # worth what it costs the object
@@ -437,7 +594,7 @@ def guess_hold(points: Tensor, weight: Tensor, up: Sequence[float], ground: bool
         The guess.
     """
     axis = torch.tensor(up, dtype=torch.float64)
-    upward, downward = tuple(up), tuple(-c for c in up)
+    upward, downward = tuple(up), tuple(0.0 - c for c in up)
     if ground:
         return HoldGuess("bottom", downward, "medium", "it stands on a floor")
     normal = sheet_normal(points)
@@ -447,7 +604,7 @@ def guess_hold(points: Tensor, weight: Tensor, up: Sequence[float], ground: bool
         along = points.double() @ across
         low, high = float(along.amin()), float(along.amax())
         for end, sign, other in ((low, -1.0, high), (high, 1.0, low)):
-            if abs(end) < 0.03 * (high - low) < abs(other):
+            if abs(end) < 0.05 * (high - low) < abs(other):
                 held = tuple(float(sign * c) + 0.0 for c in across)
                 return HoldGuess("side", held, "medium", "it is an upright sheet, and the origin lies at this side")
         return HoldGuess("top", upward, "low", "it is an upright sheet, which hangs unless something else holds it")
@@ -456,7 +613,9 @@ def guess_hold(points: Tensor, weight: Tensor, up: Sequence[float], ground: bool
     depth = 0.08 * (high - low)
     top, bottom = (_width(points[mask], axis) for mask in (height >= high - depth, height <= low + depth))
     if bottom > 1.5 * top:
-        reason = f"the upper end is {top:.3g} wide, the lower {bottom:.3g}: it may hang there, and moves most if it does"
+        reason = (
+            f"the upper end is {top:.3g} wide, the lower {bottom:.3g}: it may hang there, and moves most if it does"
+        )
         return HoldGuess("top", upward, "low", reason)
     if top > 1.5 * bottom:
         return HoldGuess(
@@ -466,16 +625,18 @@ def guess_hold(points: Tensor, weight: Tensor, up: Sequence[float], ground: bool
 
 
 def given_hold(end: str, up: Sequence[float]) -> HoldGuess:
-    """An end that was given: ``top``, ``bottom`` or ``none``."""
-    check_choice("--hold", end, ("top", "bottom", "none"))
-    return HoldGuess(end, tuple(-c for c in up) if end == "bottom" else tuple(up), "given", "given")
+    """An end that was given: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` that points to it."""
+    check_choice("--hold", end, ("top", "bottom", "none", *DIRECTIONS))
+    if end in DIRECTIONS:
+        return HoldGuess("side", DIRECTIONS[end], "given", "given")
+    return HoldGuess(end, tuple(0.0 - c for c in up) if end == "bottom" else tuple(up), "given", "given")
 
 
 def end_region(points: Tensor, direction: Sequence[float], cell: float) -> Region:
     """The end of an object as a region: a half-open box if the direction is an axis, else a cylinder.
 
-    Its depth is 6 % of the length towards it, at least one and a half cells, and more until it holds 0.5 % of the
-    points.
+    Its depth is 6 % of the length towards it, at least one and a half cells, counted from where 0.5 %
+    of the points lie beyond.
 
     Args:
         points: Centres of the simulated Gaussians [scene units], shape (N, 3).
@@ -490,8 +651,7 @@ def end_region(points: Tensor, direction: Sequence[float], cell: float) -> Regio
     low, high = float(along.amin()), float(along.amax())
     solid_end = _quantile(along, 0.995)  # a few stragglers beyond do not move it
     depth = max(PIN_DEPTH * (high - low), 1.5 * cell)
-    start = min(solid_end - depth, _quantile(along, 0.995))
-    start = max(start, low)
+    start = max(solid_end - depth, low)
     main = int(axis.abs().argmax())
     if abs(float(axis[main])) > 1 - 1e-6:
         corner: list[float | None] = [None, None, None]
@@ -502,7 +662,10 @@ def end_region(points: Tensor, direction: Sequence[float], cell: float) -> Regio
     height = 2 * (high - low) + 4 * cell
     centre = centre + (start + 0.5 * height - float(centre @ axis)) * axis
     radius = 2 * float((points.double() - points.double().mean(0)).norm(dim=-1).amax())
-    return Cylinder([_rounded(float(c), cell) for c in centre], direction, _rounded(radius, cell), height)
+    direction = [round(c, 6) for c in direction]
+    return Cylinder(
+        [_rounded(float(c), cell) for c in centre], direction, _rounded(radius, cell), _rounded(height, cell)
+    )
 
 
 # ---- sizes
@@ -583,15 +746,13 @@ def _padded(points: Tensor, margin: float) -> tuple[list[float], list[float]]:
     return low, [_rounded(float(v) + margin, margin) for v in points.amax(0)]
 
 
-def _without(
-    low: list[float], high: list[float], points: Tensor, ground: Tensor
-) -> tuple[list[float], list[float]]:
+def _without(low: list[float], high: list[float], points: Tensor, ground: Tensor) -> tuple[list[float], list[float]]:
     """The box with the face that looks at the floor moved back onto the object, if it reaches into the floor."""
     for axis in range(3):
         first, last = float(points[:, axis].amin()), float(points[:, axis].amax())
         floor_low, floor_high = float(ground[:, axis].amin()), float(ground[:, axis].amax())
         if low[axis] < floor_high <= first:
-            low[axis] = 0.5 * (floor_high + first)
+            low[axis] = round(0.5 * (floor_high + first), 6)
         if high[axis] > floor_low >= last:
-            high[axis] = 0.5 * (floor_low + last)
+            high[axis] = round(0.5 * (floor_low + last), 6)
     return low, high

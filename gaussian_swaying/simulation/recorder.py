@@ -8,14 +8,16 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 import threading
 import weakref
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,13 +25,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive
+from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying.gaussians.export import SUFFIXES, UsdFilm, export_cloud, read_usd_frame, usd_arrays
+from gaussian_swaying.gaussians.ply import GaussianCloud
+from gaussian_swaying.rendering.passes import PASSES
+from gaussian_swaying.simulation.frame import SimFrame
 from gaussian_swaying.simulation.writer import FrameWriter, HostCopy
 
 MARKER = "run.json"
 # what a run writes, and so must not find in a folder that no run made
 _OURS = ["frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "diagnostics.csv"]
-_OURS += ["config.yaml", "video.mp4"]
+_OURS += ["config.yaml", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+_OURS += [*(name for name in SUFFIXES if name != "ply"), "animation.usdc"]
+_OURS += ["depth.mp4", "normal.mp4", "force.mp4"]
+NORMAL_AXES = ("camera", "world")
 
 
 def _temporary(path: Path) -> Path:
@@ -181,11 +190,68 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
         encoder.abort()
 
 
+class _Film:
+    """The video of one folder of frames, and the frames that its encoder was given."""
+
+    def __init__(self) -> None:
+        self.encoder: VideoEncoder | None = None
+        self.encoded: list[int] = []
+
+    def give_up(self) -> None:
+        if self.encoder is not None:
+            self.encoder.abort()
+            self.encoder = None
+
+
+def frame_folder(render: str = "color", camera: str = "") -> str:
+    """Folder of a render's frames within that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
+
+    Args:
+        render: One of ``color``, ``depth``, ``normal`` and ``force``.
+        camera: Name of a further camera; empty for the one of the run.
+    """
+    own = "frames" if render == "color" else render
+    return f"cameras/{camera}/{own}" if camera else own
+
+
+def raw_folder(place: str) -> str:
+    """Folder of the numbers whose colours are in the folder ``place``."""
+    return f"{place}_raw"
+
+
+def video_file(place: str) -> str:
+    """The video of the frames in the folder ``place``: ``video.mp4`` of ``frames``, ``depth.mp4`` of ``depth`` ..."""
+    folder = Path(place)
+    return folder.with_name("video.mp4" if folder.name == "frames" else f"{folder.name}.mp4").as_posix()
+
+
+def check_camera_name(name: str) -> None:
+    """Raise ValueError unless a camera's name can be that of a folder on every system."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+        raise ValueError(f"Expected a name of `cameras` to have letters, digits, - and _ only, but got {name!r}.")
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    import imageio.v3 as iio
+
+    with atomic(path) as temporary:
+        iio.imwrite(temporary, pixels, compress_level=3)
+
+
 class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
     ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
+
+    Further renders have folders of their own, ``depth``, ``normal`` and ``force``, and videos of these names; further
+    cameras have the same once more in ``cameras/<name>``. All but the colour is black where no Gaussian is.
+
+    - ``depth``: along the optical axis, yellow to violet from one longest side of the object before its centre at rest
+      to one behind it; the numbers are in ``depth_raw`` as PNG of 16 bits: 0 where nothing is, else steps of
+      ``depth_step``.
+    - ``normal``: turned towards the camera, (n + 1) / 2 in red, green and blue, in ``normal_axes``.
+    - ``force``: of the wind per area [Pa], violet at 0 to yellow at ``force_scale``.
 
     Images, trajectory, .ply and checkpoint are written in the background: the methods take a copy and return. They
     wait only if the disk or ffmpeg is so far behind that the queue is full. What cannot be written is raised by the
@@ -194,10 +260,18 @@ class Recorder:
     Args:
         images: Write a PNG per frame.
         video: Encode the frames; needs ``images``.
-        ply_every: Write the deformed Gaussians as a 3DGS .ply every so many frames; 0 for never.
+        ply_every: Write the deformed Gaussians in ``export_format`` every so many frames; 0 for never.
         trajectory: Keep position (float32, metres, z up) and F (float16) of the simulated particles per frame.
         checkpoint_every: Keep the state for ``--resume`` every so many frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
+        renders: What is drawn of each frame: ``color``, ``depth``, ``normal``, ``force``.
+        depth_step: Depth of one step of the PNG in ``depth_raw`` [m].
+        normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (metres' axes, z up).
+        force_scale: End of the colour scale of ``force`` [Pa]; null for the force per area that the wind's flow,
+            without gusts, can exert on a patch at rest; it is in summary.json.
+        export_format: How the Gaussians are written: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
+            ``splat``, or ``usd`` (all frames in one animation.usdc, in metres; needs usd-core). See
+            ``gaussian_swaying.gaussians.export``.
     """
 
     def __init__(
@@ -208,19 +282,41 @@ class Recorder:
         trajectory: bool = True,
         checkpoint_every: int = 1,
         fps: float | None = None,
+        renders: Sequence[str] = ("color",),
+        depth_step: float = 0.001,
+        normal_axes: str = "camera",
+        force_scale: float | None = None,
+        export_format: str = "ply",
     ) -> None:
         for name, value in (("ply_every", ply_every), ("checkpoint_every", checkpoint_every)):
             check_positive(f"recorder.{name}", value, allow_zero=True)
         if fps is not None:
             check_positive("recorder.fps", fps)
+        if isinstance(renders, str) or not renders or len(set(renders)) < len(renders):
+            raise ValueError(
+                f"Expected `recorder.renders` to be a list of different ones of {', '.join(PASSES)}, but got "
+                f"{renders!r}."
+            )
+        for render in renders:
+            check_choice("recorder.renders", render, PASSES)
+        check_positive("recorder.depth_step", depth_step)
+        check_choice("recorder.normal_axes", normal_axes, NORMAL_AXES)
+        if force_scale is not None:
+            check_positive("recorder.force_scale", force_scale)
+        check_choice("recorder.export_format", export_format, tuple(SUFFIXES))
+        if export_format == "usd" and ply_every and find_spec("pxr") is None:
+            raise ValueError(
+                "The USD file needs usd-core: install gaussian-swaying[usd], or set another `recorder.export_format`."
+            )
         if video and not images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
         self.images, self.video, self.trajectory = images, video, trajectory
         self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), fps
         self._folder: Path | None = None
         self._writer = FrameWriter()
-        self._encoder: VideoEncoder | None = None
-        self._encoded: list[int] = []  # the frames that the encoder was given
+        self.renders, self.depth_step, self.normal_axes = tuple(renders), float(depth_step), normal_axes
+        self.force_scale, self.export_format = force_scale, export_format
+        self._films: dict[str, _Film] = {}  # by the folder of their frames
         self._real_time_fps = 25.0
 
     @property
@@ -236,6 +332,7 @@ class Recorder:
         config: str = "",
         resume: bool = False,
         real_time_fps: float = 25.0,
+        cameras: Sequence[str] = (),
     ) -> dict[str, Any] | None:
         """Prepare the output folder.
 
@@ -247,6 +344,7 @@ class Recorder:
             config: The whole configuration as YAML, kept beside the results and compared when resuming.
             resume: Continue the run in the folder.
             real_time_fps: Frames per second at which the video shows the simulated time.
+            cameras: Names of the further cameras.
 
         Returns:
             The checkpoint to continue from, or None.
@@ -257,13 +355,18 @@ class Recorder:
         """
         self.wait()
         self._give_up_video()
-        self._writer, self._encoded, self._real_time_fps = FrameWriter(), [], real_time_fps
+        self._writer, self._real_time_fps = FrameWriter(), real_time_fps
         path = Path(folder)
+        places = [frame_folder(render, camera) for camera in ("", *cameras) for render in self.renders]
+        self._films = {place: _Film() for place in places} if self.images else {}
         if resume:
             checkpoint = self._load_checkpoint(path, config)
             self._folder = path
             self._make_folders()
-            for folder in (path, *(path / name for name in ("frames", "ply", "trajectory"))):
+            for folder in (
+                path,
+                *(path / name for name in (self.export_format, "trajectory", *self._picture_folders())),
+            ):
                 for leftover in folder.glob(".*.*.*"):  # of a run that was killed while it wrote
                     leftover.unlink()
             return checkpoint
@@ -286,7 +389,8 @@ class Recorder:
                 with atomic(path / "config.yaml") as temporary:
                     temporary.write_text(config)
             if self.video:  # that of a resumed run is made of its PNGs
-                self._encoder = VideoEncoder(path / "video.mp4", self.fps or real_time_fps)
+                for place, film in self._films.items():
+                    film.encoder = VideoEncoder(path / video_file(place), self.fps or real_time_fps)
         except OSError as error:
             raise ValueError(
                 f"The output folder {path} cannot be written ({error.strerror or error}): choose another with --output."
@@ -294,10 +398,13 @@ class Recorder:
         return None
 
     def _make_folders(self) -> None:
-        wanted = {"frames": self.images, "ply": self.ply_every > 0, "trajectory": self.trajectory}
-        for name, needed in wanted.items():
-            if needed:
-                (self.folder / name).mkdir(exist_ok=True)
+        wanted = {self.export_format: self.ply_every > 0, "trajectory": self.trajectory}
+        for name in (*self._picture_folders(), *(name for name, needed in wanted.items() if needed)):
+            (self.folder / name).mkdir(parents=True, exist_ok=True)
+
+    def _picture_folders(self) -> list[str]:
+        raw = [raw_folder(place) for place in self._films if Path(place).name == "depth"]
+        return [*self._films, *raw]
 
     def _load_checkpoint(self, path: Path, config: str) -> dict[str, Any]:
         file = path / "checkpoint.pt"
@@ -319,24 +426,23 @@ class Recorder:
             )
         return checkpoint
 
-    def write_image(self, index: int, image: Tensor) -> None:
+    def write_image(self, index: int, image: Tensor, place: str = "frames") -> None:
         """Write one frame as PNG from colours in [0, 1], shape (H, W, 3), rounded to 8 bits; and add it to the video.
+
+        Args:
+            index: Frame number.
+            image: The colours.
+            place: Folder of the frames, see :func:`frame_folder`.
 
         Raises:
             OSError: If something could not be written before, here as in the other methods that write.
         """
-        path = self.folder / "frames" / f"{index:05d}.png"
+        path = self.folder / place / f"{index:05d}.png"
         copy = HostCopy((image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8))
-
-        def write() -> None:
-            import imageio.v3 as iio
-
-            with atomic(path) as temporary:
-                iio.imwrite(temporary, copy.get().numpy(), compress_level=3)
-
-        self._submit(path, write)
-        if self._encoder is not None:
-            encoder, encoded = self._encoder, self._encoded
+        self._submit(path, lambda: _write_png(path, copy.get().numpy()))
+        film = self._films.get(place)
+        if film is not None and film.encoder is not None:
+            encoder, encoded = film.encoder, film.encoded
 
             def encode() -> None:
                 try:
@@ -346,6 +452,17 @@ class Recorder:
                     encoder.abort()  # `close` misses the frame, encodes the PNGs and tells what fails then
 
             self._submit(encoder.path, encode)
+
+    def write_depth(self, index: int, steps: Tensor, place: str = "depth") -> None:
+        """Write one frame's depth as PNG of 16 bits, beside the frames of ``place``.
+
+        Args:
+            index: Frame number.
+            steps: Whole numbers from 0 to 65535, int32, shape (H, W).
+            place: Folder of the coloured frames, see :func:`frame_folder`.
+        """
+        path, copy = self.folder / raw_folder(place) / f"{index:05d}.png", HostCopy(steps)
+        self._submit(path, lambda: _write_png(path, copy.get().numpy().astype(np.uint16)))
 
     def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
         """Keep position [m] (P, 3) and F (P, 3, 3) of one frame; packed into one file by :meth:`close`."""
@@ -367,7 +484,8 @@ class Recorder:
             write: Called with the path in another thread, later, so what it holds on to must not change. On a GPU it
                 sees what was asked of the current stream before. Must itself write the file whole or not at all.
         """
-        path = self.folder / "ply" / f"{index:05d}.ply"
+        suffix = ".npz" if self.export_format == "usd" else SUFFIXES[self.export_format]
+        path = self.folder / self.export_format / f"{index:05d}{suffix}"
         ready = torch.cuda.Event(blocking=True) if torch.cuda.is_initialized() else None
         if ready is not None:
             ready.record()
@@ -378,6 +496,25 @@ class Recorder:
             write(path)
 
         self._submit(path, work)
+
+    def write_splat(self, index: int, cloud: GaussianCloud, frame: SimFrame) -> None:
+        """Write one frame's Gaussians in the format of the recorder; those of USD are joined by :meth:`close`.
+
+        Args:
+            index: Frame number.
+            cloud: The Gaussians, in scene units; they must not change.
+            frame: Scene units to metres with z up, for USD.
+        """
+        if self.export_format != "usd":
+            return self.write_ply(index, lambda path: export_cloud(path, cloud, self.export_format))
+
+        def write(path: Path) -> None:
+            arrays: dict[str, Any] = usd_arrays(cloud)
+            rotation = frame.direction_to_sim(torch.eye(3, dtype=torch.float64)).mT.numpy()
+            with atomic(path) as temporary:
+                np.savez(temporary, **arrays, metres_per_unit=frame.metres_per_unit, rotation=rotation)
+
+        self.write_ply(index, write)
 
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep what a resumed run needs.
@@ -404,9 +541,9 @@ class Recorder:
         """
         self._writer.wait()
 
-    def frame_files(self, count: int) -> list[Path]:
-        """The PNGs of the first ``count`` frames that exist."""
-        files = [self.folder / "frames" / f"{index:05d}.png" for index in range(count)]
+    def frame_files(self, count: int, place: str = "frames") -> list[Path]:
+        """The PNGs of the first ``count`` frames that exist, of the folder ``place``."""
+        files = [self.folder / place / f"{index:05d}.png" for index in range(count)]
         return [file for file in files if file.exists()]
 
     def close(self, frames: int, summary: dict[str, Any], real_time_fps: float | None = None) -> list[Path]:
@@ -433,35 +570,36 @@ class Recorder:
             except Exception as error:
                 failure = error
             if self.ply_every and frames:
-                made.append(self.folder / "ply")
+                made.append(self._pack_usd(frames) if self.export_format == "usd" else self.folder / self.export_format)
             if self.trajectory and frames:
                 self._pack_trajectory(frames)
                 made.append(self.folder / "trajectory.npz")
             if self.images and frames:
-                made.append(self.folder / "frames")
-                files = self.frame_files(frames)
-                if self.video and files:  # last: it needs another program
-                    self._finish_video(files, self.fps or real_time_fps or self._real_time_fps)
-                    made.append(self.folder / "video.mp4")
+                made += [self.folder / place for place in self._picture_folders()]
+                for place in self._films:
+                    files = self.frame_files(frames, place)
+                    if self.video and files:  # last: it needs another program
+                        self._finish_video(place, files, self.fps or real_time_fps or self._real_time_fps)
+                        made.append(self.folder / video_file(place))
         finally:
             self._give_up_video()
         if failure is not None:
             raise failure
         return made
 
-    def _finish_video(self, files: list[Path], fps: float) -> None:
+    def _finish_video(self, place: str, files: list[Path], fps: float) -> None:
         """End the video if it shows these frames at this rate, or else make one of the files."""
-        encoder = self._encoder
-        if encoder is not None and encoder.fps == fps and self._encoded == [int(file.stem) for file in files]:
+        film = self._films[place]
+        encoder = film.encoder
+        if encoder is not None and encoder.fps == fps and film.encoded == [int(file.stem) for file in files]:
             with suppress(OSError):
                 return encoder.finish()
-        self._give_up_video()  # before another is made under the same name
-        encode_video(files, self.folder / "video.mp4", fps)
+        film.give_up()  # before another is made under the same name
+        encode_video(files, self.folder / video_file(place), fps)
 
     def _give_up_video(self) -> None:
-        if self._encoder is not None:
-            self._encoder.abort()
-            self._encoder = None
+        for film in self._films.values():
+            film.give_up()
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write ``summary.json``, and its entry ``per_frame`` as ``diagnostics.csv`` too."""
@@ -485,6 +623,26 @@ class Recorder:
                             out.writestr(name, archive.read(name))
         if shards.exists():  # if not closed before
             shutil.rmtree(shards)
+
+    def _pack_usd(self, frames: int) -> Path:
+        """Join the frames into one film, those of an earlier part of a resumed run from the film of that part."""
+        target, shards = self.folder / "animation.usdc", self.folder / "usd"
+        files = {int(file.stem): file for file in shards.glob("[0-9]*.npz")}
+        wanted = range(0, frames, self.ply_every)
+        if not any(index in files for index in wanted):
+            return target
+        with np.load(files[min(files)]) as shard:
+            scale, rotation = float(shard["metres_per_unit"]), torch.from_numpy(shard["rotation"])
+        film = UsdFilm(self.fps or self._real_time_fps, scale, rotation)
+        for index in wanted:
+            if index in files:
+                with np.load(files[index]) as shard:
+                    film.add(index, {k: shard[k] for k in shard.files if k not in ("metres_per_unit", "rotation")})
+            elif target.exists():
+                film.add(index, read_usd_frame(target, index))
+        film.save(target)
+        shutil.rmtree(shards)
+        return target
 
 
 def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, Tensor]:

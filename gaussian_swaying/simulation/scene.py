@@ -314,7 +314,6 @@ class SimulatedScene(nn.Module):
             rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
         )
 
-
     def on_gaussians(self, values: Tensor) -> Tensor:
         """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.
 

@@ -496,7 +496,7 @@ def test_a_recorder_that_is_not_closed_leaves_its_frames_and_no_process(how, tmp
     recorder.open(tmp_path / "run")
     recorder.write_image(0, _grey(1))
     recorder.wait()
-    process = recorder._encoder._process
+    process = recorder._films["frames"].encoder._process
     assert process.poll() is None
     if how == "forgotten":
         del recorder

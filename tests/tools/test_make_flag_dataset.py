@@ -47,6 +47,33 @@ def cloth(tool):
 # ---- physics
 
 
+def _spring_lengths(grid):
+    """Lengths [m] of the springs along the sides of the faces."""
+    faces, flat = grid.faces(), grid.flat()
+    sides = np.concatenate([faces[:, [k, (k + 1) % 4]] for k in range(4)])
+    ends = flat[np.unique(np.sort(sides, 1), axis=0)]
+    return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1)
+
+
+def test_every_vertex_stands_for_the_same_share_of_the_cloth(cloth):
+    """Cells of one size cover the cloth; areas and moments of area that vertices share by faces agree with masses."""
+    grid = cloth.Grid.of_cells(1.2, 0.8, 12)
+    assert (grid.columns, grid.rows, grid.count) == (11, 7, 96)
+    assert grid.cell**2 * grid.count == pytest.approx(1.2 * 0.8)
+    flat, faces = grid.flat(), grid.faces()
+    corners = flat[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]), axis=-1)
+    assert area.sum() == pytest.approx(0.96)
+    share = np.bincount(faces.reshape(-1), np.repeat(area / 4, 4)) / grid.cell**2
+    share = share.reshape(12, 8)
+    # of the rim and of the row beside it: 3/4 + 5/4 cells, as many as vertices; all others one each
+    np.testing.assert_allclose(share[:2, 3:5].sum(0), 2)
+    np.testing.assert_allclose(share[:2, :2].sum(), 4)
+    np.testing.assert_allclose(share[2:-2, 2:-2], 1)
+    np.testing.assert_allclose(share[0, 2:-2], 0.75)
+    assert grid.spring == pytest.approx(_spring_lengths(grid).mean())
+
+
 def test_patterns_have_the_parameters_of_the_paper(reference):
     """Young's modulus, density and flow of the table; mass, pressure and bending follow from them."""
     expected = {1: (5e3, 50.0, (0, 0, 0)), 2: (3e3, 30.0, (2.5, 0.5, 0)), 3: (3e3, 20.0, (2, 0, 0))}
@@ -71,9 +98,10 @@ def test_blender_is_asked_in_its_own_units(reference, cloth):
         assert asked["gravity"] == pytest.approx(-15.68)
         assert asked["mass"] * grid.count == pytest.approx(0.3 * 1.2 * 0.8)
         spring = asked["tension_stiffness"] * 625 / grid.cell
-        assert spring * 4 / 3 * grid.rim == pytest.approx(30.0)
+        lengths = _spring_lengths(grid)
+        assert spring * grid.cell / lengths.mean() * 4 / 3 == pytest.approx(30.0)  # Blender divides by the mean length
         assert asked["shear_stiffness"] == pytest.approx(0.5 * asked["tension_stiffness"])
-        assert asked["tension_damping"] * 25 / spring == pytest.approx(2.2e-3)
+        assert asked["tension_damping"] * 25 / (30.0 * 3 / 4) == pytest.approx(2.2e-3)
         assert asked["bending_stiffness"] * cloth.BENDING * grid.cell**2 * 625 == pytest.approx(material.bending)
         assert 0.02 * 25 * asked["strength"] == pytest.approx(pattern.pressure())
         assert asked["strength"] / asked["flow"] == pytest.approx(math.hypot(2.5, 0.5))
@@ -94,13 +122,13 @@ def test_steps_follow_the_mesh(reference, cloth):
         assert of[1] / of[0] == pytest.approx(16, rel=0.05)
         assert reference.least_quality(finer) == 4 * pattern.quality
     grid, rough = pattern.grid(), replace(pattern, quality=8).run()
-    with pytest.raises(ValueError, match="`quality` of at least 39"):
+    with pytest.raises(ValueError, match="`quality` of at least 22"):
         cloth.solve_cloth(grid, grid.flat(), [], pattern.material(), rough)
 
 
 def test_pins_hold_the_same_part_of_the_flag_on_every_mesh(reference):
     """An edge is a line of vertices, a corner a square of 4 cm; the lower left corner is free in pattern 2."""
-    for cells, side in ((60, 3), (120, 5)):
+    for cells, side in ((60, 2), (120, 4)):
         left, corners, top = (replace(reference.PATTERNS[n], cells=cells) for n in (1, 2, 3))
         for pattern, count in ((left, left.grid().rows + 1), (top, top.grid().columns + 1), (corners, 3 * side**2)):
             uv = pattern.grid().uv()
@@ -175,7 +203,7 @@ def test_motion_is_solved_once_and_says_what_changed(reference, monkeypatch, tmp
     assert calls == [8]
     assert [item.name for item in path.parent.iterdir()] == ["cloth.npz"]  # nothing half-written stays
     motion = reference.read_cloth(path)
-    assert motion.positions.shape == (4, 31 * 21, 3)
+    assert motion.positions.shape == (4, 30 * 20, 3)
     with np.load(path) as data:
         assert data["areal_density"] == pytest.approx(0.3)
         assert data["membrane_stiffness"] == pytest.approx(30)
@@ -255,11 +283,11 @@ def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, t
     written = json.loads((tmp_path / "uncertainty.json").read_text())
     assert {name: (row["cells"], row["quality"]) for name, row in written["variants"].items()} == {
         "steps doubled": (30, 16),
-        "coarser": (15, 8),
-        "finer": (45, 8),
+        "coarser": (20, 8),
+        "finer": (40, 8),
     }
-    # the fake moves them alike; what is left is the ripple between the vertices of a coarser mesh, a (k cell)^2 / 8
-    bound = 0.003 * (3 * math.pi / 15) ** 2 / 8 / 1.2
+    # the fake moves them alike; what is left is the ripple between the vertices of a coarser mesh, a (k face)^2 / 8
+    bound = 0.003 * (1.5 * 3 * math.pi / 20) ** 2 / 8 / 1.2
     assert all(row["chamfer"] <= 1.5 * bound for row in written["variants"].values())
     assert written["variants"]["steps doubled"]["chamfer"] == 0
     assert calls == [8, 16, 8, 8]
@@ -415,7 +443,7 @@ def test_truth_is_written_as_mesh_and_arrays(tool, small):
     mesh = PlyData.read(folder / "mesh.ply")
     normals = np.stack([mesh["vertex"][name] for name in ("nx", "ny", "nz")], -1)
     np.testing.assert_allclose(normals, truth["normals"], atol=1e-6)
-    assert len(mesh["face"].data) == 2 * 12 * 8 == len(truth["faces"])
+    assert len(mesh["face"].data) == 2 * 11 * 7 == len(truth["faces"])
 
 
 # ---- command line
@@ -436,7 +464,7 @@ def test_options_reach_the_flag_and_the_pictures(tool, reference):
     flag, pictures = tool.flag_of(2, options), tool.pictures_of(options)
     assert (flag.cells, flag.frames, flag.width, flag.height) == (60, 50, 0.6, 0.4)
     assert (flag.texture, flag.drag) == ("white", 0.5)
-    assert flag.quality == reference.least_quality(flag) == 64  # half the size and half the cells: the same cell
+    assert flag.quality == reference.least_quality(flag) == 64  # cells of 1 cm
     assert (pictures.size, pictures.samples, pictures.views) == ((640, 360), 4, 200)
     default = tool.parse([])
     for number in (1, 2, 3):

@@ -152,6 +152,54 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
     check_refused([*SMALL, "--config", str(tmp_path / "more.yaml")], tmp_path / "no", capsys, *words)
 
 
+def parse_foam():
+    """The shipped edit of the sand bear."""
+    files = [str(ROOT / "configs/sim" / name) for name in ("sand.yaml", "variants/sand_to_foam.yaml")]
+    return build_parser().parse_args([item for file in files for item in ("--config", file)])
+
+
+def test_edits_from_a_configuration(tmp_path, capsys):
+    """A region, a law with arguments of its own and a colour; bad ones are one sentence that names the field."""
+    edit = {
+        "region": {"class_path": "Box", "init_args": {"min": [0.5, None, None], "max": [None, None, None]}},
+        "time": 0.04,
+        "density": 60.0,
+        "law": {"class_path": "NeoHookean"},
+        "color": [1.0, 1.0, 1.0],
+    }
+
+    def options(entry):
+        (tmp_path / "edit.yaml").write_text(yaml.safe_dump({"edits": [entry]}))
+        return [*SMALL, "--config", str(tmp_path / "edit.yaml")]
+
+    out = tmp_path / "run"
+    assert _code([*options(edit), "--output", str(out)]) == 0
+    assert json.loads((out / "summary.json").read_text())["edits"] == 1
+    stored = yaml.safe_load((out / "config.yaml").read_text())["edits"][0]
+    assert stored["law"]["class_path"].endswith("NeoHookean")
+    assert stored["color"] == [1.0, 1.0, 1.0]
+    assert _code([*options(edit), "--frames", "3", "--resume", "--output", str(out)]) == 0
+    assert parse_foam().edits[0].law.class_path.endswith("Foam")
+    for change, words in (
+        ({"density": -1.0}, ["`edits.density` to be positive"]),
+        ({"colour": [1.0, 1.0, 1.0]}, ["edits", "colour"]),
+        ({"law": {"class_path": "Sand"}}, ["Sand", "solver.formulation"]),
+        ({"region": {"class_path": "Sphere", "init_args": {"center": [9, 9, 9], "radius": 1.0}}}, ["no simulated"]),
+    ):
+        check_refused(options(edit | change), tmp_path / "no", capsys, *words)
+
+
+def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
+    """Each parses after the flag's, and makes its cameras, recorder and edits."""
+    blocks = (ROOT / "docs/recording.md").read_text(encoding="utf-8").split("```yaml\n")[1:]
+    assert len(blocks) == 5
+    parser = build_parser()
+    for block in blocks:
+        (tmp_path / "block.yaml").write_text(block.split("```")[0])
+        parts = parser.instantiate(parser.parse_args(["--config", str(FLAG), "--config", str(tmp_path / "block.yaml")]))
+        assert parts.cameras or parts.edits or parts.recorder.renders[1:] or parts.recorder.ply_every
+
+
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
 def test_every_shipped_configuration_builds(config, tmp_path):
     """Parsed, and its components made; the splat is exchanged where the user has to give one."""
