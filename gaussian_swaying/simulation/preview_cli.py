@@ -1,0 +1,426 @@
+"""The command line of ``tools/preview.py``: report, picture and a first configuration."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import warnings
+from argparse import ArgumentError
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
+from gaussian_swaying.simulation.config import _one_sentence, build_parser, build_pipeline
+from gaussian_swaying.simulation.cost import Cost, estimate_cost
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.starter import region_dict, starter_yaml
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Everything that is found before anything is written.
+
+    Attributes:
+        report: Text for people.
+        data: The same as plain numbers, for preview.json.
+        picture: 8-bit RGB, shape (H, W, 3).
+        starter: The first configuration as YAML; None with ``--config``.
+    """
+
+    report: str
+    data: dict[str, Any]
+    picture: np.ndarray
+    starter: str | None
+
+
+def build_options() -> argparse.ArgumentParser:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        prog="preview.py",
+        description="Bounds, up axis, Gaussians, region, pins, grid and cost of a splat; a picture of them; and a "
+        "first configuration for tools/sim.py.",
+    )
+    add = parser.add_argument
+    add("scene", nargs="?", metavar="SCENE.ply", help="the splat; may be left out if --config names one")
+    add(
+        "--config",
+        action="append",
+        metavar="FILE",
+        help="show what this configuration does, instead of guessing one; may be given several times, as for sim.py",
+    )
+    add("--output", metavar="DIR", help="folder of the results; default: outputs/preview/<name of the splat>")
+    add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers, instead of a guess")
+    add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, -x, ... or -z, instead of a guess")
+    add("--region", nargs=6, type=float, metavar="V", help="box to simulate: lower and upper corner [scene units]")
+    add("--longest-side", type=float, default=1.0, metavar="M", help="length of the longest side of the object [m]")
+    add("--wind", type=float, default=6.0, metavar="M/S", help="speed of the wind in the configuration [m/s]")
+    add("--frames", type=int, default=250, help="frames of the configuration")
+    add("--height", type=int, default=540, help="height of the picture [pixels]")
+    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    return parser
+
+
+def preview_scene(options: argparse.Namespace, starter_path: Path) -> Preview:
+    """Guess a configuration for a splat, and look at it.
+
+    Args:
+        options: From :func:`build_options`.
+        starter_path: Where the configuration will be, for the report.
+
+    Returns:
+        The preview.
+
+    Raises:
+        ValueError: If the splat or an option is bad, or the configuration does not run.
+        FileNotFoundError: If there is no such splat.
+    """
+    cloud = read_ply(options.scene)
+    up = None if options.up is None else _up(options.up)
+    region = None if options.region is None else (options.region[:3], options.region[3:])
+    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind)
+    text = starter_yaml(found, options.scene, options.frames)
+    pipeline, settings = _pipeline(["--device", options.device], text)
+    if settings.scene.ply != str(Path(options.scene).resolve()):
+        raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
+    cost = estimate_cost(pipeline, settings.frames)
+    data: dict[str, Any] = {
+        "splat": str(options.scene),
+        "bounds": bounds(cloud.means),
+        "gaussians": gaussian_statistics(cloud),
+        "suggestion": suggestion_dict(found),
+        "run": run_dict(pipeline),
+        "cost": asdict(cost) | {"total_seconds": cost.total_seconds},
+    }
+    report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found), *_cost_lines(cost)]
+    name = Path(options.scene).stem
+    report += ["", f"next: python tools/sim.py --config {starter_path} --output {Path('outputs') / name}"]
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), text)
+
+
+def preview_config(options: argparse.Namespace) -> Preview:
+    """Look at a given configuration.
+
+    Args:
+        options: From :func:`build_options`, with ``config``.
+
+    Returns:
+        The preview.
+
+    Raises:
+        ValueError: If the configuration is bad or does not run.
+    """
+    arguments = [*(item for file in options.config for item in ("--config", file)), "--device", options.device]
+    if options.scene is not None:
+        arguments += ["--scene.ply", options.scene]
+    pipeline, settings = _pipeline(arguments)
+    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images)
+    cloud = pipeline.scene.model.to_cloud().to("cpu")
+    data: dict[str, Any] = {
+        "config": options.config,
+        "splat": None if options.scene is None else str(options.scene),
+        "bounds": bounds(cloud.means),
+        "gaussians": gaussian_statistics(cloud),
+        "run": run_dict(pipeline),
+        "cost": asdict(cost) | {"total_seconds": cost.total_seconds},
+    }
+    report = [
+        *_splat_lines(options.scene or options.config[-1], cloud, data),
+        *_run_lines(data["run"]),
+        *_cost_lines(cost),
+    ]
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), None)
+
+
+def _pipeline(arguments: list[str], text: str | None = None) -> tuple[SimulationPipeline, Any]:
+    """The run of a configuration, given by options or as text, and its settings."""
+    parser = build_parser()
+    try:
+        settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
+    except ArgumentError as error:
+        raise ValueError(_one_sentence(str(error), arguments)) from error
+    return build_pipeline(parser, settings)[0], settings
+
+
+def _parse_text(parser: Any, arguments: list[str], text: str) -> Any:
+    """Settings from YAML text and options after it."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "starter.yaml"
+        path.write_text(text, encoding="utf-8")
+        return parser.parse_args(["--config", str(path), *arguments])
+
+
+def _up(values: Sequence[str]) -> list[float] | str:
+    """An up direction from the command line."""
+    if len(values) == 1:
+        return values[0]
+    try:
+        return [float(value) for value in values]
+    except ValueError:
+        raise ValueError(f"Expected `--up` to be +x, -x, ... -z or 3 numbers, but got {' '.join(values)}.") from None
+
+
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """The command line with ``--up -y`` as ``--up=-y``, which argparse would take for an option."""
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in ("--up", "--hold") and argument in DIRECTIONS:
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+# ---- as plain numbers
+
+
+def suggestion_dict(found: Suggestion) -> dict[str, Any]:
+    """A suggestion without its masks."""
+    region = found.region.region()
+    return {
+        "up": {
+            "direction": list(found.up.direction),
+            "confidence": found.up.confidence,
+            "scores": found.up.scores,
+            "reasons": found.up.reasons,
+            "floor_gaussians": int(found.up.ground.sum()),
+        },
+        "region": {
+            "region": None if region is None else region_dict(region),
+            "simulated": int(found.region.simulated.sum()),
+            "opacity_threshold": found.region.opacity_threshold,
+            "specks": found.region.specks,
+            "loose": found.region.loose,
+            "reason": found.region.reason,
+        },
+        "hold": asdict(found.hold) | {"region": None if found.pin is None else region_dict(found.pin)},
+        "longest_side_m": found.longest_side,
+        "metres_per_unit": found.metres_per_unit,
+        "size_m": list(found.size),
+        "spacing_m": found.spacing,
+        "dx_m": found.dx,
+        "sheet": found.sheet,
+        "azimuth": found.azimuth,
+        "flow": list(found.flow),
+        "youngs_modulus_Pa": found.youngs_modulus,
+        "thickness_m": found.thickness,
+        "stiffness_reason": found.stiffness_reason,
+    }
+
+
+def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
+    """What a run simulates, holds and blows at."""
+    parts, scene = classify(pipeline), pipeline.scene
+    return {
+        "gaussians": len(scene.model.means),
+        "simulated": int(parts.simulated.sum()),
+        "carried": int(parts.carried.sum()),
+        "held": int(parts.pinned.sum()),
+        "conditions": parts.names,
+        "regions": [repr(b.region) for b in conditions(pipeline) if hasattr(b, "region")],
+        "frame": scene.frame.describe(),
+        "box_min": [float(v) for v in scene.bounds[0]],
+        "box_max": [float(v) for v in scene.bounds[1]],
+        "mass_kg": float(scene.points.mass.sum()),
+        "area_m2": float(scene.patch_area.sum()),
+        "filled": scene.filled,
+        "dx_m": pipeline.solver.dx,
+        "formulation": pipeline.solver.formulation,
+        "flow": mean_flow(pipeline).tolist(),
+    }
+
+
+# ---- for people
+
+
+def _splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[str]:
+    corner, own = data["bounds"], data["gaussians"]
+    below = ", ".join(f"{share:.0%} below {t}" for t, share in own["opacity_below"].items())
+    normals = "with normals" if own["normals"] else "without normals (the smallest axes are taken)"
+    return [
+        f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
+        f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
+        f"  without 1 %   {_numbers(corner['robust_min'])} to {_numbers(corner['robust_max'])}",
+        "  5, 50 and 95 % of the Gaussians have at most",
+        f"    opacity     {_numbers(own['opacity'])}; {below}",
+        f"    S1 / S2     {_numbers(own['S1_over_S2'])}   (needles are above 10)",
+        f"    S2 / S3     {_numbers(own['S2_over_S3'])}   (surface patches are above 3)",
+        f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
+    ]
+
+
+def _suggestion_lines(found: Suggestion) -> list[str]:
+    region = "all of space"
+    if found.region.box is not None:
+        region = json.dumps(dict(zip(("min", "max"), found.region.box, strict=True)))
+    count = int(found.region.simulated.sum())
+    lines = [
+        f"up              {_numbers(found.up.direction)}, {_why(found.up.confidence, '; '.join(found.up.reasons))}",
+        f"region          {region}: {found.region.reason}",
+        f"opacity         {found.region.opacity_threshold:g} and above is simulated: {count:,} particles",
+        f"held            at the {found.hold.end}, {_why(found.hold.confidence, found.hold.reason)}"
+        if found.pin is not None
+        else "held            nowhere: it will fall",
+    ]
+    if found.pin is not None:
+        lines.append(f"  pin           {_short(region_dict(found.pin))}")
+    lines += [
+        f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
+        f"{found.metres_per_unit:.4g} m, as the longest side is taken as {found.longest_side:g} m",
+        f"grid            dx = {found.dx:g} m: {found.longest_side / found.dx:.0f} cells along the longest side, "
+        f"{found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of {found.spacing:.3g} m",
+        f"material        {_material(found)}",
+        f"wind            {_numbers(found.flow)} m/s, z up",
+    ]
+    if found.up.confidence == "low":
+        lines.append("warning: the up axis is a weak guess; look at the picture, and give --up if it is wrong")
+    if found.region.loose:
+        lines.append(
+            f"warning: {found.region.loose:,} specks inside the region hang on nothing and will fall; give a smaller "
+            "--region, or raise scene.opacity_threshold"
+        )
+    return ["", "guesses (each can be given instead, see --help)", *(f"  {line}" for line in lines)]
+
+
+def _run_lines(run: dict[str, Any]) -> list[str]:
+    return [
+        "",
+        "this configuration",
+        f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
+        f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
+        f"  follow them     {run['carried']:,} faint ones",
+        f"  fill the inside {run['filled']:,} points",
+        f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
+        *(f"                  {region}" for region in run["regions"]),
+        f"  frame           {run['frame']}",
+        f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
+        f"  wind            {_numbers(run['flow'])} m/s, z up, before modulations",
+    ]
+
+
+def _cost_lines(cost: Cost) -> list[str]:
+    frame = cost.substeps * cost.substep_seconds
+    picture = ""
+    if cost.picture_seconds is not None:
+        picture = f" + {_duration(cost.picture_seconds)} for its pictures"
+    return [
+        "",
+        f"cost on this machine ({cost.device})",
+        f"  substep         {cost.substep:.3g} s, {cost.substeps} a frame (stable up to {cost.stable_substep:.3g} s; "
+        f"waves of {cost.wave_speed:.3g} m/s)",
+        f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
+        f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
+        f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
+        f"  the run         about {_duration(cost.total_seconds)}",
+    ]
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
+
+
+def _material(found: Suggestion) -> str:
+    if found.sheet:
+        return "a sheet: the cloth of the paper's flags"
+    return f"E = {found.youngs_modulus:.0e} Pa, {found.thickness:.3g} m thick: {found.stiffness_reason}"
+
+
+def _why(confidence: str, reason: str) -> str:
+    return "given" if confidence == "given" else f"confidence {confidence}: {reason}"
+
+
+def _short(region: dict[str, Any]) -> str:
+    return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)
+
+
+def _duration(seconds: float) -> str:
+    """A duration that people read: 12 ms, 3.4 s, 5 min, 2.1 h."""
+    if not math.isfinite(seconds):
+        return "unknown"
+    for unit, size, limit in (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0)):
+        if seconds < limit:
+            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 3600:.2g} h"
+
+
+# ---- the command
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Look, report, write.
+
+    Args:
+        arguments: Command line; that of the process if None.
+
+    Returns:
+        0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With the environment variable
+        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+    """
+    options = build_options().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    try:
+        if options.scene is None and options.config is None:
+            raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
+        if options.frames < 1:
+            raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
+        if not 64 <= options.height <= 4320:
+            raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
+        folder = Path(options.output or Path("outputs/preview") / Path(options.scene or options.config[-1]).stem)
+        starter = folder / "starter.yaml"
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = preview_scene(options, starter) if options.config is None else preview_config(options)
+        print(found.report)
+        for text in dict.fromkeys(str(entry.message) for entry in caught):  # the splat is read twice
+            print(f"warning: {text}", file=sys.stderr)
+        for path in write(found, folder):
+            print(f"wrote {path}")
+    except KeyboardInterrupt:
+        print("Stopped; nothing was written.", file=sys.stderr)
+        return 130
+    except (ValueError, TypeError, OSError, torch.OutOfMemoryError) as error:
+        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
+            raise
+        message = str(error)
+        if "Does not validate" in message:
+            message = _one_sentence(message, arguments or sys.argv[1:])
+        print(f"error: {message}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def write(found: Preview, folder: Path) -> list[Path]:
+    """Write preview.json, preview.png and, if it was guessed, starter.yaml.
+
+    A ``starter.yaml`` that is there and differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ...: someone may
+    have edited it.
+
+    Returns:
+        The files.
+    """
+    import imageio.v3 as iio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / "preview.json", folder / "preview.png"]
+    files[0].write_text(json.dumps(found.data, indent=1) + "\n", encoding="utf-8")
+    iio.imwrite(files[1], found.picture)
+    if found.starter is not None:
+        path = folder / "starter.yaml"
+        if path.exists() and path.read_text(encoding="utf-8") != found.starter:
+            number = 1
+            while (folder / f"starter.{number}.yaml").exists():
+                number += 1
+            path.rename(folder / f"starter.{number}.yaml")
+        path.write_text(found.starter, encoding="utf-8")
+        files.append(path)
+    return files

@@ -1,0 +1,161 @@
+"""A first configuration as a YAML file with comments, from what :mod:`gaussian_swaying.simulation.preview` guessed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from gaussian_swaying.gaussians.selection import Box, Cylinder, Not, Region, Union
+from gaussian_swaying.simulation.lean import SHELL_AERO
+from gaussian_swaying.simulation.preview import Suggestion
+
+_CLOTH = """\
+material:
+  E: 6.0e+3                     # Pa; the paper's flags have 3e3 to 6e3
+  nu: 0.3                       # the paper's flags
+  density: 30.0                 # kg/m^3; the paper's flags
+  thickness: 0.01               # m; with the density the cloth weighs 0.3 kg/m^2
+"""
+_CLOTH_AERO = """\
+aero:
+  C_D: 0.1                      # the paper's flags
+  C_F: 0.3
+  C_L: 0.005
+  air_density: 1.225            # kg/m^3
+  law: paper
+"""
+
+
+def _shell(s: Suggestion) -> str:
+    return f"""\
+material:
+  E: {s.youngs_modulus:<27.1e}# Pa; {s.stiffness_reason}; more of it bends less and takes more substeps
+  nu: 0.3
+  density: 400.0                # kg/m^3; lighter things follow the gusts faster
+  thickness: {s.thickness:<19.4g}# m; a shell; the mass of a patch is density x thickness x area
+"""
+
+
+def _shell_aero() -> str:
+    return f"""\
+aero:
+  C_D: {SHELL_AERO["drag"]:<25g}# the paper's captures
+  C_F: {SHELL_AERO["friction"]}
+  C_L: {SHELL_AERO["lift"]}
+  air_density: 1.225            # kg/m^3
+  law: {SHELL_AERO["law"]:<25}# a captured shell shows patches to the wind at every angle
+"""
+
+
+def region_dict(region: Region) -> dict[str, Any]:
+    """A region as ``class_path`` and ``init_args``, open sides as None.
+
+    Raises:
+        TypeError: If it is none of Box, Cylinder, Not and Union.
+    """
+    arguments: dict[str, Any]
+    if isinstance(region, Box):
+        corners = {"min": region.min, "max": region.max}
+        arguments = {k: [v if math.isfinite(v) else None for v in corner] for k, corner in corners.items()}
+    elif isinstance(region, Cylinder):
+        arguments = {"center": list(region.center), "axis": list(region.axis)}
+        arguments |= {"radius": region.radius, "height": region.height}
+    elif isinstance(region, Not):
+        arguments = {"region": region_dict(region.region)}
+    elif isinstance(region, Union):
+        arguments = {"regions": [region_dict(part) for part in region.regions]}
+    else:
+        raise TypeError(f"Expected a Box, Cylinder, Not or Union, but got {type(region).__name__}.")
+    return {"class_path": type(region).__name__, "init_args": arguments}
+
+
+def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> str:
+    """The configuration as text.
+
+    Args:
+        suggestion: From :func:`~gaussian_swaying.simulation.preview.suggest`.
+        ply: The splat; its absolute path is written.
+        frames: Number of frames.
+
+    Returns:
+        YAML for ``tools/sim.py --config``.
+    """
+    s = suggestion
+    path = json.dumps(str(Path(ply).resolve()), ensure_ascii=False)
+    region = s.region.region()
+    where = "null" if region is None else json.dumps(region_dict(region))
+    boundaries = " []               # nothing holds it: it will fall"
+    if s.pin is not None:
+        boundaries = f"""
+    # {s.hold.reason}
+    - class_path: PinnedRegion
+      init_args:
+        region: {json.dumps(region_dict(s.pin))}"""
+    hangs = s.hold.end != "bottom" or s.sheet
+    gravity = "[0.0, 0.0, -9.8]" if hangs else "[0.0, 0.0, 0.0] "
+    why = "it hangs" if hangs else "what stands was captured in balance with its weight"
+    return f"""\
+# A first configuration, guessed from the splat; every number may be changed. What was not guessed is the material: it
+# is that of the paper's flags for a sheet, and soft rubber for anything else.
+#   python tools/sim.py --config THIS_FILE
+frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
+frame_dt: 0.04                  # s
+background: [0.93, 0.94, 0.96]
+
+scene:
+  ply: {path}
+  up: {_padded(json.dumps([round(c, 6) for c in s.up.direction]), 26)}# scene axes; confidence: {s.up.confidence}
+  longest_side: {s.longest_side:<16.6g}# m; the real one, if you know it
+  # {s.region.reason}
+  region: {where}
+  opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
+  faint: carry
+  area: coverage
+
+{_CLOTH if s.sheet else _shell(s)}
+solver:
+  formulation: total            # keeps its neighbours: cannot tear
+  dx: {s.dx:<26.6g}# m; {s.longest_side / s.dx:.0f} cells along the longest side
+  cfl: 0.4
+  gravity: {gravity}     # m/s^2, z up; {why}
+  damping: {0.2 if s.sheet else 1.0:<21.3g}# 1/s; losses in air and material
+  boundaries:{boundaries}
+
+wind:
+  flow: {_padded(json.dumps(list(s.flow)), 24)}# m/s, z up
+  seed: 0
+  modulations:
+    - class_path: SineSway
+      init_args: {{amplitude: 0.5, period: 2.0}}
+    - class_path: GaussianGust
+      init_args: {{std: 0.3}}
+
+{_CLOTH_AERO if s.sheet else _shell_aero()}
+shader:
+  class_path: DiffuseShader
+  init_args:
+    light: [0.3, -0.6, 1.0]     # direction to the light, z up
+    two_sided: true             # the sign of a captured normal means nothing
+    ambient: 0.6
+    relative: true              # the light of the photos is in the colours already
+
+camera:
+  class_path: OrbitCamera
+  init_args:
+    width: 960
+    height: 540
+    fov_y: 40.0                 # degrees
+    azimuth: {s.azimuth:<19.6g}# degrees about up; onto the broad side
+    elevation: 8.0
+    radius: 1.9                 # times the longest side of what moves
+
+recorder:
+  trajectory: false             # positions of all particles in each frame
+"""
+
+
+def _padded(text: str, width: int) -> str:
+    """Text with blanks up to a width, at least one."""
+    return f"{text:<{width - 1}} "
