@@ -1,0 +1,424 @@
+"""Gaussians for viewers and other programs: .ply, compressed .ply, .splat and animated USD."""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
+from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
+from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
+
+SUFFIXES = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
+"""Formats, and how their files' names end."""
+LARGEST_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, as opaque as float32 tells apart from 1
+LARGEST_LOG_SCALE = 20.0  # beyond it the compressed format has no numbers
+_GSPLAT = {"compressed_ply": "ply_compressed", "splat": "splat"}
+_PRIM = "/World/Gaussians"
+
+
+def cleaned(cloud: GaussianCloud) -> GaussianCloud:
+    """A splat that every format can hold.
+
+    Gaussians with a NaN, an infinite centre or colour, or a quaternion of zero are left out. Opacities and sizes beyond
+    what float32 tells apart are brought to the end of their range: logits to ±16, logarithms of the size to ±20.
+
+    Args:
+        cloud: The Gaussians.
+
+    Returns:
+        The same, or a smaller cloud, with quaternions of unit length.
+    """
+    length = torch.linalg.vector_norm(cloud.quats, dim=-1)
+    good = torch.isfinite(cloud.means).all(-1) & torch.isfinite(cloud.sh).flatten(1).all(-1)
+    good &= torch.isfinite(length) & (length > 0)
+    good &= ~cloud.scales.isnan().any(-1) & ~cloud.opacities.isnan()
+    kept = cloud if bool(good.all()) else cloud.select(good)
+    return GaussianCloud(
+        means=kept.means,
+        quats=torch.nn.functional.normalize(kept.quats, dim=-1),
+        scales=kept.scales.clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE),
+        opacities=kept.opacities.clamp(-LARGEST_LOGIT, LARGEST_LOGIT),
+        sh=kept.sh,
+        normals=kept.normals,
+    )
+
+
+def export_cloud(path: str | os.PathLike[str], cloud: GaussianCloud, format: str = "ply") -> None:
+    """Write Gaussians in one of several formats; the file appears under its name only when it is complete.
+
+    - ``ply``: as 3DGS stores them, with normals, see :func:`~gaussian_swaying.gaussians.ply.write_ply`.
+    - ``compressed_ply``: PlayCanvas' format for SuperSplat, 16 bytes and the harmonics in 8 bits a Gaussian, through
+      gsplat. Gaussians fainter than 1/255 are left out, their order changes, and there are no normals.
+    - ``splat``: antimatter15's format, 32 bytes a Gaussian, through gsplat. Colours are those of harmonics of degree 0;
+      no normals.
+    - ``usd``: one frame, see :func:`write_usd`.
+
+    Args:
+        path: File to write; an existing one is replaced.
+        cloud: Gaussians to write, see :func:`cleaned`.
+        format: One of the above.
+
+    Raises:
+        FileNotFoundError: If the folder does not exist.
+        ValueError: If the format is none of these, or no Gaussian is left.
+        ImportError: If ``usd`` is asked for and usd-core is not installed.
+
+    Warns:
+        UserWarning: If Gaussians were left out because they are not finite.
+    """
+    check_choice("format", format, tuple(SUFFIXES))
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
+    if format == "usd":
+        write_usd(path, [cloud])
+        return
+    kept = _kept(path, cloud)
+    if format == "ply":
+        write_ply(path, kept)
+        return
+    _replace(path, lambda temporary: temporary.write_bytes(_gsplat_bytes(path, kept, format)))
+
+
+def format_of(path: str | os.PathLike[str]) -> str:
+    """The format that the end of a file's name stands for.
+
+    Raises:
+        ValueError: If it stands for none.
+    """
+    name = Path(path).name
+    for format, suffix in sorted(SUFFIXES.items(), key=lambda item: -len(item[1])):  # .compressed.ply before .ply
+        if name.endswith(suffix):
+            return format
+    if name.endswith((".usd", ".usda")):
+        return "usd"
+    endings = ", ".join((*SUFFIXES.values(), ".usda"))
+    raise ValueError(f"Cannot tell the format of {path}: let its name end in one of {endings}.")
+
+
+def convert(source: str | os.PathLike[str], target: str | os.PathLike[str], fps: float = 25.0) -> None:
+    """Write a 3DGS .ply, or the sequence of them that a run left in a folder, in the format of the target's name.
+
+    Args:
+        source: A 3DGS .ply; for USD also a folder of them, whose frames come in the order of their names.
+        target: File to write, see :func:`format_of`.
+        fps: Frames per second of a folder.
+
+    Raises:
+        FileNotFoundError: If the source or the target's folder does not exist.
+        ValueError: If a file cannot be read or written; the message names it and the remedy.
+    """
+    source, target = Path(source), Path(target)
+    format = format_of(target)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"{target} cannot be written because {target.parent} is not a folder; create it first.")
+    if not source.is_dir():
+        export_cloud(target, read_ply(source), format)
+        return
+    files = sorted(source.glob("*.ply"))
+    if format != "usd" or not files:
+        what = "holds no .ply" if not files else f"is a folder of {len(files)} frames, which only USD can hold"
+        raise ValueError(f"{source} {what}: give one .ply, or a folder of them and a target that ends in .usdc.")
+    film = UsdFilm(fps)
+    for frame, file in enumerate(files):
+        film.add(frame, usd_arrays(read_ply(file)))
+    film.save(target)
+
+
+def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
+    kept = cleaned(cloud)
+    if len(kept) == 0:
+        raise ValueError(
+            f"{path} was not written because none of its {len(cloud)} Gaussians is finite; check the run behind them."
+        )
+    if len(kept) < len(cloud):
+        warnings.warn(
+            f"{path}: left out {len(cloud) - len(kept)} of {len(cloud)} Gaussians that are not finite.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return kept
+
+
+def _replace(path: Path, write: Callable[[Path], Any]) -> None:
+    """Write under a temporary name of the same ending, and rename."""
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:
+    """The file as gsplat's exporter makes it, from float32 tensors on the CPU."""
+    from gsplat.exporter import export_splats
+
+    host = cloud.to("cpu", torch.float32)
+    if format == "compressed_ply":
+        visible = host.opacities.sigmoid() > 1 / 255  # as the exporter leaves them out, which an empty file breaks
+        if not bool(visible.any()):
+            raise ValueError(f"{path} was not written because all Gaussians are fainter than 1/255.")
+    data: bytes = export_splats(
+        means=host.means,
+        scales=host.scales,
+        quats=host.quats,
+        opacities=host.opacities,
+        sh0=host.sh[:, :1],
+        shN=host.sh[:, 1:],
+        format=_GSPLAT[format],
+    )
+    if format == "compressed_ply" and host.sh_degree == 0:  # an element without properties, which readers trip over
+        head, mark, body = data.partition(b"end_header\n")
+        data = re.sub(rb"element sh \d+\n", b"", head) + mark + body
+    return data
+
+
+# ---- USD
+
+
+def write_usd(
+    path: str | os.PathLike[str],
+    clouds: Sequence[GaussianCloud],
+    fps: float = 25.0,
+    start: int = 0,
+    metres_per_unit: float = 1.0,
+    rotation: Tensor | None = None,
+) -> None:
+    """Write Gaussians, still or moving, as USD (.usd, .usdc or .usda).
+
+    The prim is a ``ParticleField3DGaussianSplat`` where usd-core has that schema (26.03), with positions, orientations,
+    scales, opacities and harmonics, as the values are after exponential and sigmoid. Older versions get a
+    ``Points`` prim with the same attributes, and normals and widths beside them. Each number that changes has a sample
+    for every frame. Programs that cannot draw splats find ``displayColor`` and ``displayOpacity``.
+
+    Args:
+        path: File to write; an existing one is replaced.
+        clouds: One for each frame, all of the same size.
+        fps: Frames per second.
+        start: Number of the first frame.
+        metres_per_unit: Length of a scene unit [m].
+        rotation: Takes scene directions to z up, shape (3, 3); the scene's z is up if None.
+
+    Raises:
+        ImportError: If usd-core is not installed.
+        ValueError: If there is no frame or no finite Gaussian, or the frames differ in size.
+    """
+    check_positive("fps", fps)
+    check_positive("metres_per_unit", metres_per_unit)
+    path = Path(path)
+    if not clouds:
+        raise ValueError(f"{path} was not written because there are no frames; give at least one cloud.")
+    if len({len(cloud) for cloud in clouds}) > 1:
+        raise ValueError(f"{path} was not written because its frames differ in their number of Gaussians.")
+    film = UsdFilm(fps, metres_per_unit, rotation)
+    for index, cloud in enumerate(clouds):
+        kept = _kept(path, cloud) if len(clouds) == 1 else cloud
+        film.add(start + index, usd_arrays(kept))
+    film.save(path)
+
+
+def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
+    """What a USD prim holds of a splat, float32.
+
+    A Gaussian of a moving splat cannot be left out of a frame, so one that is not finite becomes a point of no opacity
+    at the origin.
+
+    Args:
+        cloud: N Gaussians with K harmonics each.
+
+    Returns:
+        ``positions`` (N, 3), ``orientations`` (N, 4) wxyz, ``scales`` (N, 3) and ``opacities`` (N,) as they are seen,
+        ``harmonics`` (N, K, 3), ``normals`` (N, 3) and ``colors`` (N, 3), those of harmonics of degree 0.
+    """
+    host = cloud.to("cpu", torch.float32)
+    numbers = (host.means, host.quats, host.scales, host.opacities[:, None], host.sh.flatten(1))
+    bad = ~torch.isfinite(torch.cat([part.clamp(-1e30, 1e30) for part in numbers], dim=1)).all(-1)
+    bad |= torch.linalg.vector_norm(host.quats, dim=-1) == 0
+    neutral = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    quats = torch.nn.functional.normalize(torch.where(bad[:, None], neutral, host.quats), dim=-1)
+    scales = torch.where(bad[:, None], 0.0, host.scales).clamp(-LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
+    sh = torch.where(bad[:, None, None], 0.0, host.sh)
+    normals = smallest_axis_normal(quats, scales) if host.normals is None else host.normals
+    arrays = {
+        "positions": torch.where(bad[:, None], 0.0, host.means),
+        "orientations": quats,
+        "scales": scales.exp(),
+        "opacities": torch.where(bad, 0.0, host.opacities.sigmoid()),
+        "harmonics": sh,
+        "normals": torch.where(bad[:, None], torch.tensor([0.0, 0.0, 1.0]), normals),
+        "colors": sh_to_color(sh[:, :1], torch.ones_like(host.means)).clamp(0, 1),
+    }
+    return {name: np.ascontiguousarray(value.detach().numpy()) for name, value in arrays.items()}
+
+
+class UsdFilm:
+    """A USD stage that takes one frame after the other.
+
+    The whole film is in memory until it is saved, about 60 bytes for each Gaussian and frame without view-dependent
+    colours.
+
+    Args:
+        fps: Frames per second.
+        metres_per_unit: Length of a scene unit [m].
+        rotation: Takes scene directions to z up, shape (3, 3); the scene's z is up if None.
+
+    Raises:
+        ImportError: If usd-core is not installed.
+    """
+
+    def __init__(self, fps: float, metres_per_unit: float = 1.0, rotation: Tensor | None = None) -> None:
+        usd, geom = _pxr("Usd"), _pxr("UsdGeom")
+        self._splat = getattr(_pxr("UsdVol"), "ParticleField3DGaussianSplat", None)
+        self._stage = usd.Stage.CreateInMemory()
+        geom.SetStageUpAxis(self._stage, geom.Tokens.z)
+        geom.SetStageMetersPerUnit(self._stage, metres_per_unit)
+        self._stage.SetTimeCodesPerSecond(fps)
+        self._stage.SetFramesPerSecond(fps)
+        world = geom.Xform.Define(self._stage, "/World")
+        self._stage.SetDefaultPrim(world.GetPrim())
+        if rotation is not None:
+            Gf = _pxr("Gf")
+            matrix = Gf.Matrix4d(1.0)
+            matrix.SetRotateOnly(Gf.Matrix3d(*rotation.double().T.flatten().tolist()))  # USD multiplies rows
+            world.AddTransformOp().Set(matrix)
+        self._prim = (self._splat or geom.Points).Define(self._stage, _PRIM)
+        self._last: dict[str, tuple[int, np.ndarray]] = {}
+        self._first: int | None = None
+        self._end = 0
+
+    def add(self, frame: int, arrays: dict[str, np.ndarray]) -> None:
+        """Take the arrays of :func:`usd_arrays` for a frame; frames come in order.
+
+        Raises:
+            ValueError: If the frame has another number of Gaussians than the first.
+        """
+        if self._first is None:
+            self._first = self._end = frame
+            self._stage.SetStartTimeCode(frame)
+            self._create(arrays)
+        elif len(arrays["positions"]) != len(self._last["positions"][1]):
+            raise ValueError(f"Frame {frame} has another number of Gaussians than frame {self._first}.")
+        for name, array in arrays.items():
+            written, last = self._last.get(name, (frame, None))
+            if last is not None and np.array_equal(array, last):
+                continue
+            if last is not None and written < self._end:  # it held until the frame that came before
+                self._set(name, last, self._end)
+            self._set(name, array, frame)
+            self._last[name] = (frame, array)
+        low, high = _extent(arrays)
+        self._prim.GetExtentAttr().Set(_vec3(np.stack([low, high])), frame)
+        self._stage.SetEndTimeCode(frame)
+        self._end = frame
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the film, whole or not at all."""
+        path = Path(path)
+        _replace(path, lambda temporary: self._stage.GetRootLayer().Export(str(temporary)))
+
+    def _create(self, arrays: dict[str, np.ndarray]) -> None:
+        Sdf, UsdGeom = _pxr("Sdf"), _pxr("UsdGeom")
+        prim, types = self._prim.GetPrim(), Sdf.ValueTypeNames
+        degree = round(arrays["harmonics"].shape[1] ** 0.5) - 1
+        if self._splat is None:
+            for name, kind in (
+                ("positions", types.Point3fArray),
+                ("orientations", types.QuatfArray),
+                ("scales", types.Float3Array),
+                ("opacities", types.FloatArray),
+                (_HARMONICS, types.Float3Array),
+            ):
+                prim.CreateAttribute(name, kind)
+            prim.CreateAttribute(_DEGREE, types.Int).Set(degree)
+        else:
+            prim.GetAttribute(_DEGREE).Set(degree)
+            primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("normals", types.Normal3fArray, UsdGeom.Tokens.vertex)
+            self._normals = primvar.GetAttr()
+        for primvar in (self._prim.CreateDisplayColorPrimvar(), self._prim.CreateDisplayOpacityPrimvar()):
+            primvar.SetInterpolation(UsdGeom.Tokens.vertex)
+
+    def _set(self, name: str, array: np.ndarray, frame: int) -> None:
+        Vt, prim = _pxr("Vt"), self._prim.GetPrim()
+        if name == "orientations":
+            prim.GetAttribute(name).Set(Vt.QuatfArray.FromNumpy(array[:, [1, 2, 3, 0]]), frame)
+        elif name == "opacities":
+            values = Vt.FloatArray.FromNumpy(array)
+            prim.GetAttribute(name).Set(values, frame)
+            self._prim.GetDisplayOpacityAttr().Set(values, frame)
+        elif name == "harmonics":
+            prim.GetAttribute(_HARMONICS).Set(_vec3(array.reshape(-1, 3)), frame)
+        elif name == "colors":
+            self._prim.GetDisplayColorAttr().Set(_vec3(array), frame)
+        elif name == "normals":
+            (self._normals if self._splat else self._prim.GetNormalsAttr()).Set(_vec3(array), frame)
+        else:
+            prim.GetAttribute(name).Set(_vec3(array), frame)
+            if self._splat is None and name == "positions":
+                self._prim.GetPointsAttr().Set(_vec3(array), frame)
+            if self._splat is None and name == "scales":  # drawn as discs of one standard deviation
+                self._prim.GetWidthsAttr().Set(Vt.FloatArray.FromNumpy(2 * array.max(1)), frame)
+
+
+def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.ndarray]:
+    """The arrays of one frame of a file that :class:`UsdFilm` wrote, as :func:`usd_arrays` gives them.
+
+    Args:
+        path: The file.
+        frame: Frame number; a frame without samples of its own is interpolated.
+
+    Raises:
+        ImportError: If usd-core is not installed.
+        ValueError: If the file cannot be read or holds no Gaussians.
+    """
+    usd, geom = _pxr("Usd"), _pxr("UsdGeom")
+    try:
+        stage = usd.Stage.Open(str(path))
+        prim = stage.GetPrimAtPath(_PRIM)
+        found = {name: prim.GetAttribute(_ATTRIBUTES.get(name, name)).Get(frame) for name in _ARRAYS}
+        normals = prim.GetAttribute("normals") or geom.PrimvarsAPI(prim).GetPrimvar("normals").GetAttr()
+        arrays = {name: np.array(value, dtype=np.float32) for name, value in found.items()}
+        arrays["normals"] = np.array(normals.Get(frame), dtype=np.float32)
+    except Exception as error:  # USD's own, and those of attributes that are missing
+        raise ValueError(f"{path} cannot be read as a USD file of Gaussians: export it again.") from error
+    arrays["orientations"] = arrays["orientations"][:, [3, 0, 1, 2]]
+    arrays["harmonics"] = arrays["harmonics"].reshape(len(arrays["positions"]), -1, 3)
+    return arrays
+
+
+_HARMONICS = "radiance:sphericalHarmonicsCoefficients"
+_DEGREE = "radiance:sphericalHarmonicsDegree"
+_ARRAYS = ("positions", "orientations", "scales", "opacities", "harmonics", "colors")
+_ATTRIBUTES = {"harmonics": _HARMONICS, "colors": "primvars:displayColor"}
+
+
+def _pxr(name: str) -> Any:
+    """A module of usd-core."""
+    try:
+        return import_module(f"pxr.{name}")
+    except ImportError as error:
+        raise ImportError(
+            "USD files need usd-core: install gaussian-swaying[usd], or choose another format."
+        ) from error
+
+
+def _vec3(array: np.ndarray) -> Any:
+    return _pxr("Vt").Vec3fArray.FromNumpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def _extent(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box around all Gaussians to three standard deviations."""
+    axes = quat_to_rotation(torch.from_numpy(arrays["orientations"])).numpy()
+    reach = 3 * np.sqrt(np.square(axes * arrays["scales"][:, None, :]).sum(-1))
+    return (arrays["positions"] - reach).min(0), (arrays["positions"] + reach).max(0)

@@ -1,0 +1,225 @@
+"""Another material or another colour for a part of the object, at load or during a run."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.gaussians.selection import Region
+from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+from gaussian_swaying.mpm.materials import ConstitutiveLaw
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.scene import SimulatedScene
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
+
+
+@dataclass
+class Edit:
+    """A change of a part of the object.
+
+    Deformations and velocities stay as they are; stresses follow the new material from then on. Where the law changes,
+    its internal variable starts anew.
+
+    Args:
+        region: Where at rest, in scene units, also among Gaussians that stay; all that moves if null.
+        time: When [s]: holds from the first frame at or after it. 0 is at load.
+        E: Young's modulus [Pa]; unchanged if null.
+        nu: Poisson's ratio; unchanged if null.
+        density: Density at rest [kg/m³]; unchanged if null.
+        law: Constitutive law; unchanged if null. One that flows needs ``solver.formulation: updated``.
+        color: Red, green and blue in [0, 1], the same from everywhere; unchanged if null.
+        detail: Which part of the differences in brightness within the region the new colour keeps, in [0, 1].
+    """
+
+    region: Region | None = None
+    time: float = 0.0
+    E: float | None = None
+    nu: float | None = None
+    density: float | None = None
+    law: ConstitutiveLaw | None = None
+    color: list[float] | None = None
+    detail: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive("edits.time", self.time, allow_zero=True)
+        for name in ("E", "density"):
+            if getattr(self, name) is not None:
+                check_positive(f"edits.{name}", getattr(self, name))
+        if self.nu is not None and not -1 < self.nu < 0.5:
+            raise ValueError(
+                f"Expected `edits.nu` (Poisson's ratio) to lie between -1 and 0.5, both excluded, but got {self.nu}."
+            )
+        if self.color is not None and not all(0 <= part <= 1 for part in check_vector("edits.color", self.color)):
+            raise ValueError(f"Expected `edits.color` to lie in [0, 1], but got {self.color}.")
+        if not 0 <= self.detail <= 1:
+            raise ValueError(f"Expected `edits.detail` to lie in [0, 1], but got {self.detail}.")
+        if not self.of_material and self.color is None:
+            raise ValueError("An entry of `edits` changes nothing: give `E`, `nu`, `density`, `law` or `color`.")
+
+    @property
+    def of_material(self) -> bool:
+        """Whether more than the colour changes."""
+        return any(value is not None for value in (self.E, self.nu, self.density, self.law))
+
+
+def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bool = False) -> MaterialPoints:
+    """The material with an edit.
+
+    Args:
+        points: The material of one scene, shapes (P, ·).
+        inside: Which points are edited, bool, shape (P,).
+        edit: What to change.
+        flowed: Whether the points have moved already. Where a law has flowed, the elastic and the total deformation
+            differ for good. If none is left that flows, one of the laws is told to keep both, and the one that flowed
+            stays in the list, without particles, for kernels that look at the list.
+
+    Returns:
+        The material; laws that hold for no point any more are left out.
+    """
+
+    def field(value: float | None, old: Tensor) -> Tensor:
+        return old if value is None else torch.where(inside, value, old)
+
+    before = torch.zeros_like(inside, dtype=torch.long) if points.law_index is None else points.law_index
+    index, laws = before, list(points.laws)
+    if edit.law is not None:
+        index = torch.where(inside, len(laws), before)
+        laws.append(edit.law)
+    used = torch.unique(index).tolist()
+    kept = [laws[k] for k in used]
+    had_both = flowed and any(laws[k].plastic for k in torch.unique(before).tolist())
+    if had_both and not any(type(law).plastic for law in kept):
+        kept[0] = copy.deepcopy(kept[0])
+        kept[0].plastic = True
+        kept.append(next(law for law in laws if type(law).plastic))
+    place = torch.zeros(len(laws), dtype=torch.long, device=index.device)
+    place[used] = torch.arange(len(used), device=index.device)
+    mass = points.mass if edit.density is None else torch.where(inside, edit.density * points.volume, points.mass)
+    return dataclasses.replace(
+        points,
+        mass=mass,
+        youngs_modulus=field(edit.E, points.youngs_modulus),
+        poisson_ratio=field(edit.nu, points.poisson_ratio),
+        laws=tuple(kept),
+        law_index=place[index] if len(kept) > 1 else None,
+    )
+
+
+def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float = 0.0) -> Tensor:
+    """Harmonics of a splat with one colour for a part of it.
+
+    Args:
+        sh: Coefficients, shape (N, K, 3).
+        inside: Which Gaussians get the colour, bool, shape (N,).
+        color: Red, green and blue in [0, 1].
+        detail: Which part of the differences in brightness is kept: the colour is multiplied by
+            ``1 + detail (Y / mean(Y) - 1)`` with the luminance Y of the old colours.
+
+    Returns:
+        Shape (N, K, 3).
+    """
+    old = (sh[:, 0] * SH_DC + 0.5).clamp_min(0)
+    luminance = (old * old.new_tensor(LUMINANCE)).sum(-1)
+    mean = torch.where(inside, luminance, 0.0).sum() / inside.sum().clamp_min(1)
+    factor = 1 + detail * (luminance / mean.clamp_min(1e-6) - 1)
+    new = torch.zeros_like(sh)
+    new[:, 0] = (factor[:, None] * old.new_tensor(list(color)) - 0.5) / SH_DC
+    return torch.where(inside[:, None, None], new, sh)
+
+
+class SceneEditor:
+    """Applies edits to a scene, in order of their times, and takes them back.
+
+    Args:
+        scene: The scene, which is changed.
+        edits: What changes when; those of the same time in the order given, so that later entries win.
+
+    Raises:
+        ValueError: If the region of an edit holds nothing that it could change.
+    """
+
+    def __init__(self, scene: SimulatedScene, edits: Sequence[Edit] = ()) -> None:
+        self.scene = scene
+        self.edits = sorted(edits, key=lambda edit: edit.time)
+        self.applied = 0
+        self._loaded: tuple[MaterialPoints, Tensor, Tensor] | None = None
+        for edit in self.edits:
+            self.reach(edit)
+
+    @property
+    def times(self) -> list[float]:
+        """The different times of the edits, in order."""
+        return sorted({edit.time for edit in self.edits})
+
+    def reach(self, edit: Edit) -> tuple[Tensor, Tensor]:
+        """Which particles (P,) and which Gaussians (N,) an edit changes.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
+        if region is None:
+            particles = torch.ones_like(scene.patch_area, dtype=torch.bool)
+            gaussians = torch.zeros_like(means[:, 0], dtype=torch.bool).index_fill(0, scene.moving, True)
+        else:
+            particles = region.contains(scene.frame.point_to_scene(scene.points.position).to(means.dtype))
+            gaussians = region.contains(means)
+        particles, gaussians = particles & edit.of_material, gaussians & (edit.color is not None)
+        for wanted, found, what in (
+            (edit.of_material, particles, "simulated Gaussian"),
+            (edit.color is not None, gaussians, "Gaussian"),
+        ):
+            if wanted and not bool(found.any()):
+                raise ValueError(f"The region {region!r} of `edits` at {edit.time:g} s holds no {what}.")
+        return particles, gaussians
+
+    def reset(self) -> None:
+        """The scene as it was before its first edit."""
+        self.applied = 0
+        if self._loaded is None:
+            return
+        device = self.scene.model.means.device
+        points, sh0, shN = self._loaded
+        self.scene.points = points.map(lambda tensor: tensor.to(device))
+        self._paint(sh0.to(device), shN.to(device))
+        self._loaded = None
+
+    def due(self, time: float) -> list[Edit]:
+        """The edits of the list up to a time [s] that were not yet applied; they count as applied from now on."""
+        found = [edit for edit in self.edits[self.applied :] if edit.time <= time]
+        self.applied += len(found)
+        return found
+
+    def apply(self, edit: Edit, flowed: bool = False) -> Tensor:
+        """Change the scene.
+
+        Args:
+            edit: What to change.
+            flowed: See :func:`edited_points`.
+
+        Returns:
+            Which particles have another law now, bool, shape (P,).
+        """
+        particles, gaussians = self.reach(edit)
+        model = self.scene.model
+        if self._loaded is None:
+            self._loaded = (self.scene.points, model.sh0.detach(), model.shN.detach())
+        with torch.inference_mode(False), torch.no_grad():
+            if edit.of_material:
+                self.scene.points = edited_points(self.scene.points, particles, edit, flowed)
+            if edit.color is not None:
+                sh = recolored(model.sh.detach(), gaussians, edit.color, edit.detail)
+                self._paint(sh[:, :1], sh[:, 1:])
+        return particles & (edit.law is not None)
+
+    def _paint(self, sh0: Tensor, shN: Tensor) -> None:
+        with torch.inference_mode(False):
+            self.scene.model.sh0 = nn.Parameter(sh0.clone(), requires_grad=False)
+            self.scene.model.shN = nn.Parameter(shN.clone(), requires_grad=False)

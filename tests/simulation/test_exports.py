@@ -1,0 +1,81 @@
+"""Formats in which a run leaves its Gaussians."""
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.export import read_usd_frame
+from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.gaussians.surface import covariance
+from gaussian_swaying.simulation import recorder as recorder_module
+from gaussian_swaying.simulation.recorder import Recorder
+
+QUIET = {"video": False, "images": False, "trajectory": False}
+
+
+@pytest.mark.parametrize(
+    ("format", "suffix", "size"), [("splat", ".splat", 96 * 32), ("compressed_ply", ".compressed.ply", None)]
+)
+def test_small_formats(format, suffix, size, make_pipeline, tmp_path):
+    pipeline = make_pipeline()
+    pipeline.run(Recorder(ply_every=2, export_format=format, **QUIET), tmp_path / "run", 3, progress=False)
+    files = sorted((tmp_path / "run" / format).iterdir())
+    assert [file.name for file in files] == [f"00000{suffix}", f"00002{suffix}"]
+    assert files[0].read_bytes() != files[1].read_bytes()
+    assert size is None or files[0].stat().st_size == size
+    assert tmp_path / "run" / format in pipeline.files
+
+
+def test_a_film_in_usd(make_pipeline, tmp_path):
+    """Every frame of the run, resumed or not, as its .ply has it; metres, z up and the time of the run."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    folder, scene = tmp_path / "run", {"metres_per_unit": 2.0}
+    for frames in (2, 4):
+        usd = Recorder(ply_every=1, export_format="usd", **QUIET)
+        pipeline = make_pipeline(scene=scene)
+        pipeline.run(usd, folder, frames, resume=frames > 2, progress=False)
+    plain = make_pipeline(scene=scene)
+    plain.run(Recorder(ply_every=1, **QUIET), tmp_path / "plain", 4, progress=False)
+    for frame in range(4):
+        found, expected = (
+            read_usd_frame(folder / "animation.usdc", frame),
+            read_ply(tmp_path / "plain" / "ply" / f"{frame:05d}.ply"),
+        )
+        np.testing.assert_allclose(found["positions"], expected.means.numpy(), atol=1e-6)
+        shape = covariance(torch.from_numpy(found["orientations"]), torch.from_numpy(found["scales"]).log())
+        torch.testing.assert_close(shape, covariance(expected.quats, expected.scales), rtol=1e-4, atol=1e-8)
+    assert not np.allclose(found["positions"], read_usd_frame(folder / "animation.usdc", 0)["positions"], atol=1e-3)
+    stage = Usd.Stage.Open(str(folder / "animation.usdc"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 3, 25)
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 2.0
+    assert not (folder / "usd").exists()
+    assert folder / "animation.usdc" in pipeline.files
+
+
+def test_the_up_direction_of_a_film_is_z(flag_ply, make_pipeline, tmp_path):
+    """In the world of the film every Gaussian is where the simulation has it, up to scale and origin."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    settings = {"up": [0.0, 1.0, 0.0], "longest_side": 1.2}
+    pipeline = make_pipeline(read_ply(flag_ply), pinned=False, scene=settings)
+    usd = Recorder(ply_every=1, export_format="usd", **QUIET)
+    pipeline.run(usd, tmp_path / "run", 1, progress=False)
+    stage = Usd.Stage.Open(str(tmp_path / "run" / "animation.usdc"))
+    prim = stage.GetPrimAtPath("/World/Gaussians")
+    matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0))
+    points = np.array(prim.GetAttribute("positions").Get(0), dtype=np.float64) @ matrix[:3, :3]
+    points = points * UsdGeom.GetStageMetersPerUnit(stage)
+    expected = pipeline.scene.points.position.double().numpy()
+    np.testing.assert_allclose(points - points.mean(0), expected - expected.mean(0), atol=1e-5)
+
+
+def test_usd_without_its_library_is_refused_at_once(monkeypatch):
+    monkeypatch.setattr(recorder_module, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"needs usd-core: .*`recorder.export_format`"):
+        Recorder(ply_every=1, export_format="usd")
+    Recorder(export_format="usd")  # nothing would be written
+    with pytest.raises(ValueError, match=r"`recorder\.export_format` to be one of ply, compressed_ply, splat, usd"):
+        Recorder(export_format="obj")
