@@ -15,10 +15,12 @@ if TYPE_CHECKING:
     from gaussian_swaying.aero.load import WindLoad
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
     from gaussian_swaying.data.capture import Capture, View, read_capture
+    from gaussian_swaying.data.capture_camera import CaptureCamera
     from gaussian_swaying.data.datamodule import CaptureDataModule
     from gaussian_swaying.data.generated_capture import GeneratedCapture
     from gaussian_swaying.data.initial_points import initial_points
     from gaussian_swaying.data.point_cloud import PointCloud
+    from gaussian_swaying.gaussians.export import export_cloud, write_usd
     from gaussian_swaying.gaussians.filling import InteriorFilling
     from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
     from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
@@ -52,9 +54,11 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
     from gaussian_swaying.rendering.camera import Camera, LookAtCamera, OrbitCamera, TransformsCamera
     from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+    from gaussian_swaying.rendering.keyframes import CameraKey, KeyframedCamera
     from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
     from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
+    from gaussian_swaying.simulation.edits import Edit
     from gaussian_swaying.simulation.frame import SimFrame
     from gaussian_swaying.simulation.physgaussian import Normalisation, PhysGaussianCamera
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
@@ -69,10 +73,12 @@ _HOMES = {
     "aero.load": ("WindLoad",),
     "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "UniformGust", "WindField"),
     "data.capture": ("Capture", "View", "read_capture"),
+    "data.capture_camera": ("CaptureCamera",),
     "data.datamodule": ("CaptureDataModule",),
     "data.generated_capture": ("GeneratedCapture",),
     "data.initial_points": ("initial_points",),
     "data.point_cloud": ("PointCloud",),
+    "gaussians.export": ("export_cloud", "write_usd"),
     "gaussians.filling": ("InteriorFilling",),
     "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
     "gaussians.selection": ("Box", "Cylinder", "Sphere"),
@@ -106,9 +112,11 @@ _HOMES = {
     "mpm.state": ("GridSpec", "MPMState", "MaterialPoints"),
     "rendering.camera": ("Camera", "LookAtCamera", "OrbitCamera", "TransformsCamera"),
     "rendering.gsplat_renderer": ("GsplatRenderer",),
+    "rendering.keyframes": ("CameraKey", "KeyframedCamera"),
     "rendering.shading": ("DiffuseShader", "PhongShader"),
     "rendering.torch_renderer": ("TorchRenderer",),
     "simulation.diagnostics": ("SimulationDiverged", "TearingGauge"),
+    "simulation.edits": ("Edit",),
     "simulation.frame": ("SimFrame",),
     "simulation.physgaussian": ("Normalisation", "PhysGaussianCamera"),
     "simulation.pipeline": ("SimulationPipeline",),
@@ -125,13 +133,16 @@ __all__ = [
     "Boundary",
     "Box",
     "Camera",
+    "CameraKey",
     "Capture",
+    "CaptureCamera",
     "CaptureDataModule",
     "ChamferDistance",
     "ConstitutiveLaw",
     "Cylinder",
     "DefaultDensification",
     "DiffuseShader",
+    "Edit",
     "EnclosingBox",
     "FixedCorotated",
     "FlowKey",
@@ -147,6 +158,7 @@ __all__ = [
     "Handle",
     "Impulse",
     "InteriorFilling",
+    "KeyframedCamera",
     "LookAtCamera",
     "LossInputs",
     "LossTerm",
@@ -190,12 +202,14 @@ __all__ = [
     "aero_force",
     "chamfer_distance",
     "compare_run",
+    "export_cloud",
     "frechet_distance",
     "initial_points",
     "load_trajectory",
     "read_capture",
     "read_ply",
     "write_ply",
+    "write_usd",
 ]
 
 

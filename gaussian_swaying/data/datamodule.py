@@ -190,9 +190,7 @@ class CaptureDataModule(LightningDataModule):
         from gaussian_swaying.training.initial import gaussians_from_points
 
         cloud = initial_points(self.capture, self.points, self.point_count, self.seed)
-        return gaussians_from_points(
-            cloud.points, cloud.colors, sh_degree, self.initial_opacity, self.initial_scale
-        )
+        return gaussians_from_points(cloud.points, cloud.colors, sh_degree, self.initial_opacity, self.initial_scale)
 
     @property
     def validation_split(self) -> str:
