@@ -166,6 +166,49 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
     return row
 
 
+_TIMES = (0.05, 0.2, 0.4, 0.6, 0.95)  # of a figure, as shares of the run
+
+
+def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -> bool:
+    """Reference, ours, PhysGaussian's way and the error of ours at five times; False without pictures of all."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import numpy as np
+    from imageio.v3 import imread
+
+    folders = {"reference": reference / "video" / "frames"}
+    folders |= {name: runs[name] / "frames" for name in ("ours", "particle") if name in runs}
+    files = {name: sorted(folder.glob("*.png")) for name, folder in folders.items()}
+    count = min(map(len, files.values()))
+    if len(files) < 3 or count < 250:
+        return False
+    rows = [*files, "error of ours"]
+    drawn, axes = plt.subplots(len(rows), len(_TIMES), figsize=(12, 12 * len(rows) / len(_TIMES) * 0.62))
+    for column, share in enumerate(_TIMES):
+        frame = round(share * (count - 1))
+        seen = {name: imread(files[name][frame])[..., :3] for name in files}
+        wrong = np.abs(seen["ours"].astype(float) - seen["reference"].astype(float)).mean(-1)
+        for row, name in enumerate(rows):
+            axis = axes[row, column]
+            if name in seen:
+                axis.imshow(seen[name])
+            else:
+                axis.imshow(wrong, cmap="magma", vmin=0, vmax=255)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if column == 0:
+                axis.set_ylabel(VARIANTS["particle"].title if name == "particle" else name)
+            if row == 0:
+                axis.set_title(f"{0.04 * frame:.2f} s")
+    drawn.tight_layout()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    drawn.savefig(target, dpi=110)
+    plt.close(drawn)
+    return True
+
+
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py flags``."""
     command.add_argument("--dataset", required=True, help="folder that tools/make_flag_dataset.py wrote")
@@ -177,6 +220,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", type=int, help="only the first frames")
     command.add_argument("--size", help="of the pictures, as 960x540; that of the reference by default")
     command.add_argument("--points", type=int, default=10_000, help="on the reference's surface")
+    command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
     command.add_argument("--more", help="further options of tools/sim.py, in quotes")
 
 
@@ -217,6 +261,12 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
                 rows.setdefault(name, {})[str(pattern)] = row
                 shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
                 print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)
+                save(result)
+        for pattern in patterns:
+            runs = {n: Path(scratch) / f"{n}_{pattern}" for n in names if (Path(scratch) / f"{n}_{pattern}").is_dir()}
+            target = Path(options.pictures) / f"flags_pattern{pattern}.png"
+            if figure(pattern, Path(options.dataset) / f"pattern{pattern}", runs, target):
+                result.setdefault("figures", {})[str(pattern)] = target.name
                 save(result)
 
 
@@ -270,6 +320,8 @@ def page(recorded: list[Row]) -> list[str]:
                 for name, v in found.items()
             ]
             lines.append(f"- pattern {pattern}: {', '.join(shown)}")
+        for pattern, name in sorted(result.get("figures", {}).items()):
+            lines += ["", f"![Pattern {pattern} at five times](pictures/{name})"]
         lines += ["", "### Time and memory", "", "| | particles | substeps | time a frame [ms] | device memory [GiB] |"]
         lines += ["|---|---|---|---|---|"]
         for name in ("ours", "particle"):

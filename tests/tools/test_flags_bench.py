@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imageio.v3 import imread, imwrite
 
 from gaussian_swaying.simulation.config import build_parser
 
+PIXEL = imwrite("<bytes>", np.zeros((4, 6, 3), np.uint8), extension=".png")
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -67,6 +69,21 @@ def test_a_row_is_simulated_and_compared(flags, tmp_path):
     assert row["chamfer_share"] == pytest.approx(row["mean"]["chamfer_m"] / 1.2)
     options.more = "--solver.dx=nonsense"
     assert "solver.dx" in flags.run_row(1, "ours", options, None, tmp_path / "again")["failed"]
+
+
+def test_a_figure_needs_all_pictures(flags, tmp_path):
+    frames = {"reference": tmp_path / "reference/video/frames", "ours": tmp_path / "ours/frames"}
+    frames["particle"] = tmp_path / "particle/frames"
+    for folder in frames.values():
+        folder.mkdir(parents=True)
+        for number in range(250):
+            (folder / f"{number:05d}.png").write_bytes(PIXEL)
+    runs = {name: tmp_path / name for name in ("ours", "particle")}
+    target = tmp_path / "figures" / "one.png"
+    assert not flags.figure(2, tmp_path / "reference", {"ours": runs["ours"]}, target)
+    assert not target.exists()
+    assert flags.figure(2, tmp_path / "reference", runs, target)
+    assert imread(target).shape[1] > 1000
 
 
 def test_the_page_tells_what_was_and_what_was_not(flags):
