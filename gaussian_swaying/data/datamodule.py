@@ -208,6 +208,11 @@ class CaptureDataModule(LightningDataModule):
         """
         wanted = {"fit": ("train", self.validation_split), "validate": (self.validation_split,), "test": ("test",)}
         for split in wanted.get(stage or "", ("train", self.validation_split, "test")):
+            if stage in ("validate", "test") and not self.capture.split(split):
+                raise ValueError(
+                    f"The split `{split}` of {self.path} is empty, so there is nothing to {stage}: set `test_every`, "
+                    "or name the images in the capture's files."
+                )
             self._dataset(split)
 
     def _dataset(self, split: str) -> CaptureDataset:
@@ -241,8 +246,9 @@ class CaptureDataModule(LightningDataModule):
             ValueError: If the seed or the training images are others.
         """
         now = {"seed": self.seed, "count": len(self.capture.split("train"))}
+        fitting = self.trainer is None or self.trainer.state.fn == "fit"
         for name, what in (("seed", "seed"), ("count", "number of training images")):
-            if state_dict[name] != now[name]:
+            if fitting and state_dict[name] != now[name]:
                 raise ValueError(
                     f"The {what} of {self.path} was {state_dict[name]} in the checkpoint and is {now[name]} now: set "
                     "what it was, or start a new run."

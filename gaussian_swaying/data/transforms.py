@@ -63,13 +63,24 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
             if image is None:
                 missing.append(name)
                 continue
-            lens = _read_lens(where, {**data, **frame}, image)
+            lens = _read_lens(where, _merged(data, frame), image)
             own = split if listed is None else listed.get(name)
             images.append(PosedImage(name, image, lens, torch.linalg.inv(pose), own))
         for candidate in (data.get("ply_file_path"), "points3d.ply"):
             if points is None and isinstance(candidate, str) and (file.parent / candidate).is_file():
                 points = file.parent / candidate
     return images, missing, points
+
+
+def _merged(data: dict[str, object], frame: dict[str, object]) -> dict[str, object]:
+    """Fields of a frame, and those of the top where it has none; the top's focal length yields to the frame's angle."""
+    hidden: set[str] = set()
+    for axis, other in ("xy", "yx"):
+        if f"fl_{axis}" in frame or f"camera_angle_{axis}" in frame:
+            hidden |= {f"fl_{axis}", f"camera_angle_{axis}"}
+        if f"camera_angle_{axis}" in frame:  # a zoom: pixels stay square unless the frame says otherwise
+            hidden |= {f"fl_{other}", f"camera_angle_{other}"}
+    return {name: value for name, value in data.items() if name not in hidden} | frame
 
 
 def check_rigid(what: str, pose: torch.Tensor, tolerance: float = 1e-3) -> None:

@@ -16,6 +16,7 @@ from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 import gaussian_swaying.data.datamodule
 import gaussian_swaying.data.generated_datamodule
@@ -38,7 +39,8 @@ TRAINER_DEFAULTS: dict[str, Any] = {
 
 def default_loggers(folder: Path) -> list[Logger]:
     """A CSV file and, if tensorboard is installed, its event files, all in ``folder``."""
-    loggers: list[Logger] = [CSVLogger(folder, name="", version="csv")]
+    # rows come every `log_every` images only, and are worth keeping if the run is killed
+    loggers: list[Logger] = [CSVLogger(folder, name="", version="csv", flush_logs_every_n_steps=1)]
     if any(importlib.util.find_spec(name) is not None for name in ("tensorboard", "tensorboardX")):
         loggers.append(TensorBoardLogger(folder, name="", version="tensorboard"))
     return loggers
@@ -74,14 +76,30 @@ class TrainCLI(LightningCLI):
             kwargs["callbacks"] = [*callbacks, TQDMProgressBar(refresh_rate=20)]
         return super().instantiate_trainer(**kwargs)
 
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse, and refuse a checkpoint that cannot be read."""
+        super().parse_arguments(parser, args)
+        command = self.config.get("subcommand")
+        path = self.config.get(command, {}).get("ckpt_path") if command else None
+        if path is None or not Path(str(path)).suffix:  # best, last ...
+            return
+        try:
+            held = torch.load(path, map_location="cpu", weights_only=False, mmap=True)
+        except FileNotFoundError:
+            raise
+        except Exception as error:
+            raise ValueError(f"{path} is no checkpoint, or not whole: give another `--ckpt_path`.") from error
+        if not isinstance(held, dict) or "splat_training" not in held:
+            raise ValueError(f"{path} is no checkpoint of this training: give another `--ckpt_path`.")
+
     def after_fit(self) -> None:
         """Keep a checkpoint of the last image too, where ``every_n_train_steps`` does not divide their number."""
         checkpoint = self._get(self.config_init, "checkpoint")
         if checkpoint is None or checkpoint.dirpath is None:
             return
-        path = Path(checkpoint.dirpath) / f"step_{self.trainer.global_step:06d}.ckpt"
-        if not path.exists():
-            self.trainer.save_checkpoint(path)
+        kept: Any = self.trainer.checkpoint_callback
+        if getattr(kept, "_last_global_step_saved", None) != self.trainer.global_step:
+            self.trainer.save_checkpoint(Path(checkpoint.dirpath) / f"step_{self.trainer.global_step:06d}.ckpt")
 
 
 def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainCLI:
@@ -113,7 +131,9 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainC
 
 
 def _sentence(error: BaseException) -> str:
-    """The lines of a parser's message that name the value and the reason."""
+    """The lines of a parser's message that name the value and the reason, or the last of a worker's traceback."""
+    if str(error).startswith("Caught "):
+        return str(error).strip().rpartition("Error: ")[2]
     noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
     lines = [line.strip() for line in str(error).splitlines()]
     return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(noise))
@@ -135,13 +155,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.filterwarnings("ignore", message=".*LeafSpec")
     try:
         cli = make_cli(arguments)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as stop:
+        if isinstance(stop, SystemExit) and stop.code != 1:  # Lightning leaves with 1 after Ctrl-C
+            raise
         print("Stopped; --ckpt_path with the last checkpoint continues.", file=sys.stderr)
         return 130
     except torch.OutOfMemoryError as error:
         print(f"error: {error} Remedy: smaller images (`data.init_args.downscale`).", file=sys.stderr)
         return 2
-    except (ArgumentError, ValueError, TypeError, OSError, TrainingDiverged) as error:
+    except (ArgumentError, ValueError, TypeError, OSError, TrainingDiverged, MisconfigurationException) as error:
         if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
             raise
         print(f"error: {_sentence(error)}", file=sys.stderr)

@@ -171,6 +171,8 @@ class DefaultDensification(Densification):
             check_positive(f"densification.{name}", value)
         if not 0.0 <= prune_opacity < 0.5:
             raise ValueError(f"Expected `densification.prune_opacity` from 0 to below 0.5, but got {prune_opacity}.")
+        if reset_opacity and prune_opacity == 0:
+            raise ValueError("Expected `densification.prune_opacity` above 0 with `reset_opacity`, but got 0.")
         self.absgrad, self.reset_opacity = absgrad, reset_opacity
         self.stop, self.reset_every, self.prune_opacity = stop, reset_every, float(prune_opacity)
         self._options: dict[str, Any] = {

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +24,7 @@ from gaussian_swaying.rendering.base import SplatOutput, SplatRenderer, make_ren
 from gaussian_swaying.rendering.camera import Camera
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.losses import SSIM_TAPS, LossInputs, LossTerm, TotalLoss
-from gaussian_swaying.training.panels import lpips_metric, panel
+from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
 
 
 class TrainingDiverged(RuntimeError):  # noqa: N818
@@ -41,6 +43,9 @@ class TrainingDiverged(RuntimeError):  # noqa: N818
             f"Training diverged at step {step}: {what} is not finite; {kept}. Remedy: lower the learning rates "
             "(`model.rates`) or the weight of the loss that grew (`model.loss_weights`)."
         )
+
+
+_CLOCK_STEP = 20_000_000  # [ns] by which times of files may lag behind the clock
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,7 @@ class SplatTrainer(lightning.LightningModule):
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
         sh_every: Steps after which the degree in use rises by one; 0 for all from the start.
         background: Behind the Gaussians: ``random`` in each step where a photo has an alpha and black where it has
-            none, or one colour from 0 to 1.
+            none, ``black``, ``white``, or one colour from 0 to 1.
         scene_scale: Extent of the scene [scene units], which learning rates and thresholds refer to; that of the
             cameras (``datamodule.scene_scale``) by default.
         seed: Seed of backgrounds and new Gaussians.
@@ -167,7 +172,7 @@ class SplatTrainer(lightning.LightningModule):
         rates: LearningRates | None = None,
         sh_degree: int = 3,
         sh_every: int = 1000,
-        background: Literal["random"] | list[float] = "random",
+        background: Literal["random", "black", "white"] | list[float] = "random",
         scene_scale: float | None = None,
         seed: int = 0,
         panels: int = 3,
@@ -190,7 +195,10 @@ class SplatTrainer(lightning.LightningModule):
         self.rates = LearningRates() if rates is None else rates
         self.sh_degree, self.sh_every = sh_degree, sh_every
         self.random_background = background == "random"
-        fixed = (0.0, 0.0, 0.0) if isinstance(background, str) else check_vector("background", background)
+        shade = 1.0 if background == "white" else 0.0
+        fixed = (shade,) * 3 if isinstance(background, str) else check_vector("background", background)
+        if min(fixed) < 0 or max(fixed) > 1:
+            raise ValueError(f"Expected `background` to be a colour from 0 to 1, but got {list(fixed)}.")
         self.register_buffer("fixed_background", torch.tensor(fixed), persistent=False)
         self.scene_scale = scene_scale
         self.seed, self.panels, self.log_every = seed, panels, log_every
@@ -202,6 +210,8 @@ class SplatTrainer(lightning.LightningModule):
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
         self._pending: _Pending | None = None
+        self._seen = 0  # images that a checkpoint was trained on
+        self._begun = 0  # [ns] when the training did
         self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
 
     fixed_background: Tensor
@@ -251,9 +261,14 @@ class SplatTrainer(lightning.LightningModule):
 
     def on_fit_start(self) -> None:
         """Refuse what would train wrongly without a word."""
+        self._begun = time.time_ns()
         if self.trainer.world_size > 1:
             raise ValueError(
                 f"Expected one device for a training, but got {self.trainer.world_size}: use trainer.devices 1."
+            )
+        if self.trainer.precision not in ("32-true", "32"):
+            raise ValueError(
+                f"Expected `trainer.precision` to be 32-true, but got {self.trainer.precision}: splats need float32."
             )
 
     def on_train_start(self) -> None:
@@ -343,6 +358,11 @@ class SplatTrainer(lightning.LightningModule):
         for optimizer in optimizers:
             optimizer.zero_grad(set_to_none=True)
         self.densification.after_step(step, output.screen)
+        if len(splat) == 0:
+            raise ValueError(
+                f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
+                "losses that make Gaussians fade."
+            )
         if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
@@ -379,7 +399,10 @@ class SplatTrainer(lightning.LightningModule):
     def _last_checkpoint(self) -> str | None:
         folders = [getattr(callback, "dirpath", None) for callback in self.trainer.checkpoint_callbacks]
         files = [file for folder in folders if folder for file in Path(folder).glob("*.ckpt")]
-        return str(max(files, key=lambda file: file.stat().st_mtime_ns)) if files else None
+        files = [file for file in files if file.stat().st_mtime_ns >= self._begun - _CLOCK_STEP]  # of this run
+        if files:
+            return str(max(files, key=lambda file: file.stat().st_mtime_ns))
+        return None if self.trainer.ckpt_path is None else str(self.trainer.ckpt_path)
 
     # ---- checkpoints
 
@@ -396,6 +419,7 @@ class SplatTrainer(lightning.LightningModule):
             "sh_degree": self.sh_degree,
             "seed": self.seed,
             "random": self._random,
+            "seen": self.global_step,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -420,8 +444,13 @@ class SplatTrainer(lightning.LightningModule):
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
         self._random = {name: state.cpu() for name, state in stored["random"].items()}
+        self._seen = int(stored["seen"])
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
+        else:
+            warnings.warn(
+                f"The checkpoint was trained with {stored['kind']}, so its state is not taken over.", stacklevel=2
+            )
 
     # ---- evaluation
 
@@ -455,7 +484,8 @@ class SplatTrainer(lightning.LightningModule):
 
     def _evaluate(self, batch: Mapping[str, Any], batch_idx: int, stage: str) -> None:
         target, _, background = self._target(batch, train=False)
-        degree = self.sh_degree if stage == "test" else self.active_degree(max(self.global_step - 1, 0))
+        fitting = self.trainer.state.fn == "fit"
+        degree = self.active_degree(max(self.global_step - 1, 0)) if fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
         one, two = (picture.movedim(-1, 0)[None].float() for picture in (image, target))
         values = {"psnr": peak_signal_noise_ratio(one, two, data_range=1.0)}
@@ -463,30 +493,35 @@ class SplatTrainer(lightning.LightningModule):
             ssim = structural_similarity_index_measure(one, two, data_range=1.0)
             assert isinstance(ssim, Tensor)
             values["ssim"] = ssim
-        if self._lpips:
+        if self._lpips and min(image.shape[:2]) >= LPIPS_SIDE:
             values["lpips"] = self._lpips[0].to(self.device)(one, two)
         for name, value in values.items():
             self._metrics.setdefault(name, []).append(value)
         if batch_idx < self.panels and not self.trainer.sanity_checking:
-            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}")
+            step = self.global_step if fitting else self._seen
+            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}", step)
 
     def _log_metrics(self, stage: str) -> None:
         for name, values in self._metrics.items():
             self.log(f"{stage}/{name}", torch.stack(values).mean(), prog_bar=name == "psnr")
         self.log(f"{stage}/gaussians", float(len(self.splat)))
 
-    def _write_panel(self, batch: Mapping[str, Any], target: Tensor, image: Tensor, name: str) -> None:
+    def _degree_reached(self) -> int:
+        """Degree in use when the checkpoint was written; all of it without one."""
+        return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
+
+    def _write_panel(self, batch: Mapping[str, Any], target: Tensor, image: Tensor, name: str, step: int) -> None:
         from imageio.v3 import imwrite
 
         pictures = panel(self.splat, self._drawing(), batch["camera"], target, image)
         folder = self.folder / "panels"
         folder.mkdir(parents=True, exist_ok=True)
         pixels = (pictures * 255.0).round().clamp(0, 255).to(torch.uint8).cpu()
-        imwrite(folder / f"{name}_{self.global_step:06d}.png", pixels.numpy())
+        imwrite(folder / f"{name}_{step:06d}.png", pixels.numpy())
         for logger in self.trainer.loggers:
             board: Any = getattr(logger, "experiment", None)
             if hasattr(board, "add_image"):
-                board.add_image(name, pixels.numpy(), self.global_step, dataformats="HWC")
+                board.add_image(name, pixels.numpy(), step, dataformats="HWC")
 
     # ---- the end
 

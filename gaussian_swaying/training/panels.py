@@ -15,7 +15,10 @@ from gaussian_swaying.rendering.base import Renderer
 from gaussian_swaying.rendering.camera import Camera
 
 _RAMP = ((0.27, 0.00, 0.33), (0.23, 0.32, 0.55), (0.13, 0.57, 0.55), (0.37, 0.79, 0.38), (0.99, 0.91, 0.14))
-_BACKBONES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth", "squeeze": "squeezenet1_1-*.pth"}
+# the very files that torchvision would download
+_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
+LPIPS_SIDE = 32
+"""Fewest pixels on a side that the backbones of LPIPS take."""
 
 
 def color_ramp(values: Tensor) -> Tensor:
@@ -85,7 +88,7 @@ def lpips_metric(net: str = "alex") -> Any | None:
     """
     check_choice("net", net, tuple(_BACKBONES))
     folder = Path(torch.hub.get_dir()) / "checkpoints"
-    if importlib.util.find_spec("torchvision") is None or not any(folder.glob(_BACKBONES[net])):
+    if importlib.util.find_spec("torchvision") is None or not (folder / _BACKBONES[net]).is_file():
         return None
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 

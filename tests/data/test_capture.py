@@ -1,6 +1,7 @@
 """Captures in every format, against the cameras and pictures that were written."""
 
 import json
+import math
 import warnings
 
 import imageio.v3 as iio
@@ -69,6 +70,10 @@ def test_intrinsics_of_a_frame_win_and_the_principal_point_is_kept(tmp_path, cap
     views = read_capture(tmp_path).views
     assert views[0].camera.intrinsics.tolist() == [[18, 0, 9], [0, 19, 8], [0, 0, 1]]
     assert views[1].camera.intrinsics.tolist() == [[30, 0, 9], [0, 19, 7], [0, 0, 1]]
+    data["frames"][2]["camera_angle_x"] = 2 * math.atan(10 / 40)  # a zoom, with square pixels
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    zoomed = read_capture(tmp_path).views[2].camera.intrinsics
+    assert [float(zoomed[0, 0]), float(zoomed[1, 1])] == pytest.approx([40.0, 40.0])
 
 
 def test_frames_without_an_image_are_counted_once(tmp_path, capture_tools):

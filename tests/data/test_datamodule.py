@@ -167,6 +167,14 @@ def test_the_camera_of_a_view_is_moved_once(folder):
     assert data._dataset("train")[0].to("cpu").camera is not first
 
 
+def test_nothing_to_measure_is_an_error(folder):
+    data = CaptureDataModule(folder, test_every=0)
+    data.setup("fit")
+    for stage in ("test", "validate"):
+        with pytest.raises(ValueError, match=rf"`test` of .* is empty.*{stage}.*`test_every`"):
+            data.setup(stage)
+
+
 def test_bad_arguments(folder):
     with pytest.raises(ValueError, match="`workers`"):
         CaptureDataModule(folder, workers=-1)

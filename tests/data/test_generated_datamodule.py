@@ -1,5 +1,8 @@
 """A generated capture as training data: drawn once, never over something else."""
 
+import json
+import shutil
+
 import pytest
 import torch
 
@@ -38,3 +41,25 @@ def test_other_things_are_left_alone(tmp_path):
     (tmp_path / "mine").mkdir()
     with pytest.raises(ValueError, match="holds no generated capture"):
         _data(tmp_path / "mine").setup("fit")
+
+
+def test_of_two_runs_at_once_the_faster_one_draws(tmp_path, monkeypatch):
+    """The folder appears while the images are drawn: with the same settings it is taken, with others refused."""
+    flag = GeneratedCapture(views=9, size=16)
+    data = GeneratedDataModule(tmp_path / "flag", flag, workers=1)
+    draw = GeneratedCapture.write
+    rival = {"size": 16}
+
+    def slow(self, folder, threads=2):
+        if not (tmp_path / "flag").exists():
+            (tmp_path / "flag").mkdir()
+            held = {name: value for name, value in vars(self).items() if not name.startswith("_")} | rival
+            (tmp_path / "flag" / "generated.json").write_text(json.dumps(held))
+        return draw(self, folder, threads)
+
+    monkeypatch.setattr(GeneratedCapture, "write", slow)
+    data._make()
+    shutil.rmtree(tmp_path / "flag")
+    rival["size"] = 99
+    with pytest.raises(OSError, match="not empty"):
+        data._make()

@@ -14,6 +14,7 @@ import yaml
 from gaussian_swaying.data.generated_capture import GeneratedCapture
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.simulation.config import main as simulate
+from gaussian_swaying.training import cli as training_cli
 from gaussian_swaying.training.cli import main, make_cli
 from gaussian_swaying.training.densification import PARAMETERS
 
@@ -120,6 +121,33 @@ def test_the_last_image_is_in_a_checkpoint(capture, tmp_path):
     assert state["global_step"] == 13
 
 
+def test_a_second_run_in_the_same_folder_keeps_its_own_last_state(capture, tmp_path):
+    options = {"trainer.max_steps": 13, "checkpoint.save_top_k": 1}
+    for count in (600, 500):
+        given = {"path": str(capture), "point_count": count, "workers": 1}
+        data = {"class_path": "CaptureDataModule", "init_args": given}
+        more = {"data": json.dumps(data), "model.densification.init_args.start": 99}
+        assert main(["fit", *_arguments(capture, tmp_path, **options, **more)]) == 0
+    state = torch.load(tmp_path / "checkpoints/step_000013.ckpt", weights_only=False)["state_dict"]
+    assert len(state["model.means"]) == 500
+
+
+def test_ctrl_c(capture, tmp_path, monkeypatch, capsys):
+    """Lightning turns it into an exit with 1."""
+
+    def stopped(*_):
+        raise SystemExit(1)
+
+    monkeypatch.setattr("gaussian_swaying.training.cli.make_cli", stopped)
+    assert main(["fit"]) == 130
+    assert "--ckpt_path" in capsys.readouterr().err
+
+
+def test_the_message_of_a_worker_is_one_sentence():
+    text = 'Caught ValueError in DataLoader worker process 0.\nOriginal\n  File "x"\nValueError: The image is cut.\n'
+    assert training_cli._sentence(ValueError(text)) == "The image is cut."
+
+
 OWN = """
 import torch
 from gaussian_swaying.training.losses import LossTerm
@@ -152,6 +180,9 @@ def test_a_loss_of_ones_own_from_a_yaml(capture, tmp_path, monkeypatch):
     ("options", "words"),
     [
         ({"model.sh_degree": 7}, ["`sh_degree`", "7"]),
+        ({"trainer.gradient_clip_val": 1}, ["gradient"]),
+        ({"ckpt_path": "README.ckpt"}, ["README.ckpt"]),
+        ({"ckpt_path": str(QUICK)}, ["quick_cpu.yaml is no checkpoint", "`--ckpt_path`"]),
         ({"model.loss_weights.siz": 1.0}, ["`loss_weights`", "siz"]),
         ({"model.densification.init_args.every": 0}, ["`densification.every`"]),
         ({"model.bogus": 1}, ["bogus"]),

@@ -1,6 +1,7 @@
 """Trainings that learn, stop when something is not finite, and continue exactly."""
 
 import math
+import os
 
 import lightning
 import pytest
@@ -178,6 +179,74 @@ def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
     assert again.trainer.global_step == 200
 
 
+def test_a_checkpoint_is_validated_as_it_was_in_training(data, make_trainer, tmp_path):
+    """With the harmonics that were in use, and panels that bear its step."""
+    options = {"sh_every": 6, "panels": 1}
+    on = {"limit_val_batches": 1.0, "val_check_interval": 10}
+    trainer = make_trainer(10, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=10)], **on)
+    trainer.fit(_module(**options), data)
+    trained = float(trainer.callback_metrics["val/psnr"])
+    again = _module(**options)
+    found = make_trainer(10, **on).validate(
+        again, data, ckpt_path=tmp_path / "step=10.ckpt", weights_only=False, verbose=False
+    )[0]
+    assert found["val/psnr"] == pytest.approx(trained, abs=1e-5)
+    assert again.active_degree(9) == 1
+    assert [path.name for path in (tmp_path / "run" / "panels").glob("*.png")] == ["val_00_000010.png"]
+
+
+def test_the_checkpoint_that_is_named_is_of_this_run(data, make_trainer, tmp_path):
+    (tmp_path / "step=99.ckpt").write_bytes(b"of a run before")
+    os.utime(tmp_path / "step=99.ckpt", ns=(0, 0))
+    module = _module(loss_terms={"breaks": Breaks(2)})
+    trainer = make_trainer(20, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=50)])
+    with pytest.raises(TrainingDiverged, match="there is no checkpoint yet"):
+        trainer.fit(module, data)
+
+
+def test_what_cannot_be_trained_is_refused(data, make_trainer):
+    with pytest.raises(ValueError, match=r"`trainer\.precision` to be 32-true"):
+        make_trainer(3, precision="bf16-mixed").fit(_module(), data)
+    with pytest.raises(ValueError, match="prune_opacity` above 0"):
+        DefaultDensification(reset_opacity=True, prune_opacity=0.0)
+    chosen = DefaultDensification(start=1, every=2, prune_opacity=0.49)
+    with pytest.raises(ValueError, match=r"No Gaussian is left at step \d+: lower `densification\.prune_opacity`"):
+        make_trainer(20).fit(_module(densification=chosen), data)
+
+
+class _Board(lightning.pytorch.loggers.logger.DummyLogger):
+    """A logger whose experiment takes pictures."""
+
+    def __init__(self):
+        super().__init__()
+        self.pictures = {}
+
+    @property
+    def experiment(self):
+        return self
+
+    def add_image(self, name, pixels, step, dataformats):
+        self.pictures[name] = (pixels.shape, step, dataformats)
+
+
+def test_what_is_shown_on_the_way(data, make_trainer, monkeypatch):
+    """Panels on the board, PSNR and the number of Gaussians in the progress bar, LPIPS if its weights are there."""
+    monkeypatch.setattr("gaussian_swaying.training.module.lpips_metric", lambda net: _Constant())
+    board = _Board()
+    trainer = make_trainer(4, logger=board, limit_val_batches=1.0, val_check_interval=4)
+    trainer.fit(_module(panels=1, lpips="alex"), data)
+    assert board.pictures == {"val_00": ((32, 4 * 48, 3), 4, "HWC")}
+    assert trainer.progress_bar_metrics["gaussians"] == 150
+    assert trainer.progress_bar_metrics["psnr"] > 5
+    assert trainer.callback_metrics["val/lpips"] == 0.25
+
+
+class _Constant(torch.nn.Module):
+    def forward(self, one, two):
+        assert one.shape == two.shape == (1, 3, 32, 48)
+        return torch.tensor(0.25)
+
+
 def test_schedules(data, make_trainer):
     rates = LearningRates()
     assert means_rate(rates, 2.0, 0, 100) == pytest.approx(3.2e-4)
@@ -205,6 +274,9 @@ def test_backgrounds(data):
     torch.testing.assert_close(target[0, 1], torch.tensor([1.0, 0.5, 0.0]))
     torch.testing.assert_close(target[1, 0], torch.tensor([0.625, 0.375, 0.125]))
     assert module._target({"image": image, "alpha": None}, train=True)[0] is image
+    assert _module(background="white")._target({"image": image, "alpha": alpha}, train=False)[2].eq(1).all()
+    with pytest.raises(ValueError, match="`background` to be a colour from 0 to 1"):
+        _module(background=[255.0, 255.0, 255.0])
     module = _module()
     one, two = (module._target({"image": image, "alpha": alpha}, train=True)[2] for _ in range(2))
     assert not torch.equal(one, two)
