@@ -48,7 +48,7 @@ def damped_fall(cell: float, quality: int, rate: float = 2.0) -> dict[str, Any]:
 def hanging_panel(cell: float, quality: int, shear: bool = True) -> list[dict[str, Any]]:
     """Stretch of a panel under its own weight, held by its upper edge, and how much narrower it gets."""
     width, height, gravity = 0.4, 0.8, 2.0
-    grid = Grid.of_cells(width, height, round(height / cell))
+    grid = Grid.of_cells(width, height, round(height / cell), "top")
     material = replace(SHEET, air_rate=20.0, shear=shear)
     run = ClothRun(frames=75, quality=quality, gravity=gravity)
     pins = np.flatnonzero(grid.uv()[:, 1] > 1 - 1e-9)

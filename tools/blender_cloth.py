@@ -60,24 +60,27 @@ class Grid:
     Blender gives every vertex the same mass and every line of springs the same stiffness, at the rim or not. So the
     cloth is cut into equal cells with a vertex in the middle of each, and only those of the rim are moved out to it: a
     mesh of squares with an outer ring one and a half cells wide. Were it one cell wide, a vertex of the rim would have
-    the mass of a cell and half its area, an error of first order in the cell.
+    the mass of a cell and half its area, an error of first order in the cell. Along an edge that is held the mass of
+    the rim does not matter, and a ring of one cell is right.
 
-    Vertex ``i * (rows + 1) + j`` stands at x = (i + 1/2) cell, z = (j + 1/2) cell, or at the rim.
+    Vertex ``i * (rows + 1) + j`` is the j-th from below of the i-th column.
 
     Attributes:
         width: Length along x [m].
         height: Length along z [m].
-        columns: Number of faces along x; there is one cell more.
+        columns: Number of faces along x.
         rows: Number of faces along z.
+        held: The edge that is held: ``left``, ``top`` or none.
     """
 
     width: float
     height: float
     columns: int
     rows: int
+    held: str | None = None
 
     @classmethod
-    def of_cells(cls, width: float, height: float, cells: int) -> Grid:
+    def of_cells(cls, width: float, height: float, cells: int, held: str | None = None) -> Grid:
         """The mesh with ``cells`` square cells along the longer side.
 
         Raises:
@@ -91,12 +94,20 @@ class Grid:
                 f"gives {across} x {up} of {width / across:.4f} m x {height / up:.4f} m: choose a number of cells that "
                 "divides both sides."
             )
-        return cls(width, height, across - 1, up - 1)
+        return cls(width, height, across - 1, up - 1, held)
+
+    @property
+    def cells(self) -> tuple[float, float]:
+        """Sides of a cell along x and z [m]; half a cell of the cloth hangs on an edge that is held."""
+        return (
+            self.width / (self.columns + (0.5 if self.held == "left" else 1.0)),
+            self.height / (self.rows + (0.5 if self.held == "top" else 1.0)),
+        )
 
     @property
     def cell(self) -> float:
-        """Side of a cell [m]."""
-        return self.width / (self.columns + 1)
+        """Side of a square as large as a cell [m]."""
+        return math.sqrt(math.prod(self.cells))
 
     @property
     def spring(self) -> float:
@@ -111,7 +122,9 @@ class Grid:
 
     def uv(self) -> np.ndarray:
         """Place of each vertex on the cloth, in 0 to 1, float64, shape (V, 2)."""
-        u, v = (np.r_[0.0, (np.arange(1, faces) + 0.5) / (faces + 1), 1.0] for faces in (self.columns, self.rows))
+        first = 1.0 if self.held == "left" else 1.5
+        u = np.r_[0.0, (first + np.arange(self.columns - 1)) * self.cells[0] / self.width, 1.0]
+        v = np.r_[0.0, (1.5 + np.arange(self.rows - 1)) * self.cells[1] / self.height, 1.0]
         return np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
 
     def faces(self) -> np.ndarray:
@@ -187,7 +200,7 @@ def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict
         ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind.
     """
     rate2 = run.fps**2
-    mass = material.areal_density * grid.width * grid.height / grid.count
+    mass = material.areal_density * grid.cell**2
     spring = material.membrane / (LATTICE if material.shear else 1.0)  # N/m
     tension = spring * grid.spring / rate2
     bending = material.bending / (BENDING * grid.cell**2 * rate2)

@@ -53,7 +53,7 @@ VARIANTS: dict[str, Variant] = {
     "total_01": Variant("`total`, dx = 0.01 m", options=("--solver.dx=0.01",)),
     "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), ("--solver.dx=0.02",)),
-    "damped": Variant("damping 0.2 1/s", options=("--solver.damping=0.2",)),
+    "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
     "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
     "thin": Variant(
@@ -70,6 +70,7 @@ VARIANTS: dict[str, Variant] = {
 }
 """All rows, by name."""
 
+_DRAG = {1: 0.0, 2: 0.8, 3: 1.28}  # C_D of configs/bench
 _TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
 
 PAPER = {
@@ -100,8 +101,8 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
             width, height = size.split("x")
             arguments += [f"--camera.width={width}", f"--camera.height={height}"]
     arguments += list(variant.options)
-    if pattern == 1 and ("particle" in variant.overlays):
-        arguments += ["--aero.C_F=0"]  # no air in the reference of this pattern
+    if {"particle", "no_surface"} & set(variant.overlays):  # as much friction as drag; no air in pattern 1
+        arguments += [f"--aero.C_F={_DRAG[pattern]}"]
     if variant is VARIANTS["thin"]:
         modulus, density = _TWICE[pattern]
         arguments += [f"--material.E={modulus}", f"--material.density={density}"]

@@ -258,12 +258,13 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), default=sorted(PATTERNS), help="which flags")
     add("--only", nargs="+", choices=PARTS, default=list(PARTS), help="which parts")
     add("--preview", action="store_true", help="coarse mesh, small pictures, every tenth frame")
-    add("--cells", type=int, help="cells of the mesh along the longer side (90, 90, 120)")
-    add("--quality", type=int, help="steps of the solver a frame, a power of two (32; else what the mesh needs)")
+    add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140)")
+    add("--quality", type=int, help="steps of the solver a frame, a power of two (what the mesh needs)")
     add("--frames", type=int, help="number of frames, of which the first is the rest shape (250)")
     add("--flag-size", type=float, nargs=2, metavar=("WIDTH", "HEIGHT"), help="sides of the flag [m]")
     add("--texture", help="white, stripes, or the path of an image")
-    add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (1.28)")
+    add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (0.8 in pattern 2, else 1.28)")
+    add("--damping", type=float, help="rate at which every velocity decays [1/s] (2, 1, 1)")
     add("--self-collision", action="store_true", default=None, help="keep the cloth away from itself")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of the video [pixels] (1920x1080)")
     add("--samples", type=int, help="light paths per pixel (16)")
@@ -285,13 +286,13 @@ def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
     Raises:
         ValueError: If an option is out of range.
     """
-    names = ("frames", "texture", "drag", "self_collision", "cells")
+    names = ("frames", "texture", "drag", "damping", "self_collision", "cells")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.flag_size:
         given["width"], given["height"] = options.flag_size
     pattern = PATTERNS[number]
     if options.preview:
-        given = {"cells": pattern.cells // 3} | given
+        given = {"cells": pattern.cells // 4} | given
     pattern = replace(pattern, **given)
     return replace(pattern, quality=options.quality or reference.least_quality(pattern))
 

@@ -10,6 +10,7 @@ from imageio.v3 import imread, imwrite
 
 from gaussian_swaying.simulation.config import build_parser
 
+DRAG = {2: 0.8, 3: 1.28}
 PIXEL = imwrite("<bytes>", np.zeros((4, 6, 3), np.uint8), extension=".png")
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,7 +31,7 @@ def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
             settings = parser.parse_args(flags.sim_arguments(pattern, variant, tmp_path, None, None))
             assert settings.recorder.trajectory
             if name == "ours" and pattern > 1:
-                assert (settings.aero.C_D, settings.aero.C_F, settings.aero.law) == (1.28, 0.0, "projected")
+                assert (settings.aero.C_D, settings.aero.C_F, settings.aero.law) == (DRAG[pattern], 0.0, "projected")
                 assert not settings.wind.modulations
             if name in ("particle", "no_surface"):
                 assert (0.0 if pattern == 1 else settings.aero.C_D) == settings.aero.C_F

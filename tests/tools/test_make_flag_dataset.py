@@ -55,23 +55,40 @@ def _spring_lengths(grid):
     return np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1)
 
 
+def _vertex_areas(grid):
+    """A quarter of each face [m²] for each of its vertices, shape (columns + 1, rows + 1)."""
+    corners = grid.flat()[grid.faces()]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]), axis=-1)
+    assert area.sum() == pytest.approx(grid.width * grid.height)
+    share = np.bincount(grid.faces().reshape(-1), np.repeat(area / 4, 4))
+    return share.reshape(grid.columns + 1, grid.rows + 1)
+
+
 def test_every_vertex_stands_for_the_same_share_of_the_cloth(cloth):
-    """Cells of one size cover the cloth; areas and moments of area that vertices share by faces agree with masses."""
+    """The area that a vertex has by its faces is, with the vertex beside it, that of two cells of one size."""
     grid = cloth.Grid.of_cells(1.2, 0.8, 12)
     assert (grid.columns, grid.rows, grid.count) == (11, 7, 96)
     assert grid.cell**2 * grid.count == pytest.approx(1.2 * 0.8)
-    flat, faces = grid.flat(), grid.faces()
-    corners = flat[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]), axis=-1)
-    assert area.sum() == pytest.approx(0.96)
-    share = np.bincount(faces.reshape(-1), np.repeat(area / 4, 4)) / grid.cell**2
-    share = share.reshape(12, 8)
-    # of the rim and of the row beside it: 3/4 + 5/4 cells, as many as vertices; all others one each
-    np.testing.assert_allclose(share[:2, 3:5].sum(0), 2)
-    np.testing.assert_allclose(share[:2, :2].sum(), 4)
+    share = _vertex_areas(grid) / grid.cell**2
     np.testing.assert_allclose(share[2:-2, 2:-2], 1)
     np.testing.assert_allclose(share[0, 2:-2], 0.75)
+    for rim in (share[:2], share[-2:], share[:, :2].T, share[:, -2:].T):
+        np.testing.assert_allclose(rim[:, 2:-2].sum(0), 2)
+        np.testing.assert_allclose(rim[:, :2].sum(), 4)
     assert grid.spring == pytest.approx(_spring_lengths(grid).mean())
+
+
+@pytest.mark.parametrize("held", ["left", "top"])
+def test_an_edge_that_is_held_carries_half_a_cell(cloth, held):
+    """Its vertices do not move, so their mass is none; the vertices beside it stand for one cell each."""
+    grid = cloth.Grid.of_cells(1.2, 0.8, 12, held)
+    share = _vertex_areas(grid) / grid.cell**2
+    edge = share if held == "left" else share.T[::-1]
+    np.testing.assert_allclose(edge[0, 2:-2], 0.5)
+    np.testing.assert_allclose(edge[1:-2, 2:-2], 1)
+    np.testing.assert_allclose(edge[-2:, 2:-2].sum(0), 2)
+    # as heavy as the cloth, apart from the half cell that is held
+    assert grid.cell**2 * (grid.count - len(edge[0])) == pytest.approx(0.96 - 0.5 * grid.cell**2 * len(edge[0]))
 
 
 def test_patterns_have_the_parameters_of_the_paper(reference):
@@ -86,13 +103,14 @@ def test_patterns_have_the_parameters_of_the_paper(reference):
         assert material.membrane == pytest.approx(modulus * pattern.thickness)
         assert material.bending == pytest.approx(modulus * pattern.thickness**3 / 12 / 0.91)
         speed = math.hypot(*flow)
-        assert pattern.pressure() == pytest.approx(0.5 * 1.225 * 1.28 * speed**2)
+        assert pattern.pressure() == pytest.approx(0.5 * 1.225 * {1: 1.28, 2: 0.8, 3: 1.28}[number] * speed**2)
+        assert pattern.damping == material.air_rate == (2.0 if number == 1 else 1.0)
 
 
 def test_blender_is_asked_in_its_own_units(reference, cloth):
     """The relations, turned round: whatever the mesh, the same mass, springs, damping, bending and wind in SI units."""
     for cells in (30, 60, 120):
-        pattern = replace(reference.PATTERNS[2], cells=cells, quality=512)
+        pattern = replace(reference.PATTERNS[2], cells=cells, quality=512, damping=0.7)
         grid, material, run = pattern.grid(), pattern.material(), pattern.run()
         asked = cloth.blender_settings(grid, material, run)
         assert asked["gravity"] == pytest.approx(-15.68)
@@ -105,7 +123,7 @@ def test_blender_is_asked_in_its_own_units(reference, cloth):
         assert asked["bending_stiffness"] * cloth.BENDING * grid.cell**2 * 625 == pytest.approx(material.bending)
         assert 0.02 * 25 * asked["strength"] == pytest.approx(pattern.pressure())
         assert asked["strength"] / asked["flow"] == pytest.approx(math.hypot(2.5, 0.5))
-        assert asked["air_damping"] == 0.0
+        assert 0.01 * 25 * asked["air_damping"] / asked["mass"] == pytest.approx(0.7)
     still = reference.PATTERNS[1]
     asked = cloth.blender_settings(still.grid(), still.material(), still.run())
     assert asked["strength"] == asked["flow"] == 0.0
@@ -122,7 +140,7 @@ def test_steps_follow_the_mesh(reference, cloth):
         assert of[1] / of[0] == pytest.approx(16, rel=0.05)
         assert reference.least_quality(finer) == 4 * pattern.quality
     grid, rough = pattern.grid(), replace(pattern, quality=8).run()
-    with pytest.raises(ValueError, match="`quality` of at least 22"):
+    with pytest.raises(ValueError, match="`quality` of at least 29"):
         cloth.solve_cloth(grid, grid.flat(), [], pattern.material(), rough)
 
 
@@ -207,13 +225,14 @@ def test_motion_is_solved_once_and_says_what_changed(reference, monkeypatch, tmp
     with np.load(path) as data:
         assert data["areal_density"] == pytest.approx(0.3)
         assert data["membrane_stiffness"] == pytest.approx(30)
+        assert data["damping"] == 1
         np.testing.assert_allclose(data["gravity"], [0, 0, -9.8])
         np.testing.assert_allclose(data["flow"], [2.5, 0.5, 0])
         assert set(json.loads(str(data["units"]))) <= set(data.files)
         assert str(data["hash"]) == reference.settings_hash(motion.settings)
         np.testing.assert_array_equal(data["pins"], pattern.pins(motion.uv))
     changed = replace(pattern, quality=16, drag=1.0)
-    with pytest.raises(ValueError, match=r"`drag` was 1.28 and is now 1.0; `quality` was 8 and is now 16"):
+    with pytest.raises(ValueError, match=r"`drag` was 0.8 and is now 1.0; `quality` was 8 and is now 16"):
         reference.solve_pattern(changed, path)
     assert calls == [8]
 
@@ -283,11 +302,11 @@ def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, t
     written = json.loads((tmp_path / "uncertainty.json").read_text())
     assert {name: (row["cells"], row["quality"]) for name, row in written["variants"].items()} == {
         "steps doubled": (30, 16),
-        "coarser": (20, 8),
-        "finer": (40, 8),
+        "coarser": (22, 8),
+        "finer": (37, 8),
     }
     # the fake moves them alike; what is left is the ripple between the vertices of a coarser mesh, a (k face)^2 / 8
-    bound = 0.003 * (1.5 * 3 * math.pi / 20) ** 2 / 8 / 1.2
+    bound = 0.003 * (1.5 * 3 * math.pi / 22) ** 2 / 8 / 1.2
     assert all(row["chamfer"] <= 1.5 * bound for row in written["variants"].values())
     assert written["variants"]["steps doubled"]["chamfer"] == 0
     assert calls == [8, 16, 8, 8]
@@ -460,10 +479,10 @@ def test_without_blender_one_sentence_names_the_extra(tool, monkeypatch, tmp_pat
 
 def test_options_reach_the_flag_and_the_pictures(tool, reference):
     shape = ["--cells", "60", "--frames", "50", "--flag-size", "0.6", "0.4", "--texture", "white", "--drag", "0.5"]
-    options = tool.parse([*shape, "--size", "640x360", "--samples", "4"])
+    options = tool.parse([*shape, "--damping", "0.3", "--size", "640x360", "--samples", "4"])
     flag, pictures = tool.flag_of(2, options), tool.pictures_of(options)
     assert (flag.cells, flag.frames, flag.width, flag.height) == (60, 50, 0.6, 0.4)
-    assert (flag.texture, flag.drag) == ("white", 0.5)
+    assert (flag.texture, flag.drag, flag.damping) == ("white", 0.5, 0.3)
     assert flag.quality == reference.least_quality(flag) == 64  # cells of 1 cm
     assert (pictures.size, pictures.samples, pictures.views) == ((640, 360), 4, 200)
     default = tool.parse([])
