@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -196,17 +197,22 @@ def gradients(options: argparse.Namespace) -> None:
     validation_page(options)
 
 
-def train(options: argparse.Namespace) -> None:
-    """Measure trainings: a bare gsplat loop beside Lightning, what else helps, and what the surface losses buy."""
-    device, result = _start(options)
-    name = f"train_{device.type}"
+def _go_on(options: argparse.Namespace, name: str, result: dict[str, Any], measure: Callable[..., None]) -> None:
+    """Add to what was recorded on the same device, and write after each part."""
     path = Path(options.results) / f"{name}.json"
     if path.exists():
         kept = json.loads(path.read_text())
         if kept["device"] == result["device"]:
             result = kept | result
-    training_cases.measure(options, result, lambda now: _write(options, name, now, quiet=True))
+    measure(options, result, lambda now: _write(options, name, now, quiet=True))
     print(f"wrote {path}")
+
+
+def train(options: argparse.Namespace) -> None:
+    """Measure trainings: a bare gsplat loop beside Lightning, what else helps, and what the surface losses buy."""
+    device, result = _start(options)
+    name = f"train_{device.type}"
+    _go_on(options, name, result, training_cases.measure)
 
 
 def flags(options: argparse.Namespace) -> None:
@@ -214,13 +220,7 @@ def flags(options: argparse.Namespace) -> None:
     device, result = _start(options)
     options.device = device.type
     name = f"flags_{device.type}"
-    path = Path(options.results) / f"{name}.json"
-    if path.exists():
-        kept = json.loads(path.read_text())
-        if kept["device"] == result["device"]:
-            result = kept | result
-    flag_cases.measure(options, result, lambda now: _write(options, name, now, quiet=True))
-    print(f"wrote {path}")
+    _go_on(options, name, result, flag_cases.measure)
 
 
 def gallery(options: argparse.Namespace) -> None:
@@ -229,13 +229,7 @@ def gallery(options: argparse.Namespace) -> None:
     options.device = device.type
     options.preset = options.preset or ("preview" if device.type == "cpu" else None)
     name = f"gallery_{device.type}"
-    path = Path(options.results) / f"{name}.json"
-    if path.exists():
-        kept = json.loads(path.read_text())
-        if kept["device"] == result["device"]:
-            result = kept | result
-    gallery_cases.measure(options, result, lambda now: _write(options, name, now, quiet=True))
-    print(f"wrote {path}")
+    _go_on(options, name, result, gallery_cases.measure)
 
 
 def _gradient_lines(result: dict[str, Any]) -> list[str]:
