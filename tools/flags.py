@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from gaussian_swaying.metrics.compare import compare_run
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,7 +33,7 @@ class Variant:
         overlays: Files of configs/bench/variants on top of the matched configuration.
         options: Further options of tools/sim.py.
         patterns: Flags for which it differs from ``ours``.
-        weights: Further options of tools/train.py; a variant with some has a splat of its own.
+        training: Further options of tools/train.py; a variant with some has a splat of its own.
     """
 
     title: str
@@ -56,9 +58,7 @@ VARIANTS: dict[str, Variant] = {
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
     "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
-    "thin": Variant(
-        "half the thickness, twice E and density", options=("--material.thickness=0.005",), patterns=PATTERNS
-    ),
+    "thin": Variant("half the thickness, twice E and density", options=("--material.thickness=0.005",)),
     **{
         f"b_{b:g}": Variant(
             f"size loss b = {b:g}",
@@ -70,7 +70,6 @@ VARIANTS: dict[str, Variant] = {
 }
 """All rows, by name."""
 
-_DRAG = {1: 0.0, 2: 0.8, 3: 1.28}  # C_D of configs/bench
 _TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
 
 PAPER = {
@@ -102,7 +101,8 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
             arguments += [f"--camera.width={width}", f"--camera.height={height}"]
     arguments += list(variant.options)
     if {"particle", "no_surface"} & set(variant.overlays):  # as much friction as drag; no air in pattern 1
-        arguments += [f"--aero.C_F={_DRAG[pattern]}"]
+        matched = yaml.safe_load((BENCH / f"flag{pattern}.yaml").read_text())
+        arguments += [f"--aero.C_F={matched.get('aero', {}).get('C_D', 0.0)}"]
     if variant is VARIANTS["thin"]:
         modulus, density = _TWICE[pattern]
         arguments += [f"--material.E={modulus}", f"--material.density={density}"]

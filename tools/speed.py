@@ -47,11 +47,10 @@ LIMITS: list[str] = [
     " and the stress.",
     "Batches: a single small flag already runs from CUDA graphs, so one after the other is fast, while many at"
     " once fill the GPU.",
-    "Frames: four fifths of one is simulation, at more time for a substep than a long rollout takes, as a frame's"
-    " substeps are their own rollout, which sorts, reads out and looks for the largest speed once. In an object of few"
-    " cells with hundreds of particles each (the guitar: 90,854 in some hundred cells) there are too few programs, one"
-    " for a cell, to fill the GPU. Tried for frames: idle lanes at f = 1, gusts recorded in the graphs, an energy"
-    " kernel; together they took a frame of the flag from 11.2 to 9.9 ms.",
+    "Frames: most of one is simulation, at more time for a substep than a long rollout takes, as a frame's substeps"
+    " are their own rollout, which sorts, reads out and looks for the largest speed once. In an object of few, crowded"
+    " cells (the guitar) there are, it seems, too few programs, one for a cell, to fill the GPU. Tried for frames: idle"
+    " lanes in the middle of their cell, gusts recorded in the graphs, an energy kernel.",
 ]
 """What limits the speed, a sentence each: text of the page that is no measurement."""
 

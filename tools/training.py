@@ -63,7 +63,7 @@ FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
         ],
     ),
     "schedule": (
-        "densification until step 4,000 of 7,000, a harmonic degree every 500",
+        "densification until step 4,000, a harmonic degree every 500",
         [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000", "--model.sh_every=500"],
     ),
     "degree_1": ("harmonics of degree 1", [*_weights(**_NO_SURFACE), "--model.sh_degree=1"]),
@@ -415,7 +415,7 @@ def _capture_lines(result: Row) -> list[str]:
     rows += [(FOX_VARIANTS[name][0], row) for name, row in result.get("variants", {}).items()]
     if not rows:
         return []
-    lines = ["### A capture: 50 photos, real, distorted", ""]
+    lines = ["### A capture of photos", ""]
     lines += [
         "`bare` is a plain loop over gsplat with the same start, schedule and photometric loss, with the images on"
     ]

@@ -56,7 +56,7 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
         mode = "constant" if padding == "zeros" else padding
         x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, mode) for plane in (x, y))
     moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
-    # planes as groups, not as a batch: the gradient of a convolution of one channel is ten times slower
+    # planes as groups, not as a batch: the gradient of a convolution of one channel is slow
     groups = moments.shape[1]
     moments = functional.conv2d(moments, window.view(1, 1, 1, -1).expand(groups, 1, 1, -1), groups=groups)
     moments = functional.conv2d(moments, window.view(1, 1, -1, 1).expand(groups, 1, -1, 1), groups=groups)
