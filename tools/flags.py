@@ -86,7 +86,7 @@ PAPER_ABLATION = {
 """The same of its third table, for pattern 3."""
 
 
-def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None, size: str | None) -> list[str]:
+def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None) -> list[str]:
     """Command line of tools/sim.py for a row."""
     configs = [ROOT / "configs" / "sim" / f"flag{pattern}.yaml", BENCH / f"flag{pattern}.yaml"]
     configs += [BENCH / "variants" / f"{name}.yaml" for name in variant.overlays]
@@ -96,9 +96,8 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
     camera = dataset / f"pattern{pattern}" / "video" / "camera.json"
     if camera.exists():
         arguments += ["--camera=TransformsCamera", f"--camera.path={camera}"]
-        if size:
-            width, height = size.split("x")
-            arguments += [f"--camera.width={width}", f"--camera.height={height}"]
+        described = json.loads(camera.read_text())
+        arguments += [f"--camera.width={described['w']}", f"--camera.height={described['h']}"]
     arguments += list(variant.options)
     if {"particle", "no_surface"} & set(variant.overlays):  # as much friction as drag; no air in pattern 1
         matched = yaml.safe_load((BENCH / f"flag{pattern}.yaml").read_text())
@@ -130,7 +129,7 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
     reference = dataset / f"pattern{pattern}"
     output = folder / f"{name}_{pattern}"
     command = [sys.executable, str(ROOT / "tools" / "sim.py")]
-    command += sim_arguments(pattern, VARIANTS[name], dataset, splat, options.size)
+    command += sim_arguments(pattern, VARIANTS[name], dataset, splat)
     command += ["--device", options.device, "--output", str(output)]
     command += [f"--frames={options.frames}"] if options.frames else []
     command += options.more.split() if options.more else []
@@ -219,7 +218,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
                          "made in code, which no training has blurred")  # fmt: skip
     command.add_argument("--train_steps", type=int, default=7000, help="images of a training")
     command.add_argument("--frames", type=int, help="only the first frames")
-    command.add_argument("--size", help="of the pictures, as 960x540; that of the reference by default")
     command.add_argument("--points", type=int, default=10_000, help="on the reference's surface")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
     command.add_argument("--more", help="further options of tools/sim.py, in quotes")

@@ -28,7 +28,7 @@ def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
     parser = build_parser()
     for name, variant in flags.VARIANTS.items():
         for pattern in variant.patterns:
-            settings = parser.parse_args(flags.sim_arguments(pattern, variant, tmp_path, None, None))
+            settings = parser.parse_args(flags.sim_arguments(pattern, variant, tmp_path, None))
             assert settings.recorder.trajectory
             if name == "ours" and pattern > 1:
                 assert (settings.aero.C_D, settings.aero.C_F, settings.aero.law) == (DRAG[pattern], 0.0, "projected")
@@ -36,10 +36,18 @@ def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
             if name in ("particle", "no_surface"):
                 assert (0.0 if pattern == 1 else settings.aero.C_D) == settings.aero.C_F
             if name == "thin":  # the same sheet: E h and density h
-                base = parser.parse_args(flags.sim_arguments(pattern, flags.VARIANTS["ours"], tmp_path, None, None))
+                base = parser.parse_args(flags.sim_arguments(pattern, flags.VARIANTS["ours"], tmp_path, None))
                 for field in ("E", "density"):
                     sheets = [getattr(s.material, field) * s.material.thickness for s in (settings, base)]
                     assert sheets[0] == pytest.approx(sheets[1])
+
+
+def test_pictures_have_the_size_of_the_reference(flags, tmp_path):
+    video = tmp_path / "pattern2" / "video"
+    video.mkdir(parents=True)
+    (video / "camera.json").write_text(json.dumps({"w": 320, "h": 180}))
+    settings = build_parser().parse_args(flags.sim_arguments(2, flags.VARIANTS["ours"], tmp_path, None))
+    assert (settings.camera.init_args.width, settings.camera.init_args.height) == (320, 180)
 
 
 def test_a_row_is_simulated_and_compared(flags, tmp_path):
@@ -54,13 +62,7 @@ def test_a_row_is_simulated_and_compared(flags, tmp_path):
     settings = {"width": 1.2, "height": 0.8}
     np.savez(folder / "cloth.npz", positions=np.repeat(rest[None], 2, 0), faces=faces, settings=json.dumps(settings))
     options = type("Options", (), {})()
-    options.dataset, options.size, options.device, options.frames, options.points = (
-        tmp_path / "data",
-        None,
-        "cpu",
-        2,
-        500,
-    )
+    options.dataset, options.device, options.frames, options.points = tmp_path / "data", "cpu", 2, 500
     options.more = "--scene.generator.init_args.spacing=0.1 --solver.dx=0.2 --solver.gravity=[0,0,0] "
     options.more += "--solver.boundaries=[]"
     row = flags.run_row(1, "ours", options, None, tmp_path)
