@@ -93,6 +93,83 @@ def render_gsplat(
     return _compose(pixels[0], alpha[0], background, dtype)
 
 
+_TILE = 16  # pixels
+
+
+def rasterize_splat(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    eps2d: float = 0.3,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``gsplat.rasterization`` for one camera, put together from gsplat's functions.
+
+    The same picture and gradients. ``rasterization`` inverts the camera's matrix to find the eye, for which the host
+    waits in the middle of a step; here the camera says where its eye is.
+
+    Args:
+        means: Centres [scene units], float32 on a CUDA device, shape (N, 3).
+        quats: Quaternions (w, x, y, z) of any length, shape (N, 4).
+        scales: Standard deviations [scene units], shape (N, 3).
+        opacities: Opacities in [0, 1], shape (N,).
+        sh: Coefficients of real spherical harmonics, shape (N, K, 3).
+        camera: The camera, on the same device.
+        background: Colour behind the Gaussians, shape (3,); black when None.
+        eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        absgrad: Keep absolute gradients of the centres on the screen.
+
+    Returns:
+        Colours (1, H, W, 3), alphas (1, H, W, 1), centres on the screen (1, N, 2) and radii (1, N, 2) [pixels].
+    """
+    from gsplat import (
+        fully_fused_projection,
+        isect_offset_encode,
+        isect_tiles,
+        rasterize_to_pixels,
+        spherical_harmonics,
+    )
+
+    width, height = camera.width, camera.height
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        means,
+        None,
+        quats,
+        scales,
+        camera.world_to_camera[None],
+        camera.intrinsics[None],
+        width,
+        height,
+        eps2d=eps2d,
+        near_plane=camera.near,
+        opacities=opacities,  # for a tighter radius
+    )
+    seen = (radii > 0).all(-1)
+    toward = (means - camera.position)[None]
+    colors = spherical_harmonics(sh_degree(sh.shape[1]), toward, sh[None], masks=seen)
+    tiles = (-(-width // _TILE), -(-height // _TILE))
+    _, crossings, order = isect_tiles(means2d, radii, depths, _TILE, *tiles)
+    offsets = isect_offset_encode(crossings, 1, *tiles).reshape(1, tiles[1], tiles[0])
+    pixels, alpha = rasterize_to_pixels(
+        means2d,
+        conics,
+        (colors + 0.5).clamp_min(0.0),
+        opacities[None],
+        width,
+        height,
+        _TILE,
+        offsets,
+        order,
+        backgrounds=None if background is None else background.to(means)[None],
+        absgrad=absgrad,
+    )
+    return pixels, alpha, means2d, radii
+
+
 def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: torch.dtype) -> RenderOutput:
     """Split colour and depth and add the background, which gsplat 1.5.3 refuses together with packed=True."""
     color, depth = pixels[..., :3], pixels[..., 3:].clone()
@@ -149,26 +226,9 @@ class GsplatRenderer(nn.Module):
         """
         if means.device.type != "cuda":
             raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
-        from gsplat import rasterization
-
         view = camera.to(means.device, torch.float32)
-        pixels, alpha, meta = rasterization(
-            means=means,
-            quats=quats,
-            scales=log_scales.exp(),
-            opacities=opacities,
-            colors=sh,
-            viewmats=view.world_to_camera[None],
-            Ks=view.intrinsics[None],
-            width=camera.width,
-            height=camera.height,
-            near_plane=camera.near,
-            eps2d=self.eps2d,
-            sh_degree=sh_degree(sh.shape[1]),
-            packed=False,
-            backgrounds=None if background is None else background.to(means)[None],
-            absgrad=absgrad,
-            rasterize_mode="classic",
+        pixels, alpha, means2d, radii = rasterize_splat(
+            means, quats, log_scales.exp(), opacities, sh, view, background, self.eps2d, absgrad
         )
-        screen = ScreenGaussians(meta["means2d"], meta["radii"], None, camera.width, camera.height)
+        screen = ScreenGaussians(means2d, radii, None, camera.width, camera.height)
         return SplatOutput(pixels[0], alpha[0], screen)

@@ -7,7 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -441,6 +441,9 @@ class SimulationPipeline(nn.Module):
                 )
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
+        if self.device.type == "cuda" and first < frames:
+            with walls("startup"):
+                self._warm_up(recorder, state, first)
         bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
         try:
             for frame in range(first, frames):
@@ -495,6 +498,15 @@ class SimulationPipeline(nn.Module):
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
+
+    def _warm_up(self, recorder: Recorder, state: MPMState, frame: int) -> None:
+        """Load and compile the kernels of a frame, of which nothing is kept."""
+        with suppress(SimulationDiverged):  # the frame itself will say so
+            state, _ = self.advance(state)
+        if recorder.images:
+            gaussians = self.scene.deformed(state, rotations=self.scene.model.view_dependent)
+            camera = self.camera_at(frame)
+            self.draw(gaussians, self.colors(gaussians, camera), camera)
 
     def _record(self, recorder: Recorder, state: MPMState, frame: int, walls: _Walls) -> None:
         exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
@@ -589,7 +601,7 @@ class SimulationPipeline(nn.Module):
 class _Walls:
     """Seconds spent in each part of the run.
 
-    Simulation, shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the
+    Startup: on a GPU, a first frame that is thrown away, with which kernels are loaded and compiled. Simulation, shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the
     host need not wait there. Writing: how long the main thread was kept by the recorder, not what its threads did
     meanwhile.
     """
@@ -623,7 +635,7 @@ class _Walls:
             self._events[-1][2].synchronize()
         while self._events and self._events[0][2].query():
             part, start, end = self._events.pop(0)
-            self.seconds[part] += start.elapsed_time(end) / 1000
+            self.seconds[part] = self.seconds.get(part, 0.0) + start.elapsed_time(end) / 1000
         return dict(self.seconds)
 
 

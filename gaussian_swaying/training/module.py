@@ -18,6 +18,7 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.data.datamodule import TrainingImage
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
 from gaussian_swaying.rendering.base import SplatOutput, SplatRenderer, make_renderer
@@ -48,27 +49,27 @@ class TrainingDiverged(RuntimeError):  # noqa: N818
 _CLOCK_STEP = 20_000_000  # [ns] by which times of files may lag behind the clock
 
 
-@dataclass(frozen=True)
 class _Pending:
-    """A loss on its way to the host, which does not wait for it."""
+    """The last loss, on its way to the host, which does not wait for it."""
 
-    step: int
-    loss: Tensor
-    arrived: torch.cuda.Event | None
+    def __init__(self, device: torch.device) -> None:
+        self.step: int | None = None
+        on_gpu = device.type == "cuda"
+        self._host = torch.zeros((), pin_memory=on_gpu)
+        self._arrived = torch.cuda.Event() if on_gpu else None
 
-    @classmethod
-    def of(cls, step: int, loss: Tensor) -> _Pending:
-        if loss.device.type != "cuda":
-            return cls(step, loss, None)
-        host = torch.empty((), dtype=loss.dtype, pin_memory=True).copy_(loss, non_blocking=True)
-        arrived = torch.cuda.Event()
-        arrived.record()
-        return cls(step, host, arrived)
+    def send(self, step: int, loss: Tensor) -> None:
+        self.step = step
+        self._host.copy_(loss, non_blocking=True)
+        if self._arrived is not None:
+            self._arrived.record()
 
-    def value(self) -> float:
-        if self.arrived is not None:
-            self.arrived.synchronize()
-        return float(self.loss)
+    def take(self) -> float:
+        """Wait for the loss and forget it."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        self.step = None
+        return float(self._host)
 
 
 def _random_state(device: torch.device) -> dict[str, Tensor]:
@@ -200,6 +201,7 @@ class SplatTrainer(lightning.LightningModule):
         if min(fixed) < 0 or max(fixed) > 1:
             raise ValueError(f"Expected `background` to be a colour from 0 to 1, but got {list(fixed)}.")
         self.register_buffer("fixed_background", torch.tensor(fixed), persistent=False)
+        self._black = max(fixed) == 0.0
         self.scene_scale = scene_scale
         self.seed, self.panels, self.log_every = seed, panels, log_every
         self.output, self.init_ply = output, init_ply
@@ -316,6 +318,12 @@ class SplatTrainer(lightning.LightningModule):
             self._made[device.type] = make_renderer(device)
         return self._made[device.type]
 
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """One image; Lightning would look through its fields at every step."""
+        if isinstance(batch, TrainingImage):
+            return batch.to(device, non_blocking=True)
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
+
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
         """One image: picture, losses, gradients, six optimisers, densification."""
         outside = _random_state(self.device)
@@ -347,7 +355,9 @@ class SplatTrainer(lightning.LightningModule):
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
         self.manual_backward(loss)
-        self._pending = _Pending.of(step, loss.detach())
+        if self._pending is None:
+            self._pending = _Pending(self.device)
+        self._pending.send(step, loss.detach())
         if self.device.type != "cuda":
             self._check_pending()
         # Lightning counts a step of its wrapper as one of `max_steps`: it wraps one optimiser only.
@@ -355,8 +365,8 @@ class SplatTrainer(lightning.LightningModule):
         (wrapped[0] if isinstance(wrapped, list) else wrapped).step()
         for optimizer in others:
             optimizer.step()
-        for optimizer in optimizers:
-            optimizer.zero_grad(set_to_none=True)
+        for name in PARAMETERS:
+            getattr(splat, name).grad = None
         self.densification.after_step(step, output.screen)
         if len(splat) == 0:
             raise ValueError(
@@ -367,12 +377,12 @@ class SplatTrainer(lightning.LightningModule):
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
 
-    def _target(self, batch: Mapping[str, Any], train: bool) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Photo over the background, its alpha (H, W, 1), and that background."""
+    def _target(self, batch: Mapping[str, Any], train: bool) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """Photo over the background, its alpha (H, W, 1), and that background, None where it is black."""
         image, alpha = batch["image"], batch.get("alpha")
         background = self.fixed_background
         if alpha is None:
-            return image, None, background
+            return image, None, None if self._black else background
         if train and self.random_background:
             background = torch.rand(3).to(image.device, non_blocking=True)
         return image * alpha + (1.0 - alpha) * background, alpha, background
@@ -390,11 +400,9 @@ class SplatTrainer(lightning.LightningModule):
 
     def _check_pending(self) -> None:
         """Raise if the last loss was not finite: on a GPU one step later, so that nothing waits for it."""
-        if self._pending is None:
-            return
-        pending, self._pending = self._pending, None
-        if not math.isfinite(pending.value()):
-            raise TrainingDiverged(pending.step, "the loss", self._last_checkpoint())
+        step = None if self._pending is None else self._pending.step
+        if self._pending is not None and step is not None and not math.isfinite(self._pending.take()):
+            raise TrainingDiverged(step, "the loss", self._last_checkpoint())
 
     def _last_checkpoint(self) -> str | None:
         folders = [getattr(callback, "dirpath", None) for callback in self.trainer.checkpoint_callbacks]

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.rendering.base import make_renderer
 from gaussian_swaying.rendering.camera import look_at_camera
-from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, render_gsplat
+from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, rasterize_splat, render_gsplat
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 
 
@@ -112,3 +112,49 @@ def test_a_splat_as_it_is_stored_matches_the_torch_renderer():
         assert float(difference.mean()) <= 1e-3
     for actual, expected in zip(*gradients, strict=True):
         assert float((actual - expected).norm() / expected.norm()) < 0.02
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("degree", [0, 2])
+def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(absgrad, degree):
+    """Colours, alphas and gradients; the sums of the kernels' atomics are in no fixed order."""
+    from gsplat import rasterization
+
+    generator = torch.Generator().manual_seed(3)
+    count, bands = 400, (degree + 1) ** 2
+    leaves = {
+        "means": torch.randn(count, 3, generator=generator) * 0.4,
+        "quats": torch.randn(count, 4, generator=generator),
+        "scales": 0.02 + 0.05 * torch.rand(count, 3, generator=generator),
+        "opacities": torch.rand(count, generator=generator),
+        "sh": 0.3 * torch.randn(count, bands, 3, generator=generator),
+    }
+    camera = look_at_camera((1.5, -2.0, 0.7), (0, 0, 0), (0, 0, 1), 40.0, 90, 70).to("cuda", torch.float32)
+    background = torch.tensor([0.1, 0.5, 0.2], device="cuda")
+    weight = torch.randn(70, 90, 3, generator=generator).cuda()
+    found = []
+    for own in (True, False):
+        inputs = {name: value.cuda().requires_grad_() for name, value in leaves.items()}
+        if own:
+            pixels, alpha, centres, radii = rasterize_splat(*inputs.values(), camera, background, 0.3, absgrad)
+        else:
+            pixels, alpha, meta = rasterization(
+                *(inputs[name] for name in ("means", "quats", "scales", "opacities", "sh")),
+                camera.world_to_camera[None],
+                camera.intrinsics[None],
+                90,
+                70,
+                near_plane=camera.near,
+                sh_degree=degree,
+                packed=False,
+                backgrounds=background[None],
+                absgrad=absgrad,
+            )
+            centres, radii = meta["means2d"], meta["radii"]
+        centres.retain_grad()
+        ((pixels[0] * weight).sum() + alpha.square().sum()).backward()
+        kept = centres.absgrad if absgrad else centres.grad
+        found.append([pixels, alpha, centres, radii.float(), kept, *(leaf.grad for leaf in inputs.values())])
+    for one, two in zip(*found, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4 * float(two.abs().max()))

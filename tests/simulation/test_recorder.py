@@ -577,6 +577,27 @@ def test_recording_never_makes_the_host_wait_for_the_gpu(tmp_path):
 # ---- summary
 
 
+def test_kernels_are_loaded_without_a_trace(make_pipeline, tmp_path):
+    """A run that did so first has the frames and the log of one that did not."""
+    runs = []
+    for load in (False, True):
+        pipeline = make_pipeline(wind=WindField([6.0, 1.5, 0.0], seed=7))
+        if load:
+            pipeline._warm_up(Recorder(), pipeline.start(), 0)
+        runs.append(_run(pipeline, tmp_path / str(load), 3))
+    assert runs[0]["per_frame"] == runs[1]["per_frame"]
+    for name in ("00000", "00002"):
+        one, two = ((tmp_path / str(load) / "frames" / f"{name}.png").read_bytes() for load in (False, True))
+        assert one == two
+
+
+@pytest.mark.gpu
+def test_startup_is_not_counted_as_simulation(make_pipeline, tmp_path):
+    summary = _run(make_pipeline(wind=WindField([6.0, 1.5, 0.0], seed=7)).to("cuda"), tmp_path / "run", 3)
+    assert set(summary["wall_s"]) == {"startup", "simulation", "shading", "rendering", "writing"}
+    assert summary["wall_s"]["startup"] > 0
+
+
 def test_the_summary(make_pipeline, tmp_path):
     pipeline = make_pipeline(wind=WindField([6.0, 1.5, 0.0], seed=7))
     returned = _run(pipeline, tmp_path / "run", 3, settings={"note": "kept"})
