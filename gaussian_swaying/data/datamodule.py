@@ -229,6 +229,12 @@ class CaptureDataModule(LightningDataModule):
             "pin_memory": torch.cuda.is_available() and not self.cache,
         }
 
+    def transfer_batch_to_device(
+        self, batch: TrainingImage, device: torch.device, dataloader_idx: int
+    ) -> TrainingImage:
+        """The image on the device; Lightning would look through its fields at every step."""
+        return batch.to(device, non_blocking=True)
+
     def train_dataloader(self) -> DataLoader[TrainingImage]:
         """Training images, shuffled, without end."""
         dataset = self._dataset("train")

@@ -18,7 +18,6 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.data.datamodule import TrainingImage
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
 from gaussian_swaying.rendering.base import SplatOutput, SplatRenderer, make_renderer
@@ -317,12 +316,6 @@ class SplatTrainer(lightning.LightningModule):
         if device.type not in self._made:
             self._made[device.type] = make_renderer(device)
         return self._made[device.type]
-
-    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        """One image; Lightning would look through its fields at every step."""
-        if isinstance(batch, TrainingImage):
-            return batch.to(device, non_blocking=True)
-        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
         """One image: picture, losses, gradients, six optimisers, densification."""
