@@ -249,49 +249,69 @@ class AnisotropyLoss(LossTerm):
     Args:
         a: Ratio from which on a Gaussian counts as elongated, at least 1.
         ratio: ``paper`` (largest over second largest scale) or ``max_min``.
+        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``, which a training cannot take.
 
     Raises:
         ValueError: If an argument is not one of those.
     """
 
-    def __init__(self, a: float = 1.1, ratio: str = "paper") -> None:
+    def __init__(self, a: float = 1.1, ratio: str = "paper", reduction: str = "mean") -> None:
         super().__init__()
         if not 1.0 <= a < math.inf:
             raise ValueError(f"Expected `a` to be at least 1, but got {a}.")
         check_choice("ratio", ratio, ("paper", "max_min"))
-        self.a, self.ratio = float(a), ratio
+        check_choice("reduction", reduction, _REDUCTIONS)
+        self.a, self.ratio, self.reduction = float(a), ratio, reduction
 
     def forward(self, inputs: LossInputs) -> Tensor:
         """See :func:`anisotropy_loss`."""
-        return anisotropy_loss(inputs.log_scales, self.a, self.ratio)
+        return anisotropy_loss(inputs.log_scales, self.a, self.ratio, self.reduction)
 
 
 class OpacityEntropyLoss(LossTerm):
-    """Entropy of the opacities, see :func:`opacity_entropy_loss`."""
+    """Entropy of the opacities, see :func:`opacity_entropy_loss`.
+
+    Args:
+        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``, which a training cannot take.
+
+    Raises:
+        ValueError: If ``reduction`` is none of those.
+    """
+
+    def __init__(self, reduction: str = "mean") -> None:
+        super().__init__()
+        check_choice("reduction", reduction, _REDUCTIONS)
+        self.reduction = reduction
 
     def forward(self, inputs: LossInputs) -> Tensor:
         """See :func:`opacity_entropy_loss`."""
-        return opacity_entropy_loss(inputs.opacities)
+        return opacity_entropy_loss(inputs.opacities, self.reduction)
 
 
 class SizeLoss(LossTerm):
     """Penalty on large Gaussians, see :func:`size_loss`.
 
+    The paper does not say how it goes over the Gaussians. As a mean with the paper's weight of 0.01 it changes nothing
+    that could be measured; as a sum it holds the Gaussians to ``b``, which a simulation needs where a surface has no
+    texture: its particles lie as densely as the Gaussians.
+
     Args:
         b: Scale from which on a Gaussian counts as large [scene units].
+        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``, which a training cannot take.
 
     Raises:
-        ValueError: If ``b`` is negative.
+        ValueError: If ``b`` is negative, or ``reduction`` is none of those.
     """
 
-    def __init__(self, b: float = 0.008) -> None:
+    def __init__(self, b: float = 0.008, reduction: str = "mean") -> None:
         super().__init__()
         check_positive("b", b, allow_zero=True)
-        self.b = float(b)
+        check_choice("reduction", reduction, _REDUCTIONS)
+        self.b, self.reduction = float(b), reduction
 
     def forward(self, inputs: LossInputs) -> Tensor:
         """See :func:`size_loss`."""
-        return size_loss(inputs.log_scales, self.b)
+        return size_loss(inputs.log_scales, self.b, self.reduction)
 
 
 class MeanOpacityLoss(LossTerm):
@@ -350,8 +370,18 @@ class TotalLoss(nn.Module):
         self.terms = nn.ModuleDict({name: term for name, term in named.items() if self.weights[name] != 0.0})
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The sum, with its gradient, and each term before its weight, detached."""
+        """The sum, with its gradient, and each term before its weight, detached.
+
+        Raises:
+            ValueError: If a term is not a number.
+        """
         values = {name: term(inputs) for name, term in self.terms.items()}
+        for name, value in values.items():
+            if value.dim():
+                raise ValueError(
+                    f"Expected the term `{name}` to be a number, but got shape {tuple(value.shape)}: set its "
+                    "`reduction` to mean or sum."
+                )
         total = sum(self.weights[name] * value for name, value in values.items())
         assert isinstance(total, Tensor)  # one weight at least is not zero
         return total, {name: value.detach() for name, value in values.items()}

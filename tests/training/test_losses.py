@@ -143,6 +143,9 @@ def test_modules_are_their_functions():
         (AnisotropyLoss(1.2, "max_min"), anisotropy_loss(inputs.log_scales, 1.2, "max_min")),
         (OpacityEntropyLoss(), opacity_entropy_loss(inputs.opacities)),
         (SizeLoss(0.01), size_loss(inputs.log_scales, 0.01)),
+        (AnisotropyLoss(reduction="sum"), anisotropy_loss(inputs.log_scales, reduction="sum")),
+        (OpacityEntropyLoss("none"), opacity_entropy_loss(inputs.opacities, "none")),
+        (SizeLoss(reduction="sum"), size_loss(inputs.log_scales, reduction="sum")),
         (MeanOpacityLoss(), torch.tensor(0.5)),
         (MeanScaleLoss(), torch.tensor(0.017)),
     ]
@@ -184,6 +187,10 @@ def test_total_with_a_term_of_ones_own():
         (lambda: AnisotropyLoss(0.5), "`a` to be at least 1"),
         (lambda: AnisotropyLoss(ratio="min_max"), "paper, max_min"),
         (lambda: SizeLoss(-1.0), "`b`"),
+        (lambda: SizeLoss(reduction="max"), "mean, sum, none"),
+        (lambda: AnisotropyLoss(reduction="max"), "mean, sum, none"),
+        (lambda: OpacityEntropyLoss("max"), "mean, sum, none"),
+        (lambda: TotalLoss({"size": SizeLoss(reduction="none")})(_inputs()), "`size` to be a number.*`reduction`"),
     ],
 )
 def test_bad_terms(make, words):
