@@ -62,7 +62,7 @@ VARIANTS: dict[str, Variant] = {
     **{
         f"b_{b:g}": Variant(
             f"size loss b = {b:g}",
-            training=("--model.loss_terms.size=SizeLoss", f"--model.loss_terms.size.b={b:g}"),
+            training=(f"--model.loss_terms.size.init_args.b={b:g}",),
             patterns=(3,),
         )
         for b in (0.001, 0.004, 0.008, 0.02, 0.1)
@@ -113,8 +113,9 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
     if (target / "point_cloud.ply").exists():
         return {"kept": True}
     command = [sys.executable, str(ROOT / "tools" / "train.py"), "fit"]
-    command += [f"--config={ROOT}/configs/train/default.yaml", f"--trainer.max_steps={steps}"]
-    command += [f"--trainer.val_check_interval={steps}", f"--checkpoint.every_n_train_steps={steps}"]
+    command += [f"--config={ROOT}/configs/train/default.yaml", f"--config={BENCH}/train.yaml"]
+    command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
+    command += [f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"]
     command += [f"--data.init_args.path={dataset / f'pattern{pattern}' / 'train'}"]
     command += [f"--trainer.default_root_dir={target}", *variant.training]
     begin = time.perf_counter()

@@ -70,13 +70,37 @@ def test_every_run_is_a_command_line_that_parses(training, tmp_path, monkeypatch
         )
         surface = [cli.model.loss.weights[term] for term in ("anisotropy", "entropy", "size")]
         assert surface == ([10.0, 0.01, 0.01] if name == "surface" else [0.0, 0.0, 0.0])
-    for name, (_, weights) in training.FLAG_ROWS.items():
-        more = training._weights(**weights)
+    for place, name in enumerate(training.FLAG_ROWS):
+        more = training.flag_options(name)
         cli = training.make_cli(
             [*training._arguments("flag", more, 10, tmp_path), "--trainer.accelerator=cpu"], run=False
         )
         used = set(cli.model.loss.terms) - {"rgb"}
-        assert len(used) == list(training.FLAG_ROWS).index(name)
+        assert len(used) == min(place, 3)
+        assert cli.model.densification.stop == (5000 if name == "settled" else 15_000)
+
+
+def test_runs_are_spread_over_the_gpus(training, tmp_path, monkeypatch):
+    """Each process sees one of those that the parent sees."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
+    monkeypatch.setattr(training.torch.cuda, "device_count", lambda: 2)
+    seen, found = [], {}
+
+    class Process:
+        returncode = 0
+
+        def __init__(self, command, env, **_):
+            seen.append(env["CUDA_VISIBLE_DEVICES"])
+            (tmp_path / command[5]).write_text("{}")
+
+        def poll(self):
+            return 0
+
+    monkeypatch.setattr(training.subprocess, "Popen", Process)
+    jobs = [(name, "nowhere", 3, None) for name in ("a", "b", "c", "d")]
+    training.run_apart(jobs, tmp_path, 4, found.__setitem__)
+    assert sorted(seen) == ["3", "3", "5", "5"]
+    assert [row["runs_per_device"] for row in found.values()] == [2, 2, 2, 2]
 
 
 def test_a_run_of_its_own_fails_with_its_message(training, tmp_path):
