@@ -463,7 +463,23 @@ def _capture_lines(result: Row) -> list[str]:
             f"| {name} | {row['psnr_db']:.2f} | {row['ssim']:.3f} | {row['gaussians']:,} | {row['seconds']:.1f} | "
             f"{memory} | {row.get('runs_per_device', 1)} |"
         )
-    return [*lines, ""]
+    return [*lines, "", *_what_helped(result)]
+
+
+def _what_helped(result: Row) -> list[str]:
+    """The variants in the order of what they gain over the bare loop, beside how far its own runs differ."""
+    bare = [row["psnr_db"] for row in result.get("pair", {}).get("bare", [])]
+    gains = {
+        FOX_VARIANTS[name][0]: row["psnr_db"] - statistics.mean(bare)
+        for name, row in result.get("variants", {}).items()
+        if bare and "failed" not in row
+    }
+    if not gains:
+        return []
+    told = [f"{gains[name]:+.2f} dB {name}" for name in sorted(gains, key=lambda name: -gains[name])]
+    spread = max(bare) - min(bare)
+    lines = ["Against the mean of the bare loop's runs, which differ by", f"{spread:.2f} dB among themselves:", ""]
+    return [*lines, *(f"- {line}" for line in told), ""]
 
 
 def _flag_lines(result: Row) -> list[str]:

@@ -52,7 +52,10 @@ def test_the_page_shows_every_row_that_did_not_fail(training):
     }
     quality |= {"distance_median_m": 1e-3, "distance_p90_m": 2e-3, "area_paper_ratio": 2.0, "area_coverage_ratio": 1.1}
     flag = {"flag:size": _row(**quality, steps=30_000), "flag:none": {"failed": "x"}}
-    text = "\n".join(training.page([_result(flag=flag, variants={"mcmc": _row(), "surface": {"failed": "x"}})]))
+    pair = {"bare": [_row(psnr_db=24.0), _row(psnr_db=24.4)], "lightning": []}
+    variants = {"surface": {"failed": "x"}, "degree_1": _row(psnr_db=24.1), "mcmc": _row()}
+    text = "\n".join(training.page([_result(flag=flag, pair=pair, variants=variants)]))
+    assert "0.40 dB among themselves:\n\n- +0.80 dB MCMC, 300,000 Gaussians\n- -0.10 dB harmonics" in text
     assert (
         "| + size (all) | 90.0 % | 80.0 % | 70.0 % | 4.0, 9.0 | 1.00, 2.00 | 2.00 | 1.10 | 25.00 | 1,000 | 40 |" in text
     )
