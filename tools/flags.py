@@ -124,6 +124,13 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
     return {"seconds": time.perf_counter() - begin, "steps": steps}
 
 
+def what_failed(told: str) -> str:
+    """The line of a process's last words that names the error."""
+    lines = [line for line in told.strip().splitlines() if line.strip()]
+    named = [line for line in lines if "rror:" in line]
+    return (named or lines or ["no message"])[-1]
+
+
 def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | None, folder: Path) -> Row:
     """Simulate a row and compare it with the reference."""
     dataset = Path(options.dataset)
@@ -145,7 +152,7 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
         command += ["--recorder.images=false", "--recorder.video=false"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if done.returncode not in (0, 3) or not (output / "summary.json").exists():
-        return {"failed": done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "no message"}
+        return {"failed": what_failed(done.stderr)}
     summary = json.loads((output / "summary.json").read_text())
     row: Row = {
         "status": summary["status"],
@@ -290,6 +297,79 @@ def _psnr(row: Row | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
+_GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB and share of the distance, against PhysGaussian's way
+_SHARE = 0.03  # of the longer side, that Chamfer distances are to stay within
+
+
+def _complete(rows: Row, name: str, pattern: int) -> Row | None:
+    row = rows.get(name, {}).get(str(pattern))
+    return row if row and row.get("status") == "complete" and "chamfer_share" in row else None
+
+
+def goals(result: Row) -> list[tuple[str, str, bool]]:
+    """What was to be reached, what was measured, and whether it is."""
+    rows, found = result["rows"], []
+    for pattern in PATTERNS:
+        ours = _complete(rows, "ours", pattern)
+        if ours is None:
+            continue
+        share = ours["chamfer_share"]
+        doubt = result.get("uncertainty", {}).get(str(pattern), {})
+        known = f" (reference itself: {100 * max(v['chamfer'] for v in doubt.values()):.2f} %)" if doubt else ""
+        found.append(
+            (
+                f"pattern {pattern}: Chamfer distance within {100 * _SHARE:g} % of the longer side",
+                f"{100 * share:.2f} %{known}",
+                share <= _SHARE,
+            )
+        )
+        decibels, factor = _GAIN[pattern]
+        other = _complete(rows, "particle", pattern)
+        if other is not None:
+            ratio = share / other["chamfer_share"]
+            goal = f"pattern {pattern}: Chamfer distance {factor:g} times that of PhysGaussian's way"
+            found.append((goal, f"{ratio:.2f} times", ratio <= factor))
+            if "psnr_db" in ours["mean"] and "psnr_db" in other["mean"]:
+                gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
+                goal = f"pattern {pattern}: PSNR {decibels:+g} dB against PhysGaussian's way"
+                found.append((goal, f"{gain:+.2f} dB", gain >= decibels))
+        other = _complete(rows, "no_surface", pattern)
+        if other is not None:
+            ratio = other["chamfer_share"] / share
+            goal = f"pattern {pattern}: without surface modelling at least twice the Chamfer distance"
+            found.append((goal, f"{ratio:.2f} times", ratio >= 2))
+        other = _complete(rows, "no_shading", pattern)
+        if other is not None and "psnr_db" in ours["mean"]:
+            gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
+            found.append((f"pattern {pattern}: without shading a lower PSNR", f"{-gain:+.2f} dB", gain > 0))
+    return found
+
+
+def pattern_lines(rows: Row, pattern: int) -> list[str]:
+    """When a flag leaves its reference, and what moves it nearer or farther."""
+    ours = _complete(rows, "ours", pattern)
+    if ours is None:
+        return []
+    distances = [value for value in ours.get("chamfer_per_frame_m", []) if value is not None]
+    longer = ours["mean"]["chamfer_m"] / ours["chamfer_share"]
+    third = len(distances) // 3
+    lines = []
+    if third:
+        parts = [distances[:third], distances[third : 2 * third], distances[2 * third :]]
+        told = ", ".join(f"{100 * sum(part) / len(part) / longer:.2f} %" for part in parts)
+        lines.append(f"- pattern {pattern}, distance in the three thirds of the run: {told}")
+    changes = {
+        VARIANTS[name].title: row["chamfer_share"] - ours["chamfer_share"]
+        for name in rows
+        if name not in ("ours", "particle", "no_surface") and (row := _complete(rows, name, pattern))
+    }
+    if changes:
+        order = sorted(changes, key=lambda name: changes[name])
+        told = "; ".join(f"{name} {100 * changes[name]:+.2f}" for name in order)
+        lines.append(f"- pattern {pattern}, change of the distance [% of the longer side] by one thing: {told}")
+    return lines
+
+
 def page(recorded: list[Row]) -> list[str]:
     """docs/flag_benchmark.md."""
     lines = [
@@ -312,6 +392,10 @@ def page(recorded: list[Row]) -> list[str]:
                 continue
             cells = [f(rows[name].get(str(p))) for p in PATTERNS for f in (_chamfer, _psnr)]
             lines.append(f"| {variant.title} | " + " | ".join(cells) + " |")
+        lines += ["", "| goal | measured | reached |", "|---|---|---|"]
+        lines += [f"| {goal} | {value} | {'yes' if ok else 'no'} |" for goal, value, ok in goals(result)]
+        told = [line for pattern in PATTERNS for line in pattern_lines(rows, pattern)]
+        lines += ["", "Where ours differs, and what one change at a time does:", "", *told] if told else []
         lines += ["", "How far the reference is from itself, solved otherwise (same measure):", ""]
         for pattern, found in sorted(result.get("uncertainty", {}).items()):
             shown = [

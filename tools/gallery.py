@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from flags import what_failed
+
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs" / "sim"
 Row = dict[str, Any]
@@ -77,8 +79,7 @@ def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         seconds = time.perf_counter() - begin
         if not (output / "summary.json").exists():
-            lines = done.stderr.strip().splitlines()
-            return {"failed": lines[-1] if lines else "no message"}
+            return {"failed": what_failed(done.stderr)}
         summary = json.loads((output / "summary.json").read_text())
         summary.pop("per_frame")
         strip(output / "frames", pictures / f"gallery_{name}.png")

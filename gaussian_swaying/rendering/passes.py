@@ -36,13 +36,13 @@ def colormap(values: Tensor) -> Tensor:
     """Colours from dark violet at 0 over green to yellow at 1 (viridis); values beyond take the ends' colours.
 
     Args:
-        values: Shape (...).
+        values: Shape (...); NaN takes the colour of 0.
 
     Returns:
         Colours in [0, 1], shape (..., 3).
     """
     table = torch.tensor(_VIRIDIS, dtype=values.dtype).to(values.device, non_blocking=True)
-    place = values.clamp(0, 1) * (len(_VIRIDIS) - 1)
+    place = values.nan_to_num(0.0).clamp(0, 1) * (len(_VIRIDIS) - 1)
     low = place.floor().clamp(max=len(_VIRIDIS) - 2)
     return torch.lerp(table[low.long()], table[low.long() + 1], (place - low)[..., None])
 

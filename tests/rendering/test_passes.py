@@ -46,6 +46,7 @@ def test_depth_in_16_bits():
 
 def test_colours_of_the_scale():
     values = torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0])
+    torch.testing.assert_close(colormap(torch.tensor([math.nan])), colormap(torch.zeros(1)))
     colours = colormap(values)
     assert torch.equal(colours[0], colours[1])
     assert torch.equal(colours[3], colours[4])

@@ -74,6 +74,13 @@ def test_a_row_is_simulated_and_compared(flags, tmp_path):
     assert "solver.dx" in flags.run_row(1, "ours", options, None, tmp_path / "again")["failed"]
 
 
+def test_the_line_that_names_the_error(flags):
+    told = "Traceback\nRuntimeError: CUDA error: out\nCompile with `X` to enable assertions.\n\n"
+    assert flags.what_failed(told) == "RuntimeError: CUDA error: out"
+    assert flags.what_failed("one\ntwo\n") == "two"
+    assert flags.what_failed("") == "no message"
+
+
 def test_a_figure_needs_all_pictures(flags, tmp_path):
     frames = {"reference": tmp_path / "reference/video/frames", "ours": tmp_path / "ours/frames"}
     frames["particle"] = tmp_path / "particle/frames"
@@ -90,7 +97,9 @@ def test_a_figure_needs_all_pictures(flags, tmp_path):
 
 
 def test_the_page_tells_what_was_and_what_was_not(flags):
-    row = {"status": "complete", "frames": 250, "torn_particles": 0, "chamfer_share": 0.0213, "mean": {"psnr_db": 22.5}}
+    mean = {"psnr_db": 22.5, "chamfer_m": 0.0213 * 1.2}
+    row = {"status": "complete", "frames": 250, "torn_particles": 0, "chamfer_share": 0.0213, "mean": mean}
+    row["chamfer_per_frame_m"] = [0.012, 0.012, 0.024, 0.024, 0.048, 0.048]
     row |= {"particles": 1000, "substeps": 5000, "ms_per_frame": 12.3, "device_memory_bytes": 2**30}
     stopped = row | {"status": "diverged", "frames": 31}
     result = {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0, "splats": "made in code"}
@@ -102,3 +111,26 @@ def test_the_page_tells_what_was_and_what_was_not(flags):
     assert "| PhysGaussian's way | failed | - | - | - | - | - |" in text
     assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in text
     assert "| Gaussian Swaying | 21.44 | 0.0178 |" in text
+
+
+def test_goals_and_what_one_change_does(flags):
+    def row(share, psnr, **more):
+        return {"status": "complete", "chamfer_share": share, "mean": {"psnr_db": psnr, "chamfer_m": 2 * share}} | more
+
+    ours = row(0.02, 22.0, chamfer_per_frame_m=[0.01, 0.02, 0.06])
+    rows = {"ours": {"3": ours}, "particle": {"3": row(0.1, 18.0)}, "no_surface": {"3": row(0.03, 18.0)}}
+    rows |= {"no_shading": {"3": row(0.02, 23.0)}, "undamped": {"3": row(0.025, 22.0)}, "thin": {"3": row(0.018, 22.0)}}
+    result = {"rows": rows, "uncertainty": {"3": {"coarser": {"chamfer": 0.0067}}}}
+    found = {goal: (value, ok) for goal, value, ok in flags.goals(result)}
+    assert found == {
+        "pattern 3: Chamfer distance within 3 % of the longer side": ("2.00 % (reference itself: 0.67 %)", True),
+        "pattern 3: Chamfer distance 0.25 times that of PhysGaussian's way": ("0.20 times", True),
+        "pattern 3: PSNR +4.2 dB against PhysGaussian's way": ("+4.00 dB", False),
+        "pattern 3: without surface modelling at least twice the Chamfer distance": ("1.50 times", False),
+        "pattern 3: without shading a lower PSNR": ("+1.00 dB", False),
+    }
+    lines = flags.pattern_lines(rows, 3)
+    assert lines[0].endswith("0.50 %, 1.00 %, 3.00 %")
+    assert "half the thickness, twice E and density -0.20; no shading +0.00; without the" in lines[1]
+    assert lines[1].endswith("damping +0.50")
+    assert flags.pattern_lines(rows, 1) == []
