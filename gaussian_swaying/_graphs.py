@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import gc
+import threading
 from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import nn
+
+_RECORDING = threading.Lock()
+"""Held while a graph is recorded: PyTorch cannot give memory back to the driver meanwhile."""
 
 
 class Recordable:
@@ -50,7 +54,9 @@ def fingerprint(modules: Iterable[nn.Module]) -> tuple[tuple[object, ...], ...]:
     )
 
 
-def record(device: torch.device, work: Callable[[], Any], pool: Any = None) -> torch.cuda.CUDAGraph:
+def record(
+    device: torch.device, work: Callable[[], Any], pool: Any = None, stream: torch.cuda.Stream | None = None
+) -> torch.cuda.CUDAGraph:
     """Record what a function launches, without running it.
 
     Everything it launches must have run before, so that nothing is compiled or loaded meanwhile, and it must not make
@@ -60,6 +66,8 @@ def record(device: torch.device, work: Callable[[], Any], pool: Any = None) -> t
         device: A CUDA device.
         work: The function.
         pool: Memory pool of what it allocates, shared by graphs of which no two run at once; one of its own if None.
+        stream: Where it is recorded; a new one if None. Graphs that share a pool must share it too: memory that was
+            freed on one stream is given to no other.
 
     Returns:
         The graph; ``replay()`` runs it.
@@ -67,26 +75,28 @@ def record(device: torch.device, work: Callable[[], Any], pool: Any = None) -> t
     Raises:
         RuntimeError: If the function does what cannot be recorded.
     """
-    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device)
+    graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device) if stream is None else stream
     stream.wait_stream(torch.cuda.current_stream(device))
-    collecting = gc.isenabled()
-    gc.disable()  # a graph that is freed meanwhile would break the recording
-    try:
-        # numbers that all graphs share are tensors of the mode of the first, and could not be written outside inference
-        # mode if that was it
-        with torch.cuda.stream(stream), torch.inference_mode(False), torch.no_grad():
-            # other threads, that of the recorder say, may go on
-            graph.capture_begin(pool=pool, capture_error_mode="thread_local")
-            try:
-                work()
-            except BaseException:
-                with suppress(RuntimeError):  # what broke the recording matters more
-                    graph.capture_end()
-                raise
-            graph.capture_end()
-    finally:
-        if collecting:
-            gc.enable()
+    with _RECORDING:
+        collecting = gc.isenabled()
+        gc.disable()  # a graph that is freed meanwhile would break the recording
+        try:
+            # numbers that all graphs share are tensors of the mode of the first, and could not be written outside
+            # inference mode if that was it
+            with torch.cuda.stream(stream), torch.inference_mode(False), torch.no_grad():
+                # other threads, that of the recorder say, may go on
+                graph.capture_begin(pool=pool, capture_error_mode="thread_local")
+                try:
+                    work()
+                except BaseException:
+                    with suppress(RuntimeError):  # what broke the recording matters more
+                        graph.capture_end()
+                    graph.reset()  # the traceback keeps it, and it would keep its memory
+                    raise
+                graph.capture_end()
+        finally:
+            if collecting:
+                gc.enable()
     torch.cuda.current_stream(device).wait_stream(stream)
     return graph
 
@@ -94,16 +104,21 @@ def record(device: torch.device, work: Callable[[], Any], pool: Any = None) -> t
 class Repeater:
     """Repeats pieces of work from CUDA graphs of 16, 4 and 1 repetitions, which share one pool of memory.
 
+    The pool is that of the graphs in use. Once they are all forgotten its memory is given back before the next one is
+    recorded.
+
     Args:
         device: Where the work runs; without CUDA it just runs.
     """
 
     SIZES = (16, 4, 1)
+    KEPT = 4
+    """Pieces of work whose graphs are kept, the latest ones."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self._graphs: dict[Hashable, dict[int, torch.cuda.CUDAGraph]] = {}
-        self._pool: Any = None
+        self._stream: torch.cuda.Stream | None = None
 
     def run(self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True) -> None:
         """Run the work ``times`` times.
@@ -119,10 +134,14 @@ class Repeater:
 
         Raises:
             RuntimeError: If it was said to be recordable and is not.
+            torch.OutOfMemoryError: If there is no memory left to record it.
         """
         if times == 0:  # nothing runs, so nothing is compiled
             return
         if self.device.type != "cuda" or not recordable or key not in self._graphs:
+            self.forget(key)
+            while len(self._graphs) >= self.KEPT:
+                self.forget(next(iter(self._graphs)))
             self._graphs[key] = {}
             for _ in range(times):
                 several(1)
@@ -136,18 +155,33 @@ class Repeater:
                 times -= size
 
     def _recorded(self, several: Callable[[int], None], size: int) -> torch.cuda.CUDAGraph:
-        if self._pool is None:
-            # a pool lives as long as a graph in it: this one stays, whatever else is forgotten
-            self._pool, spare = torch.cuda.graph_pool_handle(), torch.zeros(1, device=self.device)
-            self._keeper = record(self.device, lambda: spare.add_(1), self._pool)
+        if self._stream is None:
+            self._stream = torch.cuda.Stream(self.device)
+        alive = next((graph for graphs in self._graphs.values() for graph in graphs.values()), None)
+        if alive is None:
+            # what graphs that are gone have held, and what is cached, cannot be had while recording; PyTorch refuses to
+            # give it back once a recording was broken off
+            with _RECORDING, suppress(RuntimeError):
+                torch.cuda.synchronize(self.device)  # they may still run
+                torch.cuda.empty_cache()
         try:
-            return record(self.device, lambda: several(size), self._pool)
+            return record(self.device, lambda: several(size), None if alive is None else alive.pool(), self._stream)
         except RuntimeError as error:
+            what = str(error).strip().split("\n")[0].split(" GPU ")[0].rstrip(".")
+            if "out of memory" in what:
+                raise torch.OutOfMemoryError(
+                    f"No memory is left on the GPU to record a substep on a grid of this size ({what}): keep what "
+                    "flies away within an EnclosingBox or behind a Plane, or coarsen `solver.dx`."
+                ) from error
+            if "captur" not in str(error):  # it is no matter of recording
+                raise
             raise RuntimeError(
-                f"A substep cannot be recorded in a CUDA graph ({error}): set `recordable` of the boundary that makes "
+                f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` of the boundary that makes "
                 "the host wait to False, or `transfer` to torch."
             ) from error
 
-    def forget(self) -> None:
-        """Drop the graphs."""
-        self._graphs.clear()
+    def forget(self, key: Hashable | None = None) -> None:
+        """Drop the graphs of one key, or all of them."""
+        for known in list(self._graphs) if key is None else [key]:
+            for graph in self._graphs.pop(known, {}).values():
+                graph.reset()

@@ -44,15 +44,16 @@ class Variant:
 
 
 VARIANTS: dict[str, Variant] = {
-    "ours": Variant("ours (`total`, dx = 0.02 m)"),
+    "ours": Variant("ours (`total`, dx = 0.04 m, three layers)"),
     "particle": Variant("PhysGaussian's way", ("particle",)),
     "no_surface": Variant("no surface modelling", ("no_surface",), patterns=(2, 3)),
     "no_shading": Variant("no shading", ("no_shading",)),
     "gusts": Variant("flow randomised", ("gusts",), patterns=(2, 3)),
     "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
     "paper_area": Variant("areas π s1 s2", ("paper_area",)),
-    "total_04": Variant("`total`, dx = 0.04 m", options=("--solver.dx=0.04",)),
-    "total_01": Variant("`total`, dx = 0.01 m", options=("--solver.dx=0.01",)),
+    "membrane": Variant("one layer: no bending stiffness", options=("--scene.layers=1",)),
+    "total_03": Variant("`total`, dx = 0.03 m", options=("--solver.dx=0.03",)),
+    "total_02": Variant("`total`, dx = 0.02 m", options=("--solver.dx=0.02",)),
     "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), ("--solver.dx=0.02",)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),

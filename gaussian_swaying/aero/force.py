@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -99,6 +101,24 @@ def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | f
     return air_density * coefficient * area * speed / mass
 
 
+def capped_area(area: Tensor, rest_area: Tensor, max_ratio: float) -> Tensor:
+    r"""Area that meets the wind, :math:`\min(A, r_{max} A_0)`.
+
+    The total deformation gradient of material that flows grows without bound, and with it the area that Nanson's
+    formula gives, while a patch of grains catches no more wind than its grains do. Without a cap wind and area drive
+    each other.
+
+    Args:
+        area: Patch area now [m²], shape (..., P).
+        rest_area: Patch area at rest [m²], shape (..., P).
+        max_ratio: Largest ratio of the two; infinite for no cap.
+
+    Returns:
+        Shape (..., P). The gradient with respect to ``area`` is zero where the cap holds.
+    """
+    return area if max_ratio == math.inf else torch.minimum(area, max_ratio * rest_area)
+
+
 class AeroForce(nn.Module):
     """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
 
@@ -115,6 +135,8 @@ class AeroForce(nn.Module):
         unit_tangent: Normalise the tangential flow direction.
         drag_step: ``explicit``, or ``semi_implicit``: the solver takes the drag at the velocity that it leads to (see
             :meth:`resistance`), which needs no shorter substep for very light things in strong wind.
+        max_area_ratio: Largest ratio of a patch's area in the wind to its area at rest (see :func:`capped_area`); null
+            for no cap, which suits what is elastic. Material that flows needs one, such as 1.
 
     Example:
         >>> aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=2.0)
@@ -133,6 +155,7 @@ class AeroForce(nn.Module):
         lift_direction: str = "side",
         unit_tangent: bool = False,
         drag_step: str = "explicit",
+        max_area_ratio: float | None = None,
     ) -> None:
         super().__init__()
         check_choice("law", law, LAWS)
@@ -142,6 +165,10 @@ class AeroForce(nn.Module):
             check_positive(name, value, allow_zero=True)
         if not abs(C_L) < float("inf"):
             raise ValueError(f"Expected `C_L` to be finite, but got {C_L}.")
+        if max_area_ratio is not None and not max_area_ratio > 0:
+            raise ValueError(
+                f"Expected `max_area_ratio` to be positive, or null for no cap on the area, but got {max_area_ratio}."
+            )
         # float64 scalars: they never lower the precision of a float64 run nor raise that of a float32 one
         for name, value in (("C_D", C_D), ("C_F", C_F), ("C_L", C_L)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
@@ -150,6 +177,7 @@ class AeroForce(nn.Module):
         self.C_L: Tensor
         self.air_density, self.law = float(air_density), law
         self.lift_direction, self.unit_tangent, self.drag_step = lift_direction, unit_tangent, drag_step
+        self.max_area_ratio = math.inf if max_area_ratio is None else float(max_area_ratio)
 
     @property
     def idle(self) -> bool:

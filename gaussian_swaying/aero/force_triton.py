@@ -7,8 +7,8 @@ from gaussian_swaying.mpm.linalg_triton import cofactor, cross3, dot3
 
 
 @triton.jit
-def deform_patch(F, n, area):
-    """Unit normal and area after a deformation, as ``gaussians.surface.deform_patch``."""
+def deform_patch(F, n, area, max_ratio):
+    """Unit normal and area after a deformation, as ``gaussians.surface.deform_patch`` and ``capped_area``."""
     cof = cofactor(F)
     det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
     x = cof[0] * n[0] + cof[1] * n[1] + cof[2] * n[2]
@@ -18,7 +18,7 @@ def deform_patch(F, n, area):
     flat = size == 0
     scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
     normal = (tl.where(flat, n[0], x * scale), tl.where(flat, n[1], y * scale), tl.where(flat, n[2], z * scale))
-    return normal, size * area
+    return normal, tl.minimum(size, max_ratio) * area
 
 
 @triton.jit

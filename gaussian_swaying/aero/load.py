@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record
-from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.surface import deform_patch
 
@@ -134,6 +134,7 @@ class WindLoad:
             wind: Air velocity [m/s], broadcastable to (..., P, 3).
         """
         normal, area = deform_patch(state.F_total, self.normal, self.area)
+        area = capped_area(area, self.area, self.aero.max_area_ratio)
         return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
 
     def __call__(self, state: MPMState) -> tuple[Tensor, Tensor | None]:

@@ -134,6 +134,39 @@ def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tens
     return matmul3(matmul3(deformation_gradient, covariances), deformation_gradient.mT)
 
 
+def limit_stretch(covariances: Tensor, rest: Tensor, max_stretch: float) -> Tensor:
+    r"""Covariances of Gaussians that are drawn out too far, made rounder and smaller.
+
+    The size of a Gaussian is :math:`\sqrt{\operatorname{tr} a}`. Where it is :math:`r` times that at rest and
+    :math:`r > r_{max}`, the covariance becomes
+
+    .. math::
+        w\, a + (1 - w) \tfrac13 \operatorname{tr}(A)\, I, \qquad w = \frac{r_{max}^2 - 1}{r^2 - 1},
+
+    whose size is :math:`r_{max}` times that at rest: a grain that has lost its shape, drawn out a little, in place of a
+    streak. Others stay as they are, and nothing jumps where the limit is reached.
+
+    Args:
+        covariances: Covariances a [scene units^2], shape (..., 3, 3).
+        rest: Covariances A at rest [scene units^2], shape (..., 3, 3).
+        max_stretch: Largest ratio of the sizes, above 1.
+
+    Returns:
+        Shape (..., 3, 3).
+
+    Raises:
+        ValueError: If a tensor does not have the shape above.
+    """
+    check_shape("covariances", covariances, 3, 3)
+    check_shape("rest", rest, 3, 3)
+    size, size_at_rest = (matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] for matrix in (covariances, rest))
+    excess = (max_stretch**2 - 1) * size_at_rest
+    over = size - size_at_rest
+    weight = excess / torch.maximum(over, excess)
+    ball = torch.eye(3, dtype=rest.dtype, device=rest.device) * (size_at_rest / 3)
+    return torch.where(over > excess, weight * covariances + (1 - weight) * ball, covariances)
+
+
 def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
     """Unit normals along the smallest axis of each Gaussian (Guedon & Lepetit 2024, "SuGaR").
 

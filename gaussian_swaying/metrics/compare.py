@@ -211,7 +211,7 @@ def compare_run(
 
     Pictures are compared if both folders have ``frames/*.png`` (the reference's may lie in ``video/``). Surfaces are if
     the reference has ``cloth.npz`` (see :func:`read_cloth`) and the run ``trajectory.npz``: points drawn from the
-    reference's surface against the simulated particles, moved from the frame of the simulation to that of the scene, in
+    reference's surface against the simulated Gaussians, moved from the frame of the simulation to that of the scene, in
     metres. The Chamfer distance is the average of the two mean distances, so two equal sheets at a distance h have h.
     How much of it is due to sampling tells ``sampling_m``, the distance between that many random points of the
     reference and as many others as there are particles.
@@ -472,7 +472,8 @@ class _Surface:
         self.trajectory, self.cloth = run / "trajectory.npz", cloth
         self.points, self.seed, self.device = points, seed, device
         self.frame = _sim_frame(run, summary)
-        self.particles = len(load_trajectory(self.trajectory, 0)[0])
+        recorded = len(load_trajectory(self.trajectory, 0)[0])
+        self.particles = min(int(summary.get("simulated_gaussians") or recorded), recorded)  # others come after them
         generator = torch.Generator().manual_seed(seed)
         self.chosen = torch.randperm(self.particles, generator=generator)[:points].sort().values
         others = surface_points(cloth.positions[first_reference], cloth.faces, len(self.chosen), seed + 1)

@@ -85,7 +85,7 @@ class FusedSolver(ABC):
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.schedule = torch.zeros(MAX_STEPS + 2, kernels.SCHEDULE, device=self.device)
         self.winds = torch.zeros(MAX_STEPS, self.scenes, 3, device=self.device)
-        self.coefficients = torch.zeros(4, device=self.device)
+        self.coefficients = torch.zeros(5, device=self.device)
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
         self.watches = _corotated(points)
@@ -185,8 +185,8 @@ class FusedSolver(ABC):
 
     def _take_wind(self, load: WindLoad, winds: Tensor) -> None:
         aero = load.aero
-        half = torch.full_like(aero.C_D, 0.5 * aero.air_density)
-        self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half]))
+        half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
+        self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest]))
         self.winds[: len(winds)].copy_(winds.reshape(len(winds), -1, 3).expand(-1, self.scenes, -1))
         patches = [(t, None if t.is_inference() else t._version) for t in (load.normal, load.area)]
         known = zip(self._patch_of, patches, strict=False)
@@ -259,6 +259,7 @@ class FusedTotal(FusedSolver):
         self.fields = torch.zeros(len(inverse), 8, device=self.device)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = _lanes(sizes)
+        self._cut(sizes)
         acting = solver._acting
         self.plain = all(type(b) is PinnedRegion and b.start <= 0 and b.end == math.inf for b in acting)
         self.position = any(b.needs_position for b in acting)
@@ -269,20 +270,32 @@ class FusedTotal(FusedSolver):
                 held |= (static[f"share_{k}"] > (boundary.held_share or 0.0)).reshape(-1)
         self.held = held[active].to(torch.int8)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
-        self._partial: dict[int, Tensor] = {}
+        self._partial: dict[tuple[int, int], Tensor] = {}
         width = 8 if self.position else 4
-        _check_indices(max(8 * len(inverse), 27 * (self.cells + 1) * width, 27 * len(active)))
+        _check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
+
+    def _cut(self, sizes: Tensor) -> None:
+        """Cut crowded cells into pieces: a body of few cells would else have too few programs to fill a GPU."""
+        most = self.lanes * max(1, -(-self.count // (self.lanes * _PROGRAMS)))
+        counts = -(-sizes // most)
+        first = counts.cumsum(0) - counts
+        cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), counts)
+        self.pieces = len(cell)
+        within = torch.arange(self.pieces, device=self.device) - first[cell]
+        self.piece_start = torch.cat([self.cell_start[cell] + most * within, self.cell_start[-1:]]).int()
+        self.piece_node, self.piece_scene = self.cell_node[cell].contiguous(), self.cell_scene[cell].contiguous()
+        self.first_piece = torch.cat([first, first.new_tensor([self.pieces])]).int()
 
     def _take_patches(self, normal: Tensor, area: Tensor) -> None:
         order = self.order.long()
         self.patch[:3].copy_(normal.T[:, order])
         self.patch[3].copy_(area[order])
 
-    def _sums(self, width: int) -> Tensor:
-        """Buffer of the sums of each cell, with a row of zeros behind the last."""
-        if width not in self._partial:
-            self._partial[width] = torch.zeros(27, self.cells + 1, width, device=self.device)
-        return self._partial[width]
+    def _sums(self, rows: int, width: int) -> Tensor:
+        """Buffer of the sums of each cell or piece of one, with a row of zeros behind the last."""
+        if (rows, width) not in self._partial:
+            self._partial[rows, width] = torch.zeros(27, rows + 1, width, device=self.device)
+        return self._partial[rows, width]
 
     def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
         assert state.node_displacement is not None
@@ -313,18 +326,23 @@ class FusedTotal(FusedSolver):
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         solver = self.solver
         width = 8 if self.position else 4
-        partial = self._sums(width)
+        partial = self._sums(self.pieces, width)
         _, ny, nz = self.grid.resolution
         per_program = max(1, 32 // self.lanes)
-        kernels.total_particles[(-(-self.cells // per_program),)](
+        kernels.total_particles[(-(-self.pieces // per_program),)](
             self.fraction, self.material, self.law, self.law_table, self.patch, self.force_in, self.load, self.order,
-            self.count, self.cell_start, self.cell_node, self.cell_scene, self.cells,
+            self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, partial,
             self.schedule, self.winds, self.scenes, self.coefficients, self.first_step, offset,
             ny * nz, nz, 1 / self.grid.dx, solver.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
             **_REGISTERS.get(self.lanes, {}),
         )  # fmt: skip
+        if self.pieces > self.cells:
+            pieces, partial = partial, self._sums(self.cells, width)
+            kernels.total_pieces[(-(-self.cells // 8), 27)](
+                pieces, partial, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
+            )
         block = 64
         nodes = len(self.active)
         kernels.total_nodes[(-(-nodes // block),)](
@@ -416,11 +434,11 @@ class FusedUpdated(FusedSolver):
         if nodes > len(self.velocity) or width != self.momentum.shape[1]:
             room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
             held = room if len(self.solver._acting) else 0
+            self.repeater.forget()  # before there is need of their memory
             with torch.inference_mode(False):  # they may be written within inference mode and without
                 self.momentum = torch.zeros(room, width, device=self.device)
                 self.velocity = torch.zeros(room, 4, device=self.device)
                 self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
-            self.repeater.forget()
         if grid != self.grid:
             self.repeater.forget()  # they read the node positions
             self.grid, self.node_position = grid, None
@@ -624,6 +642,8 @@ def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
 # time of a particle with so many lanes to a cell, relative to 32, on an H200
 _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 
+# pieces into which `total` cuts particles at least, where its cells are too few: about the warps that an H200 holds
+_PROGRAMS = 2048
 
 # more warps at once are worth the spilled registers
 _REGISTERS = {64: {"maxnreg": 128}}

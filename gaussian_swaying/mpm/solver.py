@@ -276,13 +276,13 @@ class MPMSolver(nn.Module):
         """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
         return scatter(stencil, self.held_mass(k, time)[..., None, None])[..., 0] * inverse_mass
 
-    def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0, check: bool = True) -> GridSpec:
+    def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
         flat = position.detach().reshape(-1, 3)
         low, high = flat.amin(0), flat.amax(0)
         if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
-            raise FloatingPointError("A particle position is NaN or infinite.")
+            raise _not_finite("position", flat)
         grid = bounding_grid(low, high, self.dx, margin)
-        if check and grid.node_count > self.max_nodes:
+        if grid.node_count > self.max_nodes:
             size = [round(v, 3) for v in (high - low).tolist()]
             what = f"The particles span {size} m"
             if 2 * margin * self.dx > max(size):
@@ -290,6 +290,11 @@ class MPMSolver(nn.Module):
             raise ValueError(
                 f"{what}, which takes {grid.node_count:,} grid nodes at dx = {self.dx:g} m, more "
                 f"than `max_nodes` = {self.max_nodes:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
+            )
+        if max(map(abs, grid.offset)) >= 2**31:
+            raise ValueError(
+                f"The particles lie up to {float(flat.abs().amax()):.3g} m from the origin, more than 2^31 cells of dx "
+                f"= {self.dx:g} m: pin or enclose them, or shift the scene to the origin."
             )
         return grid
 
@@ -424,20 +429,26 @@ class MPMSolver(nn.Module):
 
         Returns:
             The state with its new grid.
+
+        Raises:
+            FloatingPointError: If a position or a speed is NaN or infinite.
+            ValueError: If the grid would be larger than ``max_nodes``.
         """
         if self.total_lagrangian:
             return state
         speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
+        if not math.isfinite(speed):
+            raise _not_finite("speed", state.velocity.detach().square().sum(-1).reshape(-1, 1))
         reach = (2 * speed + 0.5 * sum(g * g for g in self.gravity) ** 0.5 * horizon) * horizon
         cells = 3 + margin + min(int(reach / self.dx), 1000)
         grid = self._bounding_grid(state.position, cells, speed)
         if not state.position.is_cuda:
             return state.replace(grid=grid)
         # CUDA graphs are recorded for one grid, so it stays as long as it serves
-        serves = state.grid.holds(grid) and state.grid.node_count <= 3 * grid.node_count
+        roomy = grid.with_room(state.grid)
+        serves = state.grid.holds(grid) and state.grid.node_count <= 3 * roomy.node_count
         if serves and not margin:  # a margin is asked for where the grid did not serve
             return state
-        roomy = self._bounding_grid(state.position, cells + 4, speed, check=False)
         return state.replace(grid=roomy if roomy.node_count <= self.max_nodes else grid)
 
     def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:
@@ -765,6 +776,12 @@ def _tensors(state: MPMState) -> list[Tensor]:
     """The floating-point fields of a state."""
     fields = [state.position, state.velocity, state.affine, state.F_elastic, state.F_total, state.internal]
     return [t for t in (*fields, state.node_displacement, state.node_velocity) if t is not None]
+
+
+def _not_finite(name: str, values: Tensor) -> FloatingPointError:
+    """The error that names the first particle of which a value (P, ·) is NaN or infinite."""
+    first = int((~torch.isfinite(values)).any(-1).int().argmax())
+    return FloatingPointError(f"The {name} of particle {first} is NaN or infinite.")
 
 
 def _safe_inverse(mass: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -43,6 +44,22 @@ class GridSpec:
         )
         return self.dx == other.dx and all(inside)
 
+    def with_room(self, before: GridSpec) -> GridSpec:
+        """A larger grid that will serve for longer, where the nodes of this one are needed now.
+
+        There are four more cells on each side, and an eighth of the length where ``before`` did not reach far enough:
+        what goes on growing or flying that way needs a new grid the more rarely, the larger it is.
+
+        Args:
+            before: The grid so far.
+        """
+        offset, resolution = [], []
+        for a, n, b, m in zip(self.offset, self.resolution, before.offset, before.resolution, strict=True):
+            low, high = (max(4, n // 8) if outgrown else 4 for outgrown in (a < b, a + n > b + m))
+            offset.append(a - low)
+            resolution.append(n + low + high)
+        return GridSpec(self.dx, (offset[0], offset[1], offset[2]), (resolution[0], resolution[1], resolution[2]))
+
     def node_positions(self, like: Tensor) -> Tensor:
         """Positions of the nodes [m], shape (G, 3), with the type and device of ``like``."""
         axes = [
@@ -64,10 +81,11 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
     Returns:
         The grid.
     """
-    first = torch.floor(low.double().cpu() / dx - 0.5).long() - margin
-    last = torch.floor(high.double().cpu() / dx - 0.5).long() + 2 + margin
-    offset, resolution = first.tolist(), (last - first + 1).tolist()
-    return GridSpec(dx, (offset[0], offset[1], offset[2]), (resolution[0], resolution[1], resolution[2]))
+    # numbers of Python, which do not overflow
+    first = [math.floor(x) - margin for x in (low.double() / dx - 0.5).tolist()]
+    last = [math.floor(x) + 2 + margin for x in (high.double() / dx - 0.5).tolist()]
+    size = [b - a + 1 for a, b in zip(first, last, strict=True)]
+    return GridSpec(dx, (first[0], first[1], first[2]), (size[0], size[1], size[2]))
 
 
 _DEFAULT: tuple[ConstitutiveLaw, ...] = (FixedCorotated(),)

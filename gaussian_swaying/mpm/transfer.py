@@ -89,8 +89,8 @@ def bspline_stencil(
 ) -> Stencil:
     r"""Quadratic B-spline weights and their gradients (Jiang et al. 2016, "The material point method", eq. 123).
 
-    A particle whose support reaches out of the grid is never wrapped to the far side: its weights are zero and
-    ``inside`` says so.
+    A particle whose support reaches out of the grid, or whose position is NaN or infinite, is never wrapped to the far
+    side: its weights are zero and ``inside`` says so.
 
     Args:
         position: Particle position [m], shape (..., P, 3).
@@ -120,13 +120,14 @@ def bspline_stencil(
     lattice = position.reshape(-1, 3).T / dx
     base = torch.floor(lattice.detach() - 0.5)
     f = lattice - base
+    offset, limit, strides, shift = _grid_constants(grid, position.device)
+    low = base.long() - offset
+    inside = ((low >= 0) & (low <= limit) & (f < 2)).all(0)  # NaN becomes any integer, and is not below anything
+    f = torch.where(inside, f, 1.0)
     if snap > 0:
         f = torch.where(f - 0.5 < snap, 0.5, torch.where(1.5 - f < snap, 1.5, f))
     w = torch.stack([0.5 * (1.5 - f).square(), 0.75 - (f - 1).square(), 0.5 * (f - 0.5).square()], dim=1)
 
-    offset, limit, strides, shift = _grid_constants(grid, position.device)
-    low = base.long() - offset
-    inside = ((low >= 0) & (low <= limit)).all(0)
     first = (torch.where(inside, low, 0) * strides).sum(0)
     if batch:
         scene = torch.arange(inside.numel(), device=position.device) // max(position.shape[-2], 1)

@@ -38,7 +38,8 @@ SCHEDULE = 4
 # Numbers that differ from body to body and from grid to grid. Triton would compile a kernel again for each of them that
 # becomes one or a multiple of 16, in the middle of a run, and even while a graph is recorded.
 VARIES = (
-    "count", "cells", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz", "nx", "ny", "nz",
+    "count", "cells", "pieces", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
+    "nx", "ny", "nz",
 )  # fmt: skip
 
 
@@ -212,7 +213,7 @@ def _wind_force(
     """Force of the wind on the patches of some particles and their resistance [kg/s]."""
     rest = _load3(patch, count, index, mask)
     area = tl.load(patch + 3 * count + index, mask, 0.0)
-    normal, area = deform_patch(F, rest, area)
+    normal, area = deform_patch(F, rest, area, tl.load(coefficients + 4))
     row = winds + (step * scenes + scene) * 3
     relative = (
         tl.load(row) - velocity[0],
@@ -361,6 +362,23 @@ def total_particles(
 
 
 @triton.jit(do_not_specialize=VARIES)
+def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """``total``: the sums of each cell from those of its pieces, always in the same order."""
+    o = tl.program_id(1)
+    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = cell < cells
+    first = tl.load(first_piece + cell, mask, 0)
+    many = tl.load(first_piece + cell + 1, mask, 0) - first
+    column = tl.arange(0, WIDTH)[None, :]
+    total = tl.zeros([BLOCK, WIDTH], tl.float32)
+    for k in range(0, tl.max(many)):
+        row = (o * (pieces + 1) + first + k) * WIDTH
+        total += tl.load(pieces_in + row[:, None] + column, (k < many)[:, None], 0.0)
+    out = (o * (cells + 1) + cell) * WIDTH
+    tl.store(partial + out[:, None] + column, total, mask[:, None])
+
+
+@triton.jit(do_not_specialize=VARIES)
 def total_nodes(
     active, source, inverse_mass, held, nodes, cells, partial, fields, shift,
     schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z,
@@ -471,7 +489,9 @@ def _locate(x, dx, o, n):
     lattice = tl.div_rn(x, dx + x * 0)
     base = tl.floor(lattice - 0.5)
     first = base.to(tl.int32) - o
-    return first, lattice - base, (first >= 0) & (first <= n - 3)
+    f = lattice - base
+    fits = (first >= 0) & (first <= n - 3) & (f < 2)  # NaN becomes any integer, and is not below anything
+    return first, tl.where(fits, f, 1.0), fits
 
 
 @triton.jit(do_not_specialize=VARIES)

@@ -564,6 +564,7 @@ class SimulationPipeline(nn.Module):
             "seed": self.wind.seed,
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
+            "simulated_gaussians": len(self.scene.simulated),
             "filled_particles": self.scene.filled,
             "mass_kg": float(self.solver.points.mass.sum()),
             "patch_area_m2": float(self.scene.patch_area.sum()),
@@ -601,8 +602,9 @@ class SimulationPipeline(nn.Module):
 class _Walls:
     """Seconds spent in each part of the run.
 
-    Startup: on a GPU, a first frame that is thrown away, with which kernels are loaded and compiled. Simulation, shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the
-    host need not wait there. Writing: how long the main thread was kept by the recorder, not what its threads did
+    Startup: on a GPU, a first frame that is thrown away, with which kernels are loaded and compiled. Simulation,
+    shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the host need not
+    wait there. Writing: how long the main thread was kept by the recorder, not what its threads did
     meanwhile.
     """
 

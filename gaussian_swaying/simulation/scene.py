@@ -18,6 +18,7 @@ from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
     deform_all,
+    limit_stretch,
 )
 from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
@@ -101,6 +102,12 @@ class Scene:
         filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
         wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
             those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
+        max_stretch: How many times its size at rest a Gaussian is drawn at most (see
+            :func:`~gaussian_swaying.gaussians.surface.limit_stretch`), in pictures and exports; null for no limit,
+            which suits what is elastic. Without one, material that flows is drawn as streaks.
+        layers: Layers of material points through the thickness: 1, a membrane that folds without resistance, or 3,
+            which resists bending as a plate does (the Gaussians in the middle plane, two more points at the faces of
+            the sheet, weights of Simpson's rule). Three times the points.
     """
 
     def __init__(
@@ -116,6 +123,8 @@ class Scene:
         area: str = "coverage",
         filling: InteriorFilling | None = None,
         wind_on: str = "surface",
+        max_stretch: float | None = None,
+        layers: int = 1,
     ) -> None:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
@@ -124,12 +133,22 @@ class Scene:
             raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
         if not 0 <= opacity_threshold < 1:
             raise ValueError(f"Expected `scene.opacity_threshold` to lie in [0, 1), but got {opacity_threshold}.")
+        if max_stretch is not None and not max_stretch > 1:
+            raise ValueError(
+                f"Expected `scene.max_stretch` to be above 1, or null for no limit, but got {max_stretch}."
+            )
+        if layers not in (1, 3):
+            raise ValueError(f"Expected `scene.layers` to be 1 or 3, but got {layers}.")
+        if layers > 1 and filling is not None:
+            raise ValueError("Expected `scene.layers` 1 with `scene.filling`: a solid resists bending by itself.")
         if ply is None and generator is None:
             raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
         self.ply, self.generator, self.region = ply, generator, region or Everything()
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
+        self.max_stretch = None if max_stretch is None else float(max_stretch)
+        self.layers = layers
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -139,12 +158,15 @@ class Scene:
         return self.generator.generate()
 
 
+_SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
+
+
 class SimulatedScene(nn.Module):
     """Gaussians, material points and patches of one scene, and how the first follow the second.
 
     Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
-    simulated one, static ones stay. The points that fill a solid are material only: no Gaussian belongs to them, and
-    their patch area is zero.
+    simulated one, static ones stay. The points that fill a solid, and those at the faces of a sheet of three layers,
+    are material only: no Gaussian belongs to them, and their patch area is zero.
 
     Args:
         scene: Where the Gaussians come from.
@@ -153,8 +175,8 @@ class SimulatedScene(nn.Module):
         dtype: Precision of the simulation.
 
     Attributes:
-        points: The material, for the solver: the simulated Gaussians in their order, then the filled points.
-        filled: Number of filled points.
+        points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
+        filled: Number of points within a solid.
         patch_normal: Unit normals of the points at rest in the z-up frame, shape (P, 3).
         patch_area: Their areas that feel the wind [m²], shape (P,).
         frame: Scene units to metres.
@@ -195,6 +217,7 @@ class SimulatedScene(nn.Module):
             mode = "coverage" if scene.area == "equal" else scene.area
             found = GaussianSurfaceModel.from_cloud(part, requires_grad=False).areas(mode)
             areas[group] = found.mean() if scene.area == "equal" and len(found) else found
+        self.max_stretch = scene.max_stretch
         self.register_buffer("simulated", simulated)
         carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
         self.register_buffer("carried", carried)
@@ -209,6 +232,7 @@ class SimulatedScene(nn.Module):
             position = torch.cat([position, filling.position])
             facing = torch.cat([facing, torch.tensor([[0.0, 0.0, 1.0]]).to(facing).expand(self.filled, 3)])
             body_area, area = (torch.cat([part, part.new_zeros(self.filled)]) for part in (body_area, area))
+        facing_patch = facing
         self.register_buffer("patch_normal", facing.to(dtype))
         self.register_buffer("patch_area", area.to(dtype))
         # what every picture would otherwise compute again
@@ -254,6 +278,16 @@ class SimulatedScene(nn.Module):
                 volume = torch.where(solid > 0, solid, volume)
         else:
             volume = cell_volume(position, dx).to(dtype)
+        if scene.layers == 3:
+            if material.volume != "patch":
+                raise ValueError('Expected `material.volume` "patch" with `scene.layers` 3: layers share a thickness.')
+            out = 0.5 * fields["thickness"][:, None].to(position) * facing_patch
+            position = torch.cat([position, position + out, position - out])
+            volume = torch.cat([part * volume for part in _SIMPSON])
+            fields = {name: value.repeat(3) for name, value in fields.items()}
+            law_index = law_index.repeat(3)
+            self.patch_normal = torch.cat([self.patch_normal] * 3)
+            self.patch_area = torch.cat([self.patch_area, self.patch_area.new_zeros(2 * count)])
         self.points = MaterialPoints.create(
             position.to(dtype),
             volume=volume,
@@ -283,6 +317,8 @@ class SimulatedScene(nn.Module):
     def deformed(self, state: MPMState, rotations: bool = True) -> DeformedGaussians:
         """The Gaussians where the material has taken them: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
 
+        Where the scene has a ``max_stretch``, covariances keep to it.
+
         Args:
             state: State of one scene, fields of shape (P, ·).
             rotations: Whether to compute the rotations; otherwise they are those of rest, which is enough for colours
@@ -301,18 +337,27 @@ class SimulatedScene(nn.Module):
             turned = (near * self.arm[:, None, :]).sum(-1) - self.arm  # a difference, so that nothing moves at rest
             move, F = torch.cat([move, move[self.anchor] + turned]), torch.cat([F, near])
         if self.all_move:
-            covariances, normals, turns = deform_all(F, rest.covariances, rest.normals, rotations)
+            covariances, normals, turns = self._deform(F, rest.covariances, rest.normals, rotations)
             return DeformedGaussians(
                 rest.means + move, covariances, normals, rest.rotations if turns is None else turns
             )
         index = self.moving
-        covariances, normals, turns = deform_all(F, rest.covariances[index], rest.normals[index], rotations)
+        covariances, normals, turns = self._deform(F, rest.covariances[index], rest.normals[index], rotations)
         return DeformedGaussians(
             rest.means.index_add(0, index, move),
             rest.covariances.index_copy(0, index, covariances),
             rest.normals.index_copy(0, index, normals),
             rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
         )
+
+    def _deform(
+        self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """``deform_all`` and the limit of the scene."""
+        deformed, normals, turns = deform_all(F, covariances, normals, rotations)
+        if self.max_stretch is not None:
+            deformed = limit_stretch(deformed, covariances, self.max_stretch)
+        return deformed, normals, turns
 
     def on_gaussians(self, values: Tensor) -> Tensor:
         """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.

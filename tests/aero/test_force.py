@@ -1,9 +1,11 @@
 """The wind law against its closed forms and symmetries."""
 
+import math
+
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce, aero_force, drag_rate
+from gaussian_swaying.aero.force import AeroForce, aero_force, capped_area, drag_rate
 
 RHO = 1.225
 
@@ -182,11 +184,23 @@ def test_drag_rate_is_the_slope_of_the_force():
         ({"C_D": -0.1}, "`C_D` to not be negative"),
         ({"air_density": -1.0}, "`air_density` to not be negative"),
         ({"C_L": float("nan")}, "`C_L` to be finite"),
+        ({"max_area_ratio": 0.0}, "`max_area_ratio` to be positive, or null"),
+        ({"max_area_ratio": -1.0}, "`max_area_ratio` to be positive, or null"),
+        ({"max_area_ratio": float("nan")}, "`max_area_ratio` to be positive, or null"),
     ],
 )
 def test_bad_settings_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         AeroForce(**arguments)
+
+
+def test_the_area_in_the_wind_is_capped():
+    """At so many times that at rest; below, and without a cap, it is what it is."""
+    rest, area = torch.tensor([1.0, 2.0, 0.0, 3.0]), torch.tensor([1.5, 9.0, 0.0, 0.1])
+    assert capped_area(area, rest, 2.0).tolist() == pytest.approx([1.5, 4.0, 0.0, 0.1])
+    assert torch.equal(capped_area(area, rest, math.inf), area)
+    assert AeroForce().max_area_ratio == AeroForce(max_area_ratio=None).max_area_ratio == math.inf
+    assert AeroForce(max_area_ratio=1).max_area_ratio == 1.0
 
 
 def test_shapes_are_checked():

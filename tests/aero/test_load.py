@@ -64,6 +64,46 @@ def test_force_is_that_on_the_deformed_patches(drag_step):
     assert torch.equal(now, load.force(state, GUSTS(state.time))[0])
 
 
+@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
+def test_the_area_of_what_has_flowed_is_capped(drag_step):
+    """Shear without end: the normal turns, the force stays that on so many times the area at rest."""
+    _, state, free = _setting(drag_step=drag_step)
+    load = WindLoad(AeroForce(drag_step=drag_step, max_area_ratio=1.5), GUSTS, free.normal, free.area)
+    wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
+    F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+    F[:10, 0, 1] = 3e4
+    F[10:15, 0, 0] = 1.2
+    state = state.replace(F_total=F)
+    normal, area = deform_patch(F, free.normal, free.area)
+    growth = area / free.area
+    assert float(growth[:10].min()) > 1.5 > float(growth[10:].max())
+    force, resistance = load.force(state, wind)
+    capped = torch.cat([1.5 * free.area[:10], area[10:]])
+    torch.testing.assert_close(force, load.aero(wind, state.velocity, normal, capped))
+    if drag_step == "semi_implicit":
+        torch.testing.assert_close(resistance, load.aero.resistance(wind, state.velocity, capped))
+    torch.testing.assert_close(force[10:], free.force(state, wind)[0][10:])
+    assert float((force[:10] - free.force(state, wind)[0][:10]).abs().max()) > 1.0
+
+
+def test_gradients_through_a_capped_area_are_finite():
+    """Also where the patch stands exactly at the cap; in F only the direction of the normal is left above it."""
+    _, state, free = _setting()
+    load = WindLoad(AeroForce(max_area_ratio=1.0), GUSTS, free.normal, free.area)
+    F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+    F[:10, 0, 1] = 3e4
+    F.requires_grad_()
+    force, _ = load.force(state.replace(F_total=F), torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64))
+    (found,) = torch.autograd.grad(force.square().sum(), F)
+    assert bool(torch.isfinite(found).all())
+    assert float(found.abs().amax()) > 0
+    scaled = F.detach()[:10].requires_grad_()
+    size = load.force(state.replace(F_total=torch.cat([scaled, F.detach()[10:]])), load.winds(state.time, 0.0, 1)[0])
+    (slope,) = torch.autograd.grad(size[0][:10].square().sum(), scaled)
+    # growth of F as a whole turns no normal, so the force does not see it
+    assert float((slope * scaled.detach()).sum((-1, -2)).abs().max()) < 1e-9 * 3e4 * float(slope.abs().max())
+
+
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 @pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
 def test_a_rollout_in_the_wind_is_the_one_with_its_forces(formulation, drag_step):

@@ -18,6 +18,7 @@ from gaussian_swaying.gaussians.surface import (
     deform_covariance,
     deform_normal,
     deform_patch,
+    limit_stretch,
     quat_to_rotation,
     rotation_to_quat,
     smallest_axis_normal,
@@ -202,6 +203,37 @@ def test_the_kernel_is_the_one_that_is_asked(monkeypatch):
     assert deform_all(f[:0], f[:0], normal[:0])[2].shape == (0, 3, 3)
 
 
+def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
+    """Those below it keep their bits; those above have that size, and stay proper covariances."""
+    rest = torch.diag(torch.tensor([4.0, 1.0, 0.01])).expand(6, 3, 3).to(device, dtype)
+    f = torch.eye(3).repeat(6, 1, 1).to(device, dtype)
+    f[1, 0, 0] = 1.5
+    f[2, 1, 0] = 3.0
+    f[3, 1, 0] = 1e4
+    f[4] = 50 * torch.eye(3)
+    f[5] = 0.0
+    covariances = deform_covariance(f, rest)
+    limited = limit_stretch(covariances, rest, 2.0)
+    assert torch.equal(limited[[0, 1, 5]], covariances[[0, 1, 5]])
+    size = limited.diagonal(dim1=-2, dim2=-1).sum(-1)
+    torch.testing.assert_close(size[2:5], 4 * rest.diagonal(dim1=-2, dim2=-1).sum(-1)[2:5])
+    torch.testing.assert_close(limited, limited.mT)
+    values = torch.linalg.eigvalsh(limited[2:5])
+    assert float(values.min()) > 0.5  # of a rest size of 5.01, shared by three directions: no needle
+    assert float(values[1, 2]) == pytest.approx(3 * 5.01 + 5.01 / 3, rel=1e-2)  # what is drawn out points as before
+    axis = torch.linalg.eigh(limited[3])[1][:, 2]
+    assert float(axis[1].abs()) > 0.999
+
+
+def test_the_limit_on_stretch_is_reached_without_a_jump():
+    rest = torch.eye(3, dtype=torch.float64)
+    close = [
+        limit_stretch(torch.diag(torch.tensor([a, 1.0, 1.0], dtype=torch.float64)), rest, 2.0)
+        for a in (10.0 - 1e-9, 10.0 + 1e-9)
+    ]
+    torch.testing.assert_close(close[0], close[1], rtol=0, atol=1e-7)
+
+
 def test_gradcheck(device):
     f = _gradients(20, device)[:4].requires_grad_()
     normal = _unit(4, 3, device=device).requires_grad_()
@@ -239,6 +271,8 @@ def test_patch_area_takes_the_two_larger_scales(device, dtype):
         (lambda z: covariance_to_quat_scale(z(2, 3)), "covariances"),
         (lambda z: deform_covariance(z(2, 9), z(2, 3, 3)), "deformation_gradient"),
         (lambda z: deform_covariance(z(2, 3, 3), z(2, 6)), "covariances"),
+        (lambda z: limit_stretch(z(2, 6), z(2, 3, 3), 2.0), "covariances"),
+        (lambda z: limit_stretch(z(2, 3, 3), z(2, 6), 2.0), "rest"),
         (lambda z: deform_normal(z(2, 3, 3), z(2, 2)), "normals"),
         (lambda z: deform_area(z(2, 3), z(2, 3), z(2)), "deformation_gradient"),
         (lambda z: patch_area(z(2, 2)), "log_scales"),

@@ -172,6 +172,21 @@ def test_a_run_with_known_errors(make_run, make_reference):
     assert found["worst"]["ssim"] == min(row["ssim"] for row in found["per_frame"])
 
 
+def test_points_without_a_gaussian_are_not_compared(make_run, make_reference):
+    """Those at the faces of a sheet come after the Gaussians; here they are far away."""
+    run, reference = make_run(), make_reference()
+    before = compare_run(run, reference)["mean"]["chamfer_m"]
+    arrays = dict(np.load(run / "trajectory.npz"))
+    count = len(arrays["position_00000"])
+    for name in arrays:
+        arrays[name] = np.concatenate([arrays[name], arrays[name] + 100.0])
+    np.savez(run / "trajectory.npz", **arrays)
+    assert compare_run(run, reference)["mean"]["chamfer_m"] > 10.0
+    summary = json.loads((run / "summary.json").read_text())
+    (run / "summary.json").write_text(json.dumps(summary | {"simulated_gaussians": count}))
+    assert compare_run(run, reference)["mean"]["chamfer_m"] == before
+
+
 def test_the_side_given_holds(make_run, make_reference):
     run, reference = make_run(), make_reference()
     assert compare_run(run, reference, points=100)["chamfer_share"] is None

@@ -13,6 +13,7 @@ import weakref
 import pytest
 import torch
 
+from gaussian_swaying import _graphs
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import FlowKey, WindField
@@ -30,6 +31,7 @@ from gaussian_swaying.mpm.boundary import (
 )
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
 
 try:
     from gaussian_swaying.mpm import fused
@@ -259,9 +261,13 @@ def test_crushed_and_inverted_particles(kernel_device, formulation):
     indirect=["kernel_device"],
     ids=str,
 )
-def test_cells_of_any_size(kernel_device, case, monkeypatch):
-    """Several chunks of lanes, or warps, for one cell; cells without a particle between others."""
+@pytest.mark.parametrize("programs", [1, 2048])
+def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
+    """Several chunks of lanes, pieces or warps for one cell; cells without a particle between others."""
     formulation, sizes = case
+    if formulation == "updated" and programs > 1:
+        pytest.skip("only `total` cuts cells")
+    monkeypatch.setattr(fused, "_PROGRAMS", programs)
     if len(sizes) > 2:
         monkeypatch.setattr(fused, "_lanes", lambda sizes: 64)
     generator = torch.Generator().manual_seed(7)
@@ -279,6 +285,20 @@ def test_every_number_of_lanes(lanes, monkeypatch):
     pytest.importorskip("triton")
     monkeypatch.setattr(fused, "_lanes", lambda sizes: lanes)
     _agree(_wind_case(_points("cuda", count=300), "total"))
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypatch):
+    """200 particles in a cell and 10 in the next, by 32 lanes."""
+    monkeypatch.setattr(fused, "_lanes", lambda sizes: 32)
+    generator = torch.Generator().manual_seed(2)
+    place = 0.52 + 0.96 * torch.rand(210, 3, generator=generator)
+    place[200:, 2] += 1
+    for programs, pieces in ((2048, 7 + 1), (3, 3 + 1), (1, 2)):
+        monkeypatch.setattr(fused, "_PROGRAMS", programs)
+        solver = MPMSolver(DX, formulation="total", transfer="triton")
+        solver.init_state(_body((place * DX).to(kernel_device)))
+        assert solver.fused().pieces == pieces
 
 
 def test_the_number_of_lanes_suits_the_cells(monkeypatch):
@@ -369,6 +389,7 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
     _on(
         {"drag_step": "semi_implicit"},
         {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        {"max_area_ratio": 0.9},
         interpreted=[{"law": "projected"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
     ),
     indirect=["kernel_device"],
@@ -377,6 +398,22 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_every_kind_of_wind(kernel_device, formulation, settings):
     _agree(_wind_case(_points(kernel_device), formulation, aero=settings))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_the_cap_on_the_area_acts(kernel_device, formulation):
+    """And it is taken anew in each rollout, where a recorded graph holds what it reads and not its value."""
+    points = _points(kernel_device)
+    free, capped = _load(points), _load(points, max_area_ratio=0.5)
+    solver = _solver("triton", formulation)
+    start = _start(solver, points)
+    ends = [solver.rollout(start, DT, 1, load) for load in (free, capped, free, capped, free)]
+    for k in (2, 3, 4):
+        if formulation == "total":
+            assert torch.equal(ends[k].velocity, ends[k - 2].velocity)
+    gained = [float((end.work - start.work).abs()) for end in ends]
+    assert gained[1] < 0.9 * gained[0]
+    assert gained[2:] == pytest.approx(gained[:3], rel=1e-5)
 
 
 @pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
@@ -699,6 +736,144 @@ def test_a_grid_that_comes_back(kernel_device):
     larger = GridSpec(DX, (-8, -8, -8), (20, 20, 20))  # needs other buffers
     for grid in (larger, near):
         _agree([solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers])
+
+
+class _Played:
+    """A recorded work that can be played back without a GPU."""
+
+    def __init__(self, work):
+        self.replay = work
+
+    def pool(self):
+        return None
+
+    def reset(self):
+        del self.replay
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
+    """Over a hundred grids, of substeps that do nothing but count themselves."""
+    alive, substeps = weakref.WeakSet(), []
+
+    def record(device, work, pool, stream):
+        graph = _Played(work)
+        alive.add(graph)
+        return graph
+
+    for place, name, value in (
+        (_graphs, "record", record),
+        (torch.cuda, "Stream", lambda device: None),
+        (torch.cuda, "synchronize", lambda device: None),
+        (torch.cuda, "empty_cache", lambda: None),
+        (fused.FusedUpdated, "_load", lambda self, state: None),
+        (fused.FusedUpdated, "_particles", lambda self, *more, **options: None),
+        (fused.FusedUpdated, "_nodes", lambda self, offset, options: substeps.append(offset)),
+        (fused.FusedUpdated, "_read", lambda self, state: {}),
+    ):
+        monkeypatch.setattr(place, name, value)
+    points, solver = _points(kernel_device, count=4), _solver("triton")
+    state = solver.init_state(points)
+    solver.fused().repeater = _graphs.Repeater(torch.device("cuda"))
+    for k in range(100):  # some of one size, some that need other buffers
+        grid = GridSpec(DX, (-2, -2, -2 - k % 3), (8, 8, 8 + k))
+        for recorded in (0, 3, 3):
+            solver.rollout(state.replace(grid=grid), DT, 22)
+            assert len(alive) == recorded
+    assert len(substeps) == 100 * 3 * 22
+
+
+def _cloud(count, seed=8):
+    """Particles of a box of half a metre."""
+    return _body(0.5 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)).cuda(), youngs_modulus=0.01)
+
+
+@pytest.mark.gpu
+def test_grids_that_grow_take_the_memory_of_the_largest():
+    """Two hundred grids of up to 2.7 million nodes, each with graphs of its own.
+
+    At most there are the buffers and the graphs' memory of the largest, the same of the grid before, and the
+    temporaries of the substeps that were not recorded: three times what the largest takes alone.
+    """
+    pytest.importorskip("triton")
+    points = _cloud(500)
+    planes = [Plane([0.0, 0.0, -0.2], [0.0, 0.0, 1.0]), EnclosingBox([-9.0] * 3, [9.0] * 3)]
+
+    def most_reserved(sizes):
+        solver = MPMSolver(dx=0.02, formulation="updated", transfer="triton", boundaries=planes)
+        state, most = solver.init_state(points), 0
+        for size in sizes:
+            state = state.replace(grid=GridSpec(0.02, (-20, -20, -20), (size, size, size)))
+            for _ in range(2):
+                state = solver.rollout(state, 1e-5, 7)
+                most = max(most, torch.cuda.memory_reserved())
+            assert sum(map(len, solver.fused().repeater._graphs.values())) == 2  # of four substeps and of one
+        assert not state.lost.any()
+        return most
+
+    gc.collect()
+    torch.cuda.empty_cache()
+    before = torch.cuda.memory_reserved()
+    alone = most_reserved([140]) - before
+    torch.cuda.empty_cache()
+    assert alone > 2.7e6 * 60  # bytes; or there is nothing to be seen
+    assert most_reserved([*range(60, 140), *range(140, 60, -1), *range(101, 141)]) - before < 3 * alone
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("flight", ["drifts", "expands"])
+def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
+    """Its grid moves or grows over a hundred frames, far less often than once a frame."""
+    pytest.importorskip("triton")
+    points = _cloud(500)
+    solver = MPMSolver(
+        dx=0.02, formulation="updated", transfer="triton", gravity=(0, 0, 0),
+        boundaries=[Plane([0.0, 0.0, -99.0], [0.0, 0.0, 1.0])],
+    )  # fmt: skip
+    centre = points.position.mean(0)
+    velocity = torch.ones_like(points.position) if flight == "drifts" else 3 * (points.position - centre)
+    state = solver.init_state(points, velocity)
+    torch.cuda.empty_cache()
+    before, grids, most = torch.cuda.memory_reserved(), [], 0
+    for _ in range(100):
+        state = solver.fit_grid(state, 0.02)
+        grids.append(state.grid)
+        state = solver.rollout(state, 1e-3, 20)
+        most = max(most, torch.cuda.memory_reserved() - before)
+        assert sum(map(len, solver.fused().repeater._graphs.values())) <= 3
+    assert not state.lost.any()
+    assert 1 < len(set(grids)) < 40
+    # some fifty numbers of four bytes a node in buffers and temporaries, three times over, and PyTorch's blocks
+    assert most < 600 * max(grid.node_count for grid in grids) + 2e8
+
+
+BROKEN = [("position", math.nan), ("position", math.inf), ("position", 1e30), ("velocity", math.nan)]
+BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
+
+
+@pytest.mark.parametrize(("name", "value"), BROKEN)
+@pytest.mark.parametrize("transfer", ["torch", "triton"])
+def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
+    """Within recorded substeps too, and the device goes on to serve."""
+    points, steps = _points(kernel_device), 9 if kernel_device.type == "cuda" else 2
+    solver = _solver(transfer, boundaries=[Plane([0.0, 0.0, -0.1], [0.0, 0.0, 1.0])])
+    start = solver.fit_grid(_start(solver, points, strain=0.02), 0.04)
+    end = good = solver.rollout(start, DT, steps)  # as it is, then recorded
+    broken = getattr(start, name).clone()
+    broken[5, 1] = value
+    with torch.no_grad():
+        for _ in range(2):
+            end = solver.rollout(start.replace(**{name: broken}), DT, steps)
+    with pytest.raises(SimulationDiverged, match=r"particle .* (NaN or infinite|left the grid|object sizes)") as found:
+        check_state(solver, end)
+    if name == "position":  # it has touched nobody
+        assert found.value.particle == 5
+        assert end.lost.tolist() == [k == 5 for k in range(24)]
+        assert bool(torch.isfinite(end.velocity).all())
+    with pytest.raises((FloatingPointError, ValueError)):
+        solver.fit_grid(end, 0.04)
+    again = solver.rollout(start, DT, steps)  # nothing is left over
+    _agree([good, again], tolerance=1e-4 if kernel_device.type == "cuda" else TOLERANCE)
 
 
 # ---- the Courant number

@@ -236,6 +236,50 @@ def test_a_grid_holds_what_lies_within_it():
         assert not grid.holds(other)
 
 
+def test_room_lies_where_a_grid_was_outgrown():
+    before = GridSpec(0.1, (0, 0, 0), (40, 40, 40))
+    needed = GridSpec(0.1, (2, -1, 0), (80, 30, 40))
+    roomy = needed.with_room(before)
+    assert roomy == GridSpec(0.1, (2 - 4, -1 - 4, -4), (4 + 80 + 10, 4 + 30 + 4, 4 + 40 + 4))
+    assert roomy.holds(needed)
+
+
+def test_what_flies_on_needs_a_new_grid_the_more_rarely_the_farther_it_is():
+    """One side moves by 5 cells a frame, from 50 cells to 2050, or 41 times as many, which is 1.125 to the power 32."""
+    grid, grids = GridSpec(0.1, (0, 0, 0), (50, 20, 20)), set()
+    for frame in range(401):
+        needed = GridSpec(0.1, (0, 0, 0), (50 + 5 * frame, 20, 20))
+        if not grid.holds(needed):
+            grid = needed.with_room(grid)
+        grids.add(grid)
+    assert 20 < len(grids) < 2 * 32
+    assert grid.node_count < 1.2 * GridSpec(0.1, (0, 0, 0), (2050 + 8, 20 + 8, 20 + 8)).node_count
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "match"),
+    [
+        ("position", float("nan"), FloatingPointError, "The position of particle 7 is NaN or infinite"),
+        ("position", float("-inf"), FloatingPointError, "The position of particle 7 is NaN or infinite"),
+        ("position", 1e25, ValueError, "more than `max_nodes`"),
+        ("velocity", float("nan"), FloatingPointError, "The speed of particle 7 is NaN or infinite"),
+        ("velocity", 1e30, FloatingPointError, "The speed of particle 7 is NaN or infinite"),  # its square is
+        ("velocity", 1e15, ValueError, "may fly .* more than `max_nodes`"),
+    ],
+)
+def test_no_grid_for_what_is_not_finite_or_too_far(device, name, value, kind, match):
+    points = _block(dtype=torch.float32, device=device)
+    solver = MPMSolver(dx=0.1, formulation="updated")
+    state = solver.init_state(points)
+    broken = getattr(state, name).clone()
+    broken[7, 1] = value
+    with pytest.raises(kind, match=match):
+        solver.fit_grid(state.replace(**{name: broken}), 0.04)
+    far = state.replace(position=state.position + 1e12)
+    with pytest.raises(ValueError, match=r"more than 2\^31 cells"):
+        solver.fit_grid(far, 0.04)
+
+
 @pytest.mark.gpu
 def test_a_grid_on_a_gpu_stays_while_it_serves():
     """CUDA graphs are recorded for one grid: a body that drifts slowly needs a new one now and then only."""

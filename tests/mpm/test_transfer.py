@@ -136,6 +136,28 @@ def test_bounding_grid_holds_every_stencil():
     assert not bool(bspline_stencil(position, smaller).inside.all())
 
 
+@pytest.mark.parametrize("offset", [(-3, -3, -3), (5, 5, 5)], ids=["around the origin", "beside it"])
+@pytest.mark.parametrize("moments", [False, True])
+def test_what_is_not_finite_or_far_away_indexes_nothing_and_weighs_nothing(device, dtype, offset, moments):
+    """NaN and infinity become any integer, perhaps that of a node; nothing of them may reach one."""
+    grid = GridSpec(0.1, offset, (8, 9, 10))
+    start = torch.tensor(offset, dtype=dtype, device=device)
+    good = 0.1 * (start + 2 + 4 * torch.rand(20, 3, dtype=dtype, device=device))
+    bad = good[:12].clone()
+    nan, inf, large = float("nan"), float("inf"), torch.finfo(dtype).max
+    values = [nan, inf, -inf, large, -large, 1e10, -1e10, 2.0**31, -(2.0**31), 2.0**63, -(2.0**63), 100.0]
+    bad[range(12), [k % 3 for k in range(12)]] = torch.tensor(values, dtype=dtype, device=device)
+    stencil = bspline_stencil(torch.cat([bad, good]), grid, moments)
+    assert stencil.inside.tolist() == [False] * 12 + [True] * 20
+    assert int(stencil.node.min()) >= 0
+    assert int(stencil.node.max()) < grid.node_count
+    assert int(stencil.factors[..., :12].count_nonzero()) == 0
+    coefficients = torch.rand(32, stencil.rows, 2, dtype=dtype, device=device)
+    expected = scatter(bspline_stencil(good, grid, moments), coefficients[12:])
+    torch.testing.assert_close(scatter(stencil, coefficients), expected)
+    assert int(gather(expected, stencil)[:12].count_nonzero()) == 0
+
+
 def test_p2g_gradcheck(device):
     inputs = [t.requires_grad_() for t in _particles(device, torch.float64, count=3)]
     assert torch.autograd.gradcheck(lambda x, m, v, c: p2g(m, v, c, bspline_stencil(x, GRID)), inputs, fast_mode=True)

@@ -49,6 +49,14 @@ def test_the_numbers_are_the_papers(name):
     assert (settings.camera.init_args.width, settings.camera.init_args.height) == (1920, 1080)
 
 
+@pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.yaml")))
+def test_what_flows_has_limits_and_what_is_elastic_has_none(name):
+    settings = build_parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
+    law = settings.material.law
+    flows = law is not None and law.class_path.endswith("Sand")
+    assert (settings.aero.max_area_ratio, settings.scene.max_stretch) == ((1.0, 2.0) if flows else (None, None))
+
+
 def test_the_wind_of_the_vase_turns():
     parser = build_parser()
     wind = parser.instantiate(parser.parse_args(files("vase"))).wind

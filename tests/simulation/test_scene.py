@@ -6,16 +6,28 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.gaussians.surface import limit_stretch
 from gaussian_swaying.mpm.linalg import polar_rotation
 from gaussian_swaying.mpm.materials import NeoHookean, Sand
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, cell_volume
+from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 
 LEFT = Box([None, None, None], [0.5, None, None])
 UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]
+
+
+class _Given(ProceduralScene):
+    """A splat as a scene."""
+
+    def __init__(self, cloud):
+        self.cloud = cloud
+
+    def generate(self):
+        return self.cloud
 
 
 def _rest_state(scene):
@@ -162,6 +174,23 @@ def test_pictures_follow_the_total_deformation(make_scene):
     assert torch.equal(scene.deformed(state.replace(F_elastic=F)).covariances, scene.rest_covariances)
 
 
+@pytest.mark.parametrize("settings", [{}, {"region": LEFT}])
+def test_gaussians_keep_to_the_stretch_of_the_scene(settings, make_cloud, make_scene):
+    """Whether all of them move or some, carried ones included; without a limit they follow F however far."""
+    cloud = _faint_cloud(make_cloud) if settings else None
+    free, limited = (make_scene(cloud, max_stretch=stretch, **settings) for stretch in (None, 1.5))
+    state = _rest_state(free)
+    F = torch.eye(3).repeat(free.points.count, 1, 1)
+    F[::2, 0, 1] = 1e3
+    state = state.replace(F_total=F)
+    rest = free.rest_covariances
+    drawn, kept = free.deformed(state).covariances, limited.deformed(state).covariances
+    torch.testing.assert_close(kept, limit_stretch(drawn, rest, 1.5))
+    growth = (kept.diagonal(dim1=-2, dim2=-1).sum(-1) / rest.diagonal(dim1=-2, dim2=-1).sum(-1)).sqrt()
+    assert float(growth.max()) == pytest.approx(1.5, rel=1e-4)
+    assert torch.equal(limited.deformed(_rest_state(limited)).covariances, rest)
+
+
 @pytest.mark.parametrize("metres_per_unit", [1.0, 0.5])
 def test_a_patch_weighs_density_times_area_times_thickness(make_scene, metres_per_unit):
     material = Material(density=30.0, thickness=0.02)
@@ -272,7 +301,8 @@ def test_bad_scenes():
         Scene()
     with pytest.raises(ValueError, match=r"material\.volume"):
         Material(volume="all")
-    for name, value in (("faint", "hide"), ("area", "disc"), ("opacity_threshold", 1.0), ("up", [0.0, 1.0])):
+    bad = [("faint", "hide"), ("area", "disc"), ("opacity_threshold", 1.0), ("up", [0.0, 1.0]), ("max_stretch", 1.0)]
+    for name, value in bad:
         with pytest.raises(ValueError, match=f"scene.{name}"):
             Scene(generator=flag, **{name: value})
 
@@ -281,3 +311,33 @@ def test_points_move_with_the_module(make_scene):
     scene = make_scene()
     scene.to(torch.float64)
     assert scene.points.position.dtype == scene.patch_area.dtype == torch.float64
+
+
+def test_three_layers_are_a_plate(make_cloud):
+    """The mass of one, and its moment about the middle plane: that of a plate of this thickness, h² / 12."""
+    cloud = make_cloud()
+    material = Material(thickness=0.03)
+    one, three = (SimulatedScene(Scene(generator=_Given(cloud), layers=n), material, 0.25) for n in (1, 3))
+    count = one.points.count
+    assert three.points.count == 3 * count
+    torch.testing.assert_close(three.points.mass.sum(), one.points.mass.sum())
+    height = ((three.points.position - one.points.position.repeat(3, 1)) * one.patch_normal.repeat(3, 1)).sum(-1)
+    assert torch.equal(three.points.position[:count], one.points.position)
+    moment = (three.points.mass * height.square()).sum() / three.points.mass.sum()
+    assert float(moment) == pytest.approx(0.03**2 / 12, rel=1e-4)
+    assert torch.equal(three.patch_area[:count], one.patch_area)  # the wind meets the sheet once
+    assert not bool(three.patch_area[count:].any())
+    assert len(three.deformed(_rest_state(three)).means) == len(cloud)
+
+
+@pytest.mark.parametrize(
+    ("scene", "material", "words"),
+    [
+        ({"layers": 2}, {}, "`scene.layers` to be 1 or 3"),
+        ({"layers": 3, "filling": InteriorFilling()}, {}, "`scene.filling`"),
+        ({"layers": 3}, {"volume": "cell"}, "`material.volume`"),
+    ],
+)
+def test_layers_that_do_not_fit(make_cloud, scene, material, words):
+    with pytest.raises(ValueError, match=words):
+        SimulatedScene(Scene(generator=_Given(make_cloud()), **scene), Material(**material), 0.25)

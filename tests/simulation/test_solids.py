@@ -238,8 +238,13 @@ def test_the_pair_of_the_experiment_differs_in_the_wind_alone(tmp_path):
 def test_settings_on_the_command_line(tmp_path, capsys):
     assert main([*SMALL, "--scene.filling.particles_per_cell", "8", "--output", str(tmp_path / "run")]) == 0
     assert "points fill the inside" in capsys.readouterr().out
-    for option, words in (("threshold", "filling.threshold"), ("treshold", "treshold")):
-        assert main([*SMALL, f"--scene.filling.{option}", "-1", "--output", str(tmp_path / "no")]) == 2
+    for option, words in (
+        ("scene.filling.threshold", "filling.threshold"),
+        ("scene.filling.treshold", "treshold"),
+        ("scene.max_stretch", "above 1, or null for no limit"),
+        ("aero.max_area_ratio", "positive, or null for no cap"),
+    ):
+        assert main([*SMALL, f"--{option}", "-1", "--output", str(tmp_path / "no")]) == 2
         error = capsys.readouterr().err
         assert words in error
         assert error.count("\n") == 1

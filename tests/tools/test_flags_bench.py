@@ -33,6 +33,7 @@ def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
             if name == "ours" and pattern > 1:
                 assert (settings.aero.C_D, settings.aero.C_F, settings.aero.law) == (DRAG[pattern], 0.0, "projected")
                 assert not settings.wind.modulations
+            assert settings.scene.layers == (1 if name in ("membrane", "particle", "no_surface") else 3)
             if name in ("particle", "no_surface"):
                 assert (0.0 if pattern == 1 else settings.aero.C_D) == settings.aero.C_F
             if name == "thin":  # the same sheet: E h and density h
@@ -107,7 +108,8 @@ def test_the_page_tells_what_was_and_what_was_not(flags):
     known = {"cells": 60, "quality": 16, "frames_compared": 250, "chamfer": 0.034}
     result["uncertainty"] = {"1": {"coarser": known}}
     text = "\n".join(flags.page([result]))
-    assert "| ours (`total`, dx = 0.02 m) | 2.13 % | 22.50 | - | - | stopped at frame 31 | 22.50 |" in text
+    ours = flags.VARIANTS["ours"].title
+    assert f"| {ours} | 2.13 % | 22.50 | - | - | stopped at frame 31 | 22.50 |" in text
     assert "| PhysGaussian's way | failed | - | - | - | - | - |" in text
     assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in text
     assert "| Gaussian Swaying | 21.44 | 0.0178 |" in text
