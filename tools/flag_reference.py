@@ -80,6 +80,7 @@ class FlagPattern:
         frames: Number of frames, of which the first is the rest shape; paper.
         fps: Frames a second; paper.
         self_collision: Whether the cloth keeps away from itself.
+        bending: Bending stiffness as a share of that of a plate.
     """
 
     youngs_modulus: float
@@ -104,6 +105,7 @@ class FlagPattern:
     frames: int = 250
     fps: int = 25
     self_collision: bool = False
+    bending: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the fields.
@@ -114,7 +116,7 @@ class FlagPattern:
         for name in ("youngs_modulus", "density", "thickness", "width", "height", "corner"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"Expected `{name}` to be positive and finite, but got {getattr(self, name)}.")
-        for name in ("ripple", "gravity", "air_density", "drag", "damping"):
+        for name in ("ripple", "gravity", "air_density", "drag", "damping", "bending"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"Expected `{name}` not to be negative, but got {getattr(self, name)}.")
         for name, least in (("cells", 2), ("quality", 1), ("frames", 2), ("fps", 1)):
@@ -195,9 +197,12 @@ class FlagPattern:
 
     def material(self) -> ClothMaterial:
         """The sheet that a plate of this thickness is."""
-        bending = self.youngs_modulus * self.thickness**3 / (12 * (1 - self.poisson_ratio**2))
+        plate = self.youngs_modulus * self.thickness**3 / (12 * (1 - self.poisson_ratio**2))
         return ClothMaterial(
-            self.density * self.thickness, self.youngs_modulus * self.thickness, bending, air_rate=self.damping
+            self.density * self.thickness,
+            self.youngs_modulus * self.thickness,
+            self.bending * plate,
+            air_rate=self.damping,
         )
 
     def pressure(self) -> float:
@@ -214,6 +219,8 @@ class FlagPattern:
     def cloth_settings(self) -> dict[str, Any]:
         """All that the motion depends on."""
         own = {name: value for name, value in asdict(self).items() if name not in ("texture", "paper_drag")}
+        if own["bending"] == 1.0:  # as it was before there was a choice
+            del own["bending"]
         blender = blender_settings(self.grid(), self.material(), self.run())
         return own | {f"blender.{name}": value for name, value in blender.items()}
 
@@ -558,18 +565,21 @@ def difference(pattern: FlagPattern, a: Cloth, b: Cloth, every: int = 1, along: 
     }
 
 
-VARIANTS = ("steps doubled", "coarser", "finer")
+VARIANTS = ("steps doubled", "coarser", "finer", "hardly bending")
 
 
 def variants(pattern: FlagPattern, names: Iterable[str] = VARIANTS) -> dict[str, FlagPattern]:
     """The same flag with twice the steps, and on a mesh of three and of five quarters as many cells along a side.
 
+    The last is another flag, with a fiftieth of the bending stiffness on half as many cells: what bending does to it.
     Where the mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
     """
     coarser, finer = (replace(pattern, cells=times * pattern.cells // 4) for times in (3, 5))
+    slack = replace(pattern, cells=pattern.cells // 2, bending=0.02)
     table = {
         "steps doubled": replace(pattern, quality=2 * pattern.quality),
         "coarser": replace(coarser, quality=least_quality(coarser)),
         "finer": replace(finer, quality=least_quality(finer)),
+        "hardly bending": replace(slack, quality=least_quality(slack)),
     }
     return {name: table[name] for name in names}

@@ -44,7 +44,7 @@ class Variant:
 
 
 VARIANTS: dict[str, Variant] = {
-    "ours": Variant("ours (`total`, dx = 0.04 m, three layers)"),
+    "ours": Variant("ours (`total`, three layers)"),
     "particle": Variant("PhysGaussian's way", ("particle",)),
     "no_surface": Variant("no surface modelling", ("no_surface",), patterns=(2, 3)),
     "no_shading": Variant("no shading", ("no_shading",)),
@@ -299,6 +299,7 @@ def _psnr(row: Row | None) -> str:
 
 
 _GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB and share of the distance, against PhysGaussian's way
+_SLACK = "hardly bending"  # a variant of the reference that is another flag
 _SHARE = 0.03  # of the longer side, that Chamfer distances are to stay within
 
 
@@ -315,7 +316,7 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
         if ours is None:
             continue
         share = ours["chamfer_share"]
-        doubt = result.get("uncertainty", {}).get(str(pattern), {})
+        doubt = {n: v for n, v in result.get("uncertainty", {}).get(str(pattern), {}).items() if n != _SLACK}
         known = f" (reference itself: {100 * max(v['chamfer'] for v in doubt.values()):.2f} %)" if doubt else ""
         found.append(
             (
@@ -403,8 +404,14 @@ def page(recorded: list[Row]) -> list[str]:
                 f"{name} ({v['cells']} cells, {v['quality']} steps, {v['frames_compared']} frames) "
                 f"{100 * v['chamfer']:.2f} %"
                 for name, v in found.items()
+                if name != _SLACK
             ]
             lines.append(f"- pattern {pattern}: {', '.join(shown)}")
+            if _SLACK in found:
+                lines.append(
+                    f"- pattern {pattern}, the reference with a fiftieth of its bending stiffness: "
+                    f"{100 * found[_SLACK]['chamfer']:.2f} % from itself"
+                )
         for pattern, name in sorted(result.get("figures", {}).items()):
             lines += ["", f"![Pattern {pattern} at five times](pictures/{name})"]
         lines += ["", "### Time and memory", "", "| | particles | substeps | time a frame [ms] | device memory [GiB] |"]

@@ -304,14 +304,25 @@ def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, t
         "steps doubled": (30, 16),
         "coarser": (22, 8),
         "finer": (37, 8),
+        "hardly bending": (15, 8),
     }
     # the fake moves them alike; what is left is the ripple between the vertices of a coarser mesh, a (k face)^2 / 8
-    bound = 0.003 * (1.5 * 3 * math.pi / 22) ** 2 / 8 / 1.2
+    bound = 0.003 * (1.5 * 3 * math.pi / 15) ** 2 / 8 / 1.2
     assert all(row["chamfer"] <= 1.5 * bound for row in written["variants"].values())
     assert written["variants"]["steps doubled"]["chamfer"] == 0
-    assert calls == [8, 16, 8, 8]
+    assert calls == [8, 16, 8, 8, 8]
     tool.make_uncertainty(pattern, tmp_path, ["coarser"], lines.append, along=20)
-    assert len(calls) == 4
+    assert len(calls) == 5
+
+
+def test_bending_is_that_of_a_plate_unless_given(reference):
+    """Motions that were solved before there was a choice are still those of their settings."""
+    pattern = reference.PATTERNS[3]
+    assert pattern.material().bending == pytest.approx(3e3 * 0.01**3 / 12 / (1 - 0.3**2))
+    slack = reference.variants(pattern, ["hardly bending"])["hardly bending"]
+    assert slack.material().bending == pytest.approx(0.02 * pattern.material().bending)
+    assert "bending" not in pattern.cloth_settings()
+    assert slack.cloth_settings()["bending"] == 0.02
 
 
 # ---- cameras
