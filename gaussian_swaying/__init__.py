@@ -48,6 +48,7 @@ if TYPE_CHECKING:
         Plasticine,
         Sand,
         Snow,
+        SpringNetwork,
         StVKHencky,
     )
     from gaussian_swaying.mpm.solver import MPMSolver
@@ -106,6 +107,7 @@ _HOMES = {
         "Plasticine",
         "Sand",
         "Snow",
+        "SpringNetwork",
         "StVKHencky",
     ),
     "mpm.solver": ("MPMSolver",),
@@ -189,6 +191,7 @@ __all__ = [
     "Snow",
     "Sphere",
     "SplatTrainer",
+    "SpringNetwork",
     "StVKHencky",
     "TearingGauge",
     "TorchRenderer",

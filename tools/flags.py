@@ -58,6 +58,7 @@ VARIANTS: dict[str, Variant] = {
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), ("--solver.dx=0.02",)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
     "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
+    "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
     "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
     "thin": Variant("half the thickness, twice E and density", options=("--material.thickness=0.005",)),
     **{

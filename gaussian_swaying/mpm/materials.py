@@ -114,6 +114,25 @@ class NeoHookean(ConstitutiveLaw):
         return constitutive.neo_hookean_moduli(F, mu, lam)
 
 
+class SpringNetwork(ConstitutiveLaw):
+    """Elastic solid of springs that are linear in their length: cloth, as solvers of springs move it.
+
+    It stiffens in tension, where fixed corotated elasticity softens: a tenth and more apart at a stretch of 1.2.
+    """
+
+    def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
+        """See :func:`~gaussian_swaying.mpm.constitutive.spring_network_energy`."""
+        return constitutive.spring_network_energy(F, mu, lam)
+
+    def pk1(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:
+        """See :func:`~gaussian_swaying.mpm.constitutive.spring_network_pk1`."""
+        return constitutive.spring_network_pk1(F, mu, lam)
+
+    def moduli(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """See :func:`~gaussian_swaying.mpm.constitutive.spring_network_moduli`."""
+        return constitutive.spring_network_moduli(F, mu, lam)
+
+
 class StVKHencky(ConstitutiveLaw):
     """Elastic solid with an energy quadratic in the logarithmic stretches, the base of the plastic solids.
 

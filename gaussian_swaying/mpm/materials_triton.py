@@ -43,8 +43,9 @@ VON_MISES = tl.constexpr(16)
 FOAM = tl.constexpr(32)
 SNOW = tl.constexpr(64)
 FLUID = tl.constexpr(128)
+NETWORK = tl.constexpr(256)
 PLASTIC_KINDS = tl.constexpr(8 + 16 + 32 + 64 + 128)
-SPECTRAL_KINDS = tl.constexpr(4 + 8 + 16 + 32 + 64 + 128)
+SPECTRAL_KINDS = tl.constexpr(4 + 8 + 16 + 32 + 64 + 128 + 256)
 
 
 def law_row(law: materials.ConstitutiveLaw) -> tuple[int, list[float]] | None:
@@ -56,6 +57,8 @@ def law_row(law: materials.ConstitutiveLaw) -> tuple[int, list[float]] | None:
         kind = NEO_HOOKEAN
     elif type(law) is materials.StVKHencky:
         kind = HENCKY
+    elif type(law) is materials.SpringNetwork:
+        kind = NETWORK
     elif type(law) is materials.Sand:
         kind, values = SAND, [cone_slope(law.friction_angle), 0.0 if law.internal is None else 1.0]
     elif type(law) is materials.Metal:
@@ -112,6 +115,35 @@ def _corotated(a, mu, lam):
 
 
 @triton.jit
+def _pull(x):
+    """(l - 1) / l of a spring from the square of its length, which goes on as its tangent when small."""
+    inside = tl.maximum(x, LOG_FLOOR * LOG_FLOOR)
+    root = tl.sqrt(inside)
+    return 1 + (x - inside) / (2 * inside) - 1 / root
+
+
+@triton.jit
+def _network(a, mu, lam):
+    """``constitutive._network_slope``."""
+    least = tl.maximum(tl.minimum(mu, lam), 0.0)
+    s0 = a[0] * a[0]
+    s1 = a[1] * a[1]
+    s2 = a[2] * a[2]
+    across0 = _pull((s1 + s2) / 2)
+    across1 = _pull((s0 + s2) / 2)
+    across2 = _pull((s0 + s1) / 2)
+    whole = 3.0 / 35 * _pull((s0 + s1 + s2) / 3)
+    pressure = (lam - least) * (a[0] + a[1] + a[2] - 3)
+    direct = 10.0 / 7 * least + 2 * (mu - least)
+    network = 15 * least
+    return (
+        direct * (a[0] - 1) + network * a[0] * (8.0 / 105 * (across1 + across2) + whole) + pressure,
+        direct * (a[1] - 1) + network * a[1] * (8.0 / 105 * (across0 + across2) + whole) + pressure,
+        direct * (a[2] - 1) + network * a[2] * (8.0 / 105 * (across0 + across1) + whole) + pressure,
+    )
+
+
+@triton.jit
 def _neo_hookean_pk1(F, mu, lam):
     """``constitutive.neo_hookean_pk1``."""
     cof = cofactor(F)
@@ -133,9 +165,11 @@ def _fluid_kirchhoff(F, mu, lam, gamma):
 @triton.jit
 def pk1(F, mu, lam, kind, KINDS: tl.constexpr):
     """First Piola-Kirchhoff stress of the elastic laws."""
-    if HENCKY & KINDS:
+    if (HENCKY & KINDS) or (NETWORK & KINDS):
         u, a, v = svd3(F)
         y = _hencky(a, mu, lam)
+        if NETWORK & KINDS:
+            y = where3(kind == NETWORK, _network(a, mu, lam), y)
         if FIXED_COROTATED & KINDS:
             y = where3(kind == FIXED_COROTATED, _corotated(a, mu, lam), y)
         stress = scaled_product(u, y, v)
@@ -156,6 +190,8 @@ def pk1(F, mu, lam, kind, KINDS: tl.constexpr):
 def principal_kirchhoff(a, mu, lam, internal, kind, p2, KINDS: tl.constexpr):
     """Principal Kirchhoff stresses of the laws that are functions of the stretches; fluids are not among them."""
     y = _hencky(a, mu, lam)
+    if NETWORK & KINDS:
+        y = where3(kind == NETWORK, _network(a, mu, lam), y)
     if (FIXED_COROTATED & KINDS) or (SNOW & KINDS):
         solid = kind == FIXED_COROTATED
         if SNOW & KINDS:
@@ -278,7 +314,7 @@ def kirchhoff(F, mu, lam, internal, kind, p0, p1, p2, dt, KINDS: tl.constexpr, F
         u, a, v = svd3(F)
         if FLOW and (PLASTIC_KINDS & KINDS):
             a, internal = return_map(a, mu, lam, internal, kind, p0, p1, p2, dt, KINDS)
-            F = where9(kind > HENCKY, scaled_product(u, a, v), F)
+            F = where9((kind > HENCKY) & (kind < NETWORK), scaled_product(u, a, v), F)
         stress = scaled_product(u, principal_kirchhoff(a, mu, lam, internal, kind, p2, KINDS), u)
         if NEO_HOOKEAN & KINDS:
             other = matmul(_neo_hookean_pk1(F, mu, lam), transpose(F))

@@ -58,7 +58,7 @@ class Material:
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it).
         law: Constitutive law, for example ``Sand``; fixed corotated elasticity if null. All but ``FixedCorotated``,
-            ``NeoHookean`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
+            ``NeoHookean``, ``SpringNetwork`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
         regions: Parts made of something else; later entries win.
     """
 

@@ -20,6 +20,8 @@ from gaussian_swaying.mpm.constitutive import (
     neo_hookean_energy,
     neo_hookean_pk1,
     snow_lame,
+    spring_network_energy,
+    spring_network_pk1,
     stvk_hencky_energy,
 )
 
@@ -90,7 +92,7 @@ def test_inverted_element_is_pushed_back():
 SNOW_VOLUME = torch.tensor(0.95, dtype=torch.float64)
 LAWS = {
     name: tuple(getattr(constitutive, f"{name}_{kind}") for kind in ("energy", "pk1", "kirchhoff"))
-    for name in ("fixed_corotated", "neo_hookean", "stvk_hencky", "fluid", "snow")
+    for name in ("fixed_corotated", "neo_hookean", "spring_network", "stvk_hencky", "fluid", "snow")
 }
 
 
@@ -240,6 +242,22 @@ def test_uniaxial_closed_forms():
     assert float(stress[0, 0]) == pytest.approx(mu * (s - 1 / s) + lam * log / s, rel=1e-12)
     assert float(stress[1, 1]) == pytest.approx(lam * log, rel=1e-12)
     assert float(stvk_hencky_energy(F, MU, LAM)) == pytest.approx((mu + 0.5 * lam) * log**2, rel=1e-12)
+
+
+def test_a_network_is_a_mean_over_springs():
+    """For Cauchy's solid, in which nothing else is, against the mean over many directions; and a lattice's tension."""
+    direction = torch.nn.functional.normalize(torch.randn(400_000, 3, dtype=torch.float64), dim=-1)
+    F = torch.diag(torch.tensor([1.25, 0.9, 1.05], dtype=torch.float64))
+    mean = ((direction @ F.mT).norm(dim=-1) - 1).square().mean()
+    energy = spring_network_energy(F, MU, MU)
+    # of the rule of degree 7: the next terms are of the sixth power of strains of 0.2; of the mean: 1 / sqrt(count)
+    assert float(energy) == pytest.approx(float(7.5 * MU * mean), rel=5e-3)
+    # a square lattice with diagonals at 18 % of stretch, free to contract: 1.059 times linear
+    F = torch.diag(torch.tensor([1.18, 0.9455, 0.9455], dtype=torch.float64))
+    stress = spring_network_pk1(F, MU, LAM)
+    assert abs(float(stress[1, 1])) < 1e-3 * float(E)
+    assert 1.05 < float(stress[0, 0]) / (0.18 * float(E)) < 1.12
+    assert float(fixed_corotated_pk1(F, MU, LAM)[0, 0]) < 0.95 * 0.18 * float(E)
 
 
 def test_fluid_pressure():

@@ -154,6 +154,7 @@ LAWS = [
     materials.FixedCorotated(),
     materials.NeoHookean(),
     materials.StVKHencky(),
+    materials.SpringNetwork(),
     materials.Sand(),
     materials.Sand(35.0, volume_correction=True),
     materials.Metal(2e2),
@@ -175,7 +176,7 @@ def _close(found, exact, what):
     assert bool((error <= 2e-5 * (size + what)).all()), f"{float((error / (size + what)).max()):.1e}"
 
 
-@pytest.mark.parametrize("law", LAWS[:3], ids=lambda law: type(law).__name__)
+@pytest.mark.parametrize("law", LAWS[:4], ids=lambda law: type(law).__name__)
 def test_elastic_stress(kernel_device, law):
     F = _matrices(kernel_device, unique=True)
     out = torch.empty_like(F)
@@ -189,7 +190,7 @@ def test_elastic_stress(kernel_device, law):
     assert bool(torch.isfinite(out).all())
 
 
-@pytest.mark.parametrize("k", range(3, len(LAWS)), ids=lambda k: f"{type(LAWS[k]).__name__} {k}")
+@pytest.mark.parametrize("k", range(4, len(LAWS)), ids=lambda k: f"{type(LAWS[k]).__name__} {k}")
 def test_flow_and_stress(kernel_device, k):
     """Stretches, internal variable and Kirchhoff stress after the return map; all plastic kinds at once on a GPU."""
     law = LAWS[k]

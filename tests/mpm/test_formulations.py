@@ -15,6 +15,7 @@ from gaussian_swaying.mpm.materials import (
     Plasticine,
     Sand,
     Snow,
+    SpringNetwork,
     StVKHencky,
 )
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -23,7 +24,7 @@ from gaussian_swaying.validation.flags import flag
 from gaussian_swaying.validation.settings import Settings
 
 FORMULATIONS = ["total", "updated"]
-ELASTIC = [FixedCorotated, NeoHookean, StVKHencky]
+ELASTIC = [FixedCorotated, NeoHookean, SpringNetwork, StVKHencky]
 PLASTIC = [
     Sand,
     lambda: Sand(volume_correction=True),

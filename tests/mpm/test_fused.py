@@ -49,6 +49,7 @@ WIND = WindField([5.0, 2.0, -1.0])
 ELASTIC = {
     "corotated": materials.FixedCorotated(),
     "neo-hookean": materials.NeoHookean(),
+    "springs": materials.SpringNetwork(),
     "hencky": materials.StVKHencky(),
 }
 PLASTIC = {

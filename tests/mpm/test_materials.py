@@ -18,12 +18,14 @@ from gaussian_swaying.mpm.materials import (
     Plasticine,
     Sand,
     Snow,
+    SpringNetwork,
     StVKHencky,
 )
 
 LAWS = {
     "fixed corotated": FixedCorotated(),
     "neo-Hookean": NeoHookean(),
+    "springs": SpringNetwork(),
     "Hencky": StVKHencky(),
     "sand": Sand(),
     "corrected sand": Sand(35.0, volume_correction=True),
@@ -53,7 +55,7 @@ def _internal(law, count, dtype=torch.float64, device="cpu"):
 def test_attributes():
     assert PLASTIC == ["sand", "corrected sand", "metal", "foam", "plasticine", "snow", "fluid"]
     values = [law.internal for law in LAWS.values()]
-    assert values == [None, None, None, None, 0.0, 0.0, None, 0.0, 1.0, None]
+    assert values == [None, None, None, None, None, 0.0, 0.0, None, 0.0, 1.0, None]
     assert all(isinstance(law, ConstitutiveLaw) for law in LAWS.values())
 
 
