@@ -109,4 +109,5 @@ def test_a_capture_takes_the_place_of_the_generated_splat(tmp_path):
     parser = build_parser()
     settings = parser.parse_args(["--config", str(CONFIGS / "flag2.yaml"), "--scene.ply", str(path), "--device", "cpu"])
     pipeline, _ = build_pipeline(parser, settings)
-    assert pipeline.scene.points.count == 96
+    assert len(pipeline.scene.simulated) == 96
+    assert pipeline.scene.points.count == 3 * 96  # three layers
