@@ -329,11 +329,16 @@ def _continued_root(x: Tensor) -> Tensor:
     return root + (x - inside) / (2 * root)
 
 
+def _spring_pull(square: Tensor) -> Tensor:
+    """Derivative of half the square of a spring's extension by half the square of its length l: (l - 1) / l."""
+    return (_continued_root(square) - 1) / square.clamp(min=LOG_LIMIT**2).sqrt()
+
+
 def _network_slope(a: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     """Derivative (..., 3) [Pa] of the energy of a network by the principal stretches (..., 3)."""
     least, shear, bulk = (part[..., None] for part in _network_parts(mu, lam))
     plane, space = _network_squares(a)
-    pull, whole = ((_continued_root(x) - 1) / x.clamp(min=LOG_LIMIT**2).sqrt() for x in (plane, space))
+    pull, whole = _spring_pull(plane), _spring_pull(space)
     others = pull.sum(-1, keepdim=True) - pull  # the two planes that hold an axis
     mean = 2 / 21 * (a - 1) + a * (8 / 105 * others + 3 / 35 * whole)
     return 15 * least * mean + 2 * shear * (a - 1) + bulk * (a.sum(-1, keepdim=True) - 3)
@@ -364,7 +369,7 @@ def spring_network_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, T
         a = spectrum(F.detach()).stretch
         least, shear, bulk = (part[..., None] for part in _network_parts(mu, lam))
         plane, space = _network_squares(a)
-        pull, whole = ((_continued_root(x) - 1) / x.clamp(min=LOG_LIMIT**2).sqrt() for x in (plane, space))
+        pull, whole = _spring_pull(plane), _spring_pull(space)
         # derivative of (l - 1) / l by half the square of the length l; none where the length is continued
         turn, spread = (torch.where(x < LOG_LIMIT**2, 0.0, x.clamp(min=LOG_LIMIT**2).pow(-1.5)) for x in (plane, space))
         others, turns = (x.sum(-1, keepdim=True) - x for x in (pull, turn))

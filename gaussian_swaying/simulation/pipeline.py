@@ -441,11 +441,11 @@ class SimulationPipeline(nn.Module):
                 )
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
-        if self.device.type == "cuda" and first < frames:
-            with walls("startup"):
-                self._warm_up(recorder, state, first)
         bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
         try:
+            if self.device.type == "cuda" and first < frames:
+                with walls("startup"):
+                    self._warm_up(recorder, state, first)
             for frame in range(first, frames):
                 with walls("simulation"):
                     if frame > 0:
@@ -604,8 +604,7 @@ class _Walls:
 
     Startup: on a GPU, a first frame that is thrown away, with which kernels are loaded and compiled. Simulation,
     shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the host need not
-    wait there. Writing: how long the main thread was kept by the recorder, not what its threads did
-    meanwhile.
+    wait there. Writing: how long the main thread was kept by the recorder, not what its threads did meanwhile.
     """
 
     def __init__(self, device: torch.device) -> None:

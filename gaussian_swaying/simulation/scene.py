@@ -232,7 +232,6 @@ class SimulatedScene(nn.Module):
             position = torch.cat([position, filling.position])
             facing = torch.cat([facing, torch.tensor([[0.0, 0.0, 1.0]]).to(facing).expand(self.filled, 3)])
             body_area, area = (torch.cat([part, part.new_zeros(self.filled)]) for part in (body_area, area))
-        facing_patch = facing
         self.register_buffer("patch_normal", facing.to(dtype))
         self.register_buffer("patch_area", area.to(dtype))
         # what every picture would otherwise compute again
@@ -281,7 +280,7 @@ class SimulatedScene(nn.Module):
         if scene.layers == 3:
             if material.volume != "patch":
                 raise ValueError('Expected `material.volume` "patch" with `scene.layers` 3: layers share a thickness.')
-            out = 0.5 * fields["thickness"][:, None].to(position) * facing_patch
+            out = 0.5 * (fields["thickness"][:, None] * self.patch_normal).to(position)
             position = torch.cat([position, position + out, position - out])
             volume = torch.cat([part * volume for part in _SIMPSON])
             fields = {name: value.repeat(3) for name, value in fields.items()}
