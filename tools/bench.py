@@ -141,7 +141,8 @@ def speed(options: argparse.Namespace) -> None:
 def sim(options: argparse.Namespace) -> None:
     """Measure the main job."""
     device, result = _start(options)
-    flag = ["--config", str(ROOT / "configs" / "sim" / "flag.yaml")]
+    more = options.more.split() if options.more else []
+    flag = ["--config", str(ROOT / "configs" / "sim" / "flag.yaml"), *more]
     result["runs"] = [run_sim("flag, 75 frames at 480x270", flag, device)]
     if options.ply:
         hanging = ["--config", str(ROOT / "configs" / "sim" / "hanging_object.yaml"), "--scene.ply", options.ply]
@@ -150,7 +151,7 @@ def sim(options: argparse.Namespace) -> None:
         )
         frames = ["--frames", str(options.frames)] if options.frames else []
         name = f"{Path(options.ply).stem}, {'1920x1080' if size else '960x540'}"
-        result["runs"].append(run_sim(name, [*hanging, *size, *frames], device))
+        result["runs"].append(run_sim(name, [*hanging, *size, *frames, *more], device))
         result["round_trip_psnr_db"] = round_trip_psnr(hanging[1], options.ply, device)
     _write(options, f"sim_{device.type}", result)
 
@@ -473,6 +474,7 @@ def main() -> None:
         if function is sim:
             command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
             command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")
+            command.add_argument("--more", help="further options of tools/sim.py, in quotes")
         if function is pictures:
             command.add_argument("--run", required=True, help="output folder of a run")
             command.add_argument("--name", required=True, help="name of the picture")
