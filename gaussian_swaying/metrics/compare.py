@@ -473,7 +473,8 @@ class _Surface:
         self.points, self.seed, self.device = points, seed, device
         self.frame = _sim_frame(run, summary)
         recorded = len(load_trajectory(self.trajectory, 0)[0])
-        self.particles = min(int(summary.get("simulated_gaussians") or recorded), recorded)  # others come after them
+        surface = summary.get("surface_particles") or summary.get("simulated_gaussians")
+        self.particles = min(int(surface or recorded), recorded)  # others come after them
         generator = torch.Generator().manual_seed(seed)
         self.chosen = torch.randperm(self.particles, generator=generator)[:points].sort().values
         others = surface_points(cloth.positions[first_reference], cloth.faces, len(self.chosen), seed + 1)

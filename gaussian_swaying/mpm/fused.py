@@ -20,9 +20,8 @@ from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.aero.load import RECORDED, WindLoad
 from gaussian_swaying.mpm import transfer_triton as kernels
 from gaussian_swaying.mpm.boundary import PinnedRegion
-from gaussian_swaying.mpm.materials import FixedCorotated
-from gaussian_swaying.mpm.materials_triton import PLASTIC_KINDS, law_row
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+from gaussian_swaying.mpm.materials_triton import PLASTIC_KINDS, energy_kind, law_row
+from gaussian_swaying.mpm.state import GridSpec, MPMState
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.solver import MPMSolver
@@ -88,7 +87,8 @@ class FusedSolver(ABC):
         self.coefficients = torch.zeros(5, device=self.device)
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
-        self.watches = _corotated(points)
+        self.energy_kind = energy_kind(points.laws)
+        self.watches = self.energy_kind > 0
         """Whether rollouts can look at the speed of waves."""
         self.speed = torch.zeros(1, device=self.device)
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
@@ -320,7 +320,7 @@ class FusedTotal(FusedSolver):
         block = 128
         kernels.total_look[(-(-self.count // block),)](
             self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
-            ny * nz, nz, 1 / self.grid.dx, BLOCK=block, num_warps=4,
+            ny * nz, nz, 1 / self.grid.dx, KIND=self.energy_kind, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
@@ -501,7 +501,9 @@ class FusedUpdated(FusedSolver):
 
     def _look(self) -> None:
         block = 128
-        kernels.updated_look[(-(-self.count // block),)](self.moving, self.count, self.speed, BLOCK=block, num_warps=4)
+        kernels.updated_look[(-(-self.count // block),)](
+            self.moving, self.count, self.speed, KIND=self.energy_kind, BLOCK=block, num_warps=4
+        )
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         self._nodes(offset, options)
@@ -583,7 +585,8 @@ class FusedUpdated(FusedSolver):
 def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     """Cells per second as ``MPMSolver`` needs them for the Courant number, in one kernel; None for other laws."""
     points, laws, spatial = solver.points, solver.laws, not solver.total_lagrangian
-    if not _corotated(points):
+    kind = energy_kind(points.laws)
+    if not kind:
         return None
     out = torch.zeros(1, device=points.position.device)
     count, block = points.mass.numel(), 128
@@ -591,27 +594,24 @@ def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     with torch.cuda.device_of(out):
         kernels.largest_speed[(-(-count // block),)](
             state.F_elastic.contiguous(), density.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(),
-            state.velocity.contiguous(), out, count, SPATIAL=spatial, BLOCK=block, num_warps=4,
+            state.velocity.contiguous(), out, count, KIND=kind, SPATIAL=spatial, BLOCK=block, num_warps=4,
         )  # fmt: skip
     return out[0] / solver.dx
 
 
 def elastic_energy(solver: MPMSolver, F: Tensor) -> Tensor | None:
-    """Energy density [J/m³] of a body of one fixed corotated law, shape (..., P); None for other laws."""
-    if not _corotated(solver.points):
+    """Energy density [J/m³] in one kernel, shape (..., P); None for other laws."""
+    kind = energy_kind(solver.points.laws)
+    if not kind:
         return None
     out = torch.empty(F.shape[:-2], device=F.device)
     block = 128
     with torch.cuda.device_of(out):
         kernels.elastic_energy[(-(-out.numel() // block),)](
-            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), BLOCK=block,
-            num_warps=4,
+            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), KIND=kind,
+            BLOCK=block, num_warps=4,
         )  # fmt: skip
     return out
-
-
-def _corotated(points: MaterialPoints) -> bool:
-    return [type(law) for law in points.laws] == [FixedCorotated]
 
 
 @contextmanager

@@ -257,6 +257,12 @@ def clamp(x, low, high):
 
 
 @triton.jit
+def largest(x, y):
+    """The larger of two numbers; NaN if one is."""
+    return tl.maximum(x, y, tl.PropagateNan.ALL)
+
+
+@triton.jit
 def largest_eigenvalue(m):
     """Largest eigenvalue of a symmetric matrix, as ``linalg.symmetric_eigenvalues``."""
     mean = (m[0] + m[4] + m[8]) / 3

@@ -5,6 +5,7 @@ The definitions are :mod:`~gaussian_swaying.mpm.constitutive`, :mod:`~gaussian_s
 """
 
 import math
+from collections.abc import Iterable
 
 import triton
 import triton.language as tl
@@ -16,10 +17,13 @@ from gaussian_swaying.mpm.linalg_triton import (
     clamp,
     cofactor,
     dot3,
+    largest,
+    largest_eigenvalue,
     matmul,
     polar_rotation,
     scale9,
     scaled_product,
+    square9,
     svd3,
     transpose,
     where3,
@@ -33,6 +37,7 @@ FLUID_FLOOR = tl.constexpr(FLUID_LIMIT)
 SNOW_LOW = tl.constexpr(SNOW_RANGE[0])
 SNOW_HIGH = tl.constexpr(SNOW_RANGE[1])
 ROOT = tl.constexpr((2 / 3) ** 0.5)
+EPSILON = tl.constexpr(2**-23)  # of float32
 
 # kinds of law, one bit each; a body's laws are a mask of them
 FIXED_COROTATED = tl.constexpr(1)
@@ -46,6 +51,7 @@ FLUID = tl.constexpr(128)
 NETWORK = tl.constexpr(256)
 PLASTIC_KINDS = tl.constexpr(8 + 16 + 32 + 64 + 128)
 SPECTRAL_KINDS = tl.constexpr(4 + 8 + 16 + 32 + 64 + 128 + 256)
+HENCKY_KINDS = tl.constexpr(4 + 8 + 16 + 32)  # whose energy is Hencky's
 
 
 def law_row(law: materials.ConstitutiveLaw) -> tuple[int, list[float]] | None:
@@ -74,6 +80,17 @@ def law_row(law: materials.ConstitutiveLaw) -> tuple[int, list[float]] | None:
     if kind is None:
         return None
     return kind.value, [float(v) for v in values] + [0.0] * (4 - len(values))
+
+
+def energy_kind(laws: Iterable[materials.ConstitutiveLaw]) -> int:
+    """The ``KIND`` of :func:`wave_modulus` and :func:`energy_density` that holds for all laws of a body; 0 if none."""
+    kinds = 0
+    for law in laws:
+        row = law_row(law)
+        if row is None:
+            return 0
+        kinds |= HENCKY.value if row[0] & HENCKY_KINDS.value else row[0]
+    return kinds if kinds in (FIXED_COROTATED.value, HENCKY.value, NETWORK.value) else 0
 
 
 @triton.jit
@@ -327,6 +344,211 @@ def kirchhoff(F, mu, lam, internal, kind, p0, p1, p2, dt, KINDS: tl.constexpr, F
     else:
         stress = matmul(pk1(F, mu, lam, kind, KINDS), transpose(F))
     return F, internal, stress
+
+
+@triton.jit
+def _root(x):
+    """``constitutive._continued_root``."""
+    inside = tl.maximum(x, LOG_FLOOR * LOG_FLOOR)
+    root = tl.sqrt(inside)
+    return root + (x - inside) / (2 * root)
+
+
+@triton.jit
+def energy_density(F, mu, lam, KIND: tl.constexpr):
+    """Energy density [J/m³] of fixed corotated bodies, networks of springs or Hencky's."""
+    if KIND == FIXED_COROTATED:
+        cof = cofactor(F)
+        change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
+        energy = mu * square9(axpy9(1.0, F, -1.0, polar_rotation(F))) + 0.5 * lam * change * change
+    else:
+        _u, a, _v = svd3(F)
+        if KIND == NETWORK:
+            least = tl.maximum(tl.minimum(mu, lam), 0.0)
+            s0 = a[0] * a[0]
+            s1 = a[1] * a[1]
+            s2 = a[2] * a[2]
+            d = (a[0] - 1, a[1] - 1, a[2] - 1)
+            plane = (_root((s1 + s2) / 2) - 1, _root((s0 + s2) / 2) - 1, _root((s0 + s1) / 2) - 1)
+            space = _root((s0 + s1 + s2) / 3) - 1
+            axes = dot3(d, d)
+            mean = 2.0 / 21 * axes + 16.0 / 105 * dot3(plane, plane) + 9.0 / 35 * space * space
+            trace = d[0] + d[1] + d[2]
+            energy = 7.5 * least * mean + (mu - least) * axes + 0.5 * (lam - least) * trace * trace
+        else:
+            log = (_log(a[0]), _log(a[1]), _log(a[2]))
+            total = log[0] + log[1] + log[2]
+            energy = mu * dot3(log, log) + 0.5 * lam * total * total
+    return energy
+
+
+@triton.jit
+def _share_above(x, y, floor):
+    """Share of the way from y to x that lies above a floor."""
+    gap = x - y
+    none = gap == 0
+    above = (tl.maximum(x, floor) - tl.maximum(y, floor)) / tl.where(none, 1.0, gap)
+    return tl.where(none, tl.where(x < floor, 0.0, 1.0), above)
+
+
+@triton.jit
+def _log_difference(x, y):
+    """(log x - log y) / (x - y) of the continued logarithm, to round-off where x and y are near each other too."""
+    share = _share_above(x, y, LOG_FLOOR)
+    x = tl.maximum(x, LOG_FLOOR)
+    y = tl.maximum(y, LOG_FLOOR)
+    ratio = (x - y) / (x + y)
+    w = ratio * ratio
+    near = w < 0.04
+    # log x - log y = 2 artanh((x - y) / (x + y))
+    series = 2 * (1 + w * (1.0 / 3 + w * (1.0 / 5 + w * (1.0 / 7 + w / 9)))) / (x + y)
+    slope = tl.where(near, series, tl.log(x / y) / tl.where(near, 1.0, x - y))
+    return share * slope + (1 - share) / LOG_FLOOR
+
+
+@triton.jit
+def _pull_difference(x, y):
+    """(_pull(x) - _pull(y)) / (x - y), to round-off where x and y are near each other too."""
+    low = LOG_FLOOR * LOG_FLOOR
+    share = _share_above(x, y, low)
+    rx = tl.sqrt(tl.maximum(x, low))
+    ry = tl.sqrt(tl.maximum(y, low))
+    return share / (rx * ry * (rx + ry)) + (1 - share) / (2 * low)
+
+
+@triton.jit
+def _pull_slope(x):
+    """Derivative of ``_pull`` by half the square; none where it is continued, as in the definition."""
+    low = LOG_FLOOR * LOG_FLOOR
+    inside = tl.maximum(x, low)
+    return tl.where(x < low, 0.0, 1.0 / (inside * tl.sqrt(inside)))
+
+
+@triton.jit
+def _spectral_modulus(own, first, second, third, mu, lam):
+    """``wave`` of ``constitutive._spectral_moduli``, from H_ii and each H_ij, twist and flip.
+
+    The pairs of axes are (1, 2), (0, 2) and (0, 1).
+    """
+    rest = 2 * mu + lam
+    unit = tl.maximum(rest, 1e-30)  # or the cube of a modulus would overflow
+    m0 = first[0] / unit
+    m1 = second[0] / unit
+    m2 = third[0] / unit
+    matrix = (own[0] / unit, m2, m1, m2, own[1] / unit, m0, m1, m0, own[2] / unit)
+    bound = largest(unit * largest_eigenvalue(matrix), 2 * mu + 3 * tl.maximum(lam, 0.0))
+    bound = largest(bound, largest(first[1], first[2]))
+    bound = largest(bound, largest(second[1], second[2]))
+    bound = largest(bound, largest(third[1], third[2]))
+    wave = largest(largest(own[0], own[1]), largest(own[2], rest))
+    wave = largest(wave, largest(first[1] - first[0], first[2] + first[0]))
+    wave = largest(wave, largest(second[1] - second[0], second[2] + second[0]))
+    wave = largest(wave, largest(third[1] - third[0], third[2] + third[0]))
+    return tl.minimum(wave, bound, tl.PropagateNan.ALL)
+
+
+@triton.jit
+def _network_pair(x, y, plane_x, plane_y, plane, whole, spread, direct, network, bulk, tension):
+    """H_ij, twist and flip of two axes of a network.
+
+    The planes are named by the axis across them, and ``plane`` holds both axes. With D the divided difference of the
+    pulls of the two other planes, flip and twist are the same but for (x + y)² D, which is (x - y)² D in twist, and for
+    what does not vanish with the stretches.
+    """
+    difference = 2.0 / 105 * _pull_difference(plane_x, plane_y)
+    common = direct + network * (whole + 8.0 / 105 * (_pull(plane) + 0.5 * (_pull(plane_x) + _pull(plane_y))))
+    total = x + y
+    gap = x - y
+    twist = common + network * difference * gap * gap + 2 * tension / tl.maximum(total, EPSILON)
+    flip = common + network * difference * total * total
+    mixed = network * x * y * (4.0 / 105 * _pull_slope(plane) + spread / 35) + bulk
+    return mixed, twist, flip
+
+
+@triton.jit
+def network_wave_modulus(a, mu, lam):
+    """``wave`` of ``constitutive.spring_network_moduli`` from the principal stretches."""
+    least = tl.maximum(tl.minimum(mu, lam), 0.0)
+    direct = 10.0 / 7 * least + 2 * (mu - least)
+    network = 15 * least
+    bulk = lam - least
+    tension = bulk * (a[0] + a[1] + a[2] - 3) - direct
+    s0 = a[0] * a[0]
+    s1 = a[1] * a[1]
+    s2 = a[2] * a[2]
+    plane0 = (s1 + s2) / 2
+    plane1 = (s0 + s2) / 2
+    plane2 = (s0 + s1) / 2
+    space = (s0 + s1 + s2) / 3
+    whole = 3.0 / 35 * _pull(space)
+    spread = _pull_slope(space)
+    pull0 = _pull(plane0)
+    pull1 = _pull(plane1)
+    pull2 = _pull(plane2)
+    turn0 = 4.0 / 105 * _pull_slope(plane0)
+    turn1 = 4.0 / 105 * _pull_slope(plane1)
+    turn2 = 4.0 / 105 * _pull_slope(plane2)
+    rest = direct + bulk
+    own = (
+        rest + network * (8.0 / 105 * (pull1 + pull2) + whole + s0 * (turn1 + turn2 + spread / 35)),
+        rest + network * (8.0 / 105 * (pull0 + pull2) + whole + s1 * (turn0 + turn2 + spread / 35)),
+        rest + network * (8.0 / 105 * (pull0 + pull1) + whole + s2 * (turn0 + turn1 + spread / 35)),
+    )
+    first = _network_pair(a[1], a[2], plane1, plane2, plane0, whole, spread, direct, network, bulk, tension)
+    second = _network_pair(a[0], a[2], plane0, plane2, plane1, whole, spread, direct, network, bulk, tension)
+    third = _network_pair(a[0], a[1], plane0, plane1, plane2, whole, spread, direct, network, bulk, tension)
+    return _spectral_modulus(own, first, second, third, mu, lam)
+
+
+@triton.jit
+def _hencky_pair(x, y, tau_x, tau_y, mu, lam):
+    """H_ij, twist and flip of two axes, from their stretches and Kirchhoff stresses (where nothing is continued)."""
+    gx = 1.0 / tl.maximum(x, LOG_FLOOR)
+    gy = 1.0 / tl.maximum(y, LOG_FLOOR)
+    twist = (tau_x * gx + tau_y * gy) / tl.maximum(x + y, EPSILON)
+    bend = 0.5 * (tau_x + tau_y) * _share_above(x, y, LOG_FLOOR) * gx * gy
+    flip = mu * (gx + gy) * _log_difference(x, y) - bend
+    return lam * gx * gy, twist, flip
+
+
+@triton.jit
+def _hencky_own(x, tau, mu, lam):
+    """H_ii."""
+    g = 1.0 / tl.maximum(x, LOG_FLOOR)
+    return (2 * mu + lam - tl.where(x < LOG_FLOOR, 0.0, tau)) * g * g
+
+
+@triton.jit
+def hencky_wave_modulus(a, mu, lam):
+    """``wave`` of ``constitutive.stvk_hencky_moduli`` from the principal stretches."""
+    l0 = _log(a[0])
+    l1 = _log(a[1])
+    l2 = _log(a[2])
+    pressure = lam * (l0 + l1 + l2)
+    t0 = 2 * mu * l0 + pressure
+    t1 = 2 * mu * l1 + pressure
+    t2 = 2 * mu * l2 + pressure
+    own = (_hencky_own(a[0], t0, mu, lam), _hencky_own(a[1], t1, mu, lam), _hencky_own(a[2], t2, mu, lam))
+    first = _hencky_pair(a[1], a[2], t1, t2, mu, lam)
+    second = _hencky_pair(a[0], a[2], t0, t2, mu, lam)
+    third = _hencky_pair(a[0], a[1], t0, t1, mu, lam)
+    return _spectral_modulus(own, first, second, third, mu, lam)
+
+
+@triton.jit
+def wave_modulus(F, mu, lam, KIND: tl.constexpr):
+    """Density times the square of the speed of a wave [Pa] (``ConstitutiveLaw.moduli``), kinds as energy_density."""
+    if KIND == FIXED_COROTATED:
+        cof = cofactor(F)
+        area = largest_eigenvalue(matmul(transpose(cof), cof))
+        modulus = 2 * mu + lam * largest(area, 1.0)
+    else:
+        _u, a, _v = svd3(F)
+        if KIND == NETWORK:
+            modulus = network_wave_modulus(a, mu, lam)
+        else:
+            modulus = hencky_wave_modulus(a, mu, lam)
+    return modulus
 
 
 @triton.jit

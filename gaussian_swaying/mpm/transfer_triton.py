@@ -22,15 +22,13 @@ import triton.language as tl
 from gaussian_swaying.aero.force_triton import aero_force, deform_patch
 from gaussian_swaying.mpm.linalg_triton import (
     axpy9,
-    cofactor,
+    largest,
     largest_eigenvalue,
     matmul,
-    polar_rotation,
     scale9,
-    square9,
     transpose,
 )
-from gaussian_swaying.mpm.materials_triton import kelvin_voigt_pk1, kirchhoff, pk1
+from gaussian_swaying.mpm.materials_triton import energy_density, kelvin_voigt_pk1, kirchhoff, pk1, wave_modulus
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
@@ -773,29 +771,24 @@ def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, s
 
 
 @triton.jit
-def _wave_speed(F, density, mu, lam, SPATIAL: tl.constexpr):
-    """Speed of a wave in a fixed corotated body [m/s], as ``timestep.wave_speed``."""
-    cof = cofactor(F)
-    area = largest_eigenvalue(matmul(transpose(cof), cof))
-    squared = (2 * mu + lam * tl.maximum(area, 1.0, tl.PropagateNan.ALL)) / density
+def _wave_speed(F, density, mu, lam, KIND: tl.constexpr, SPATIAL: tl.constexpr):
+    """Speed of a wave [m/s], as ``timestep.wave_speed``."""
+    squared = wave_modulus(F, mu, lam, KIND) / density
     if SPATIAL:
         stretch = largest_eigenvalue(matmul(transpose(F), F))
-        squared = squared * tl.maximum(stretch, 1.0, tl.PropagateNan.ALL)
+        squared = squared * largest(stretch, 1.0)
     return tl.sqrt(squared)
 
 
 @triton.jit(do_not_specialize=VARIES)
-def elastic_energy(F_in, mu_in, lam_in, out, count, BLOCK: tl.constexpr):
-    """Energy density of fixed corotated particles [J/m³], as ``constitutive.fixed_corotated_energy``."""
+def elastic_energy(F_in, mu_in, lam_in, out, count, KIND: tl.constexpr, BLOCK: tl.constexpr):
+    """Energy density of particles [J/m³], as ``ConstitutiveLaw.energy``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     F = _load9(F_in, 1, index * 9, mask)
     mu = tl.load(mu_in + index, mask, 0.0)
     lam = tl.load(lam_in + index, mask, 0.0)
-    cof = cofactor(F)
-    change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
-    stretch = square9(axpy9(1.0, F, -1.0, polar_rotation(F)))
-    tl.store(out + index, mu * stretch + 0.5 * lam * change * change, mask)
+    tl.store(out + index, energy_density(F, mu, lam, KIND), mask)
 
 
 @triton.jit
@@ -806,14 +799,16 @@ def _keep_largest(out, speed, mask):
 
 
 @triton.jit(do_not_specialize=VARIES)
-def largest_speed(F_in, density, mu_in, lam_in, velocity, out, count, SPATIAL: tl.constexpr, BLOCK: tl.constexpr):
-    """Largest speed of a wave [m/s] (and of its particle, SPATIAL) of fixed corotated bodies, into ``out``."""
+def largest_speed(
+    F_in, density, mu_in, lam_in, velocity, out, count, KIND: tl.constexpr, SPATIAL: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Largest speed of a wave [m/s] (and of its particle, SPATIAL), into ``out``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     F = _load9(F_in, 1, index * 9, mask)
     mu = tl.load(mu_in + index, mask, 0.0)
     lam = tl.load(lam_in + index, mask, 0.0)
-    speed = _wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, SPATIAL)
+    speed = _wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, KIND, SPATIAL)
     if SPATIAL:
         v = _load3(velocity, 1, index * 3, mask)
         speed += tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -822,8 +817,9 @@ def largest_speed(F_in, density, mu_in, lam_in, velocity, out, count, SPATIAL: t
 
 @triton.jit(do_not_specialize=VARIES)
 def total_look(
-    fraction, material, count, particle_cell, cell_node, fields, out, sx, sy, inverse_dx, BLOCK: tl.constexpr
-):
+    fraction, material, count, particle_cell, cell_node, fields, out, sx, sy, inverse_dx,
+    KIND: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """``total``: as ``largest_speed``, from the nodal displacements."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
@@ -835,11 +831,11 @@ def total_look(
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)
     density = tl.load(material + 3 * count + index, mask, 1.0) / tl.load(material + index, mask, 1.0)
-    _keep_largest(out, _wave_speed(F, density, mu, lam, False), mask)
+    _keep_largest(out, _wave_speed(F, density, mu, lam, KIND, False), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
-def updated_look(moving, count, out, BLOCK: tl.constexpr):
+def updated_look(moving, count, out, KIND: tl.constexpr, BLOCK: tl.constexpr):
     """``updated``: as ``largest_speed``, from the rows of ``moving``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
@@ -848,5 +844,5 @@ def updated_look(moving, count, out, BLOCK: tl.constexpr):
     lam = tl.load(moving + 29 * count + index, mask, 0.0)
     density = tl.load(moving + 26 * count + index, mask, 1.0) / tl.load(moving + 27 * count + index, mask, 1.0)
     v = _load3(moving + 12 * count, count, index, mask)
-    speed = _wave_speed(F, density, mu, lam, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    speed = _wave_speed(F, density, mu, lam, KIND, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     _keep_largest(out, speed, mask)

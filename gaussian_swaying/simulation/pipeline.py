@@ -565,6 +565,7 @@ class SimulationPipeline(nn.Module):
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
             "simulated_gaussians": len(self.scene.simulated),
+            "surface_particles": self.scene.on_surface,
             "filled_particles": self.scene.filled,
             "mass_kg": float(self.solver.points.mass.sum()),
             "patch_area_m2": float(self.scene.patch_area.sum()),

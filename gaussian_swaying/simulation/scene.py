@@ -10,10 +10,12 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.data.procedural import ProceduralScene
+from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
+from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
 from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
@@ -108,6 +110,9 @@ class Scene:
         layers: Layers of material points through the thickness: 1, a membrane that folds without resistance, or 3,
             which resists bending as a plate does (the Gaussians in the middle plane, two more points at the faces of
             the sheet, weights of Simpson's rule). Three times the points.
+        particle_spacing: Largest distance of neighbouring material points on the surface [m]: Gaussians larger than
+            that get further points (see :func:`~gaussian_swaying.gaussians.subdivision.subdivide`), as a splat that
+            was trained without a limit on sizes needs; 0.45 ``solver.dx`` or less. Null for one point a Gaussian.
     """
 
     def __init__(
@@ -125,6 +130,7 @@ class Scene:
         wind_on: str = "surface",
         max_stretch: float | None = None,
         layers: int = 1,
+        particle_spacing: float | None = None,
     ) -> None:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
@@ -141,6 +147,10 @@ class Scene:
             raise ValueError(f"Expected `scene.layers` to be 1 or 3, but got {layers}.")
         if layers > 1 and filling is not None:
             raise ValueError("Expected `scene.layers` 1 with `scene.filling`: a solid resists bending by itself.")
+        if particle_spacing is not None:
+            check_positive("scene.particle_spacing", particle_spacing)
+            if filling is not None:
+                raise ValueError("Expected `scene.particle_spacing` null with `scene.filling`, which fills in points.")
         if ply is None and generator is None:
             raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
         self.ply, self.generator, self.region = ply, generator, region or Everything()
@@ -148,7 +158,7 @@ class Scene:
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
         self.max_stretch = None if max_stretch is None else float(max_stretch)
-        self.layers = layers
+        self.layers, self.particle_spacing = layers, particle_spacing
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -166,7 +176,8 @@ class SimulatedScene(nn.Module):
 
     Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
     simulated one, static ones stay. The points that fill a solid, and those at the faces of a sheet of three layers,
-    are material only: no Gaussian belongs to them, and their patch area is zero.
+    are material only: no Gaussian belongs to them, and their patch area is zero. The further points of large Gaussians
+    (``particle_spacing``) are patches of their own, but no Gaussian is drawn where they are.
 
     Args:
         scene: Where the Gaussians come from.
@@ -177,6 +188,8 @@ class SimulatedScene(nn.Module):
     Attributes:
         points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
         filled: Number of points within a solid.
+        on_surface: Number of points on the surface, which are the first: the simulated Gaussians, then the further
+            points of large ones.
         patch_normal: Unit normals of the points at rest in the z-up frame, shape (P, 3).
         patch_area: Their areas that feel the wind [m²], shape (P,).
         frame: Scene units to metres.
@@ -210,13 +223,19 @@ class SimulatedScene(nn.Module):
             visible = self.model.opacity()[simulated]
             filling = within_region(scene.filling.fill(position, shape, visible, 0.5 * dx), scene.region, self.frame)
         self.filled = 0 if filling is None else len(filling.position)
-        outer = torch.ones(len(simulated), dtype=torch.bool) if filling is None else filling.on_surface
-        areas = cloud.means.new_zeros(len(simulated))
+        pieces = None
+        if scene.particle_spacing is not None:
+            spacing = scene.particle_spacing / self.frame.metres_per_unit
+            part = cloud.select(simulated)
+            pieces = subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
+            position = torch.cat([position, self.frame.point_to_sim(pieces.means.double())])
+        source = torch.arange(len(simulated))  # the simulated Gaussian of each point on the surface
+        source = source if pieces is None else torch.cat([source, pieces.parent])
+        self.on_surface = len(source)
+        outer = torch.ones(len(source), dtype=torch.bool) if filling is None else filling.on_surface
+        areas = cloud.means.new_zeros(len(source))
         for group in (outer, ~outer):  # what lies within takes no area from the surface
-            part = cloud.select(simulated[group])
-            mode = "coverage" if scene.area == "equal" else scene.area
-            found = GaussianSurfaceModel.from_cloud(part, requires_grad=False).areas(mode)
-            areas[group] = found.mean() if scene.area == "equal" and len(found) else found
+            areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
         self.max_stretch = scene.max_stretch
         self.register_buffer("simulated", simulated)
         carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
@@ -225,7 +244,7 @@ class SimulatedScene(nn.Module):
         self.register_buffer("anchor", anchor[:, 0])
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
-        facing = self.frame.direction_to_sim(normals[simulated].double())
+        facing = self.frame.direction_to_sim(normals[simulated[source]].double())
         area = self.frame.area_to_sim(areas)
         body_area, area = area, area if scene.wind_on == "all" else torch.where(outer, area, 0)
         if filling is not None:  # a filled point is a patch of no area
@@ -256,8 +275,9 @@ class SimulatedScene(nn.Module):
         self.identity: Tensor
         count = len(position)
         where = cloud.means[simulated]
-        if filling is not None:
-            where = torch.cat([where, self.frame.point_to_scene(filling.position).to(where.dtype)])
+        if filling is not None or pieces is not None:
+            further = self.frame.point_to_scene(position[len(simulated) :])
+            where = torch.cat([where, further.to(where.dtype)])
         fields = {name: torch.full((count,), getattr(material, name), dtype=dtype) for name in _MATERIAL_FIELDS}
         laws, law_index = [material.law or FixedCorotated()], torch.zeros(count, dtype=torch.long)
         for entry in material.regions:
@@ -328,7 +348,7 @@ class SimulatedScene(nn.Module):
         """
         rest = self.rest()
         kind = rest.means.dtype
-        count = len(self.simulated)  # the points after them fill a solid and are not drawn
+        count = len(self.simulated)  # the points after them are not drawn
         move = self.frame.displacement_to_scene((state.position - self.points.position)[:count].to(kind))
         F = self.frame.gradient_to_scene(state.F_total[:count].to(kind))
         if len(self.carried):
@@ -370,6 +390,20 @@ class SimulatedScene(nn.Module):
         own = values[: len(self.simulated)].to(self.model.means.dtype)
         found = own.new_zeros(len(self.model.means))
         return found.index_copy(0, self.moving, torch.cat([own, own[self.anchor]]))
+
+
+def _areas(
+    cloud: GaussianCloud, normals: Tensor, source: Tensor, pieces: Subdivision | None, group: Tensor, mode: str
+) -> Tensor:
+    """Areas [scene units^2] of a group of points, shared among the group; each is of a Gaussian of the cloud."""
+    if mode == "paper":
+        shares = torch.bincount(source, minlength=len(cloud.means)).to(cloud.means)
+        return (patch_area(cloud.scales) / shares.clamp_min(1))[source[group]]
+    means, log_scales, opacity = cloud.means, cloud.scales, torch.sigmoid(cloud.opacities)
+    if pieces is not None:
+        means, log_scales, opacity = torch.cat([means, pieces.means]), pieces.log_scales, pieces.opacity
+    found = coverage_area(means[group], normals[source[group]], log_scales[group], opacity[group])
+    return found.mean().expand(len(found)) if mode == "equal" and len(found) else found
 
 
 _MATERIAL_FIELDS = ("E", "nu", "density", "thickness")

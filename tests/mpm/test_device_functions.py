@@ -4,6 +4,8 @@ A test of many matrices at once, singular, inverted, tiny and with repeated stre
 here, in the interpreter too.
 """
 
+import math
+
 import pytest
 import torch
 
@@ -14,7 +16,7 @@ import triton.language as tl
 
 from gaussian_swaying.mpm import fused, linalg, materials, materials_triton
 from gaussian_swaying.mpm.linalg_triton import polar_rotation, svd3
-from gaussian_swaying.mpm.materials_triton import kirchhoff, law_row, pk1
+from gaussian_swaying.mpm.materials_triton import energy_density, energy_kind, kirchhoff, law_row, pk1, wave_modulus
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
 
@@ -79,6 +81,17 @@ def _plastic(F_in, internal_in, F_out, internal_out, out, mu, lam, dt, row, coun
     for k in tl.static_range(9):
         tl.store(out + place * 9 + k, stress[k], mask)
         tl.store(F_out + place * 9 + k, F[k], mask)
+
+
+@triton.jit
+def _scalars(F_in, wave, energy, mu, lam, count, KIND: tl.constexpr, BLOCK: tl.constexpr):
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < count
+    F = _matrix(F_in, place * 9, mask)
+    mu = F[0] * 0 + mu
+    lam = F[0] * 0 + lam
+    tl.store(wave + place, wave_modulus(F, mu, lam, KIND), mask)
+    tl.store(energy + place, energy_density(F, mu, lam, KIND), mask)
 
 
 def _matrices(device, unique=False):
@@ -212,6 +225,81 @@ def test_flow_and_stress(kernel_device, k):
         assert torch.equal(inner, internal)
     _close(stress, law.kirchhoff(exact, mu, lam, memory), MU + LAM)
     assert float((F_out - F).abs().max()) > 1e-2
+
+
+ENERGIES = [materials.FixedCorotated(), materials.SpringNetwork(), materials.StVKHencky()]
+LAME = {"equal": (4e3, 4e3), "mu": (6e3, 2e3), "lambda": (2e3, 8e3), "auxetic": (5e3, -1e3), "steel": (8e10, 1.2e11)}
+CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if (law, ratio) != (ENERGIES[0], "auxetic")]
+
+
+def _strained(device):
+    """Turned round at random: stretches from crushed to fourfold, equal and nearly equal ones, and inverted ones."""
+    generator = torch.Generator().manual_seed(2)
+    free = 0.02 + 4 * torch.rand(500, 3, dtype=torch.float64, generator=generator)
+    thin = free * torch.tensor([1.0, 0.1, 0.01], dtype=torch.float64)
+    two, three = free.clone(), free[:, :1].repeat(1, 3)
+    two[:, 1] = two[:, 0]
+    near = three * (1 + 1e-4 * torch.randn(500, 3, dtype=torch.float64, generator=generator))
+    small = 1 + 1e-3 * torch.randn(500, 3, dtype=torch.float64, generator=generator)
+    stretch = torch.cat([free, thin, two, three, near, small])
+    inverted = stretch.sort(-1, descending=True)[0] * torch.tensor([1.0, 1.0, -0.9], dtype=torch.float64)
+    stretch = torch.cat([stretch, inverted])
+    turns = torch.linalg.qr(torch.randn(2, len(stretch), 3, 3, dtype=torch.float64, generator=generator))[0]
+    turns = turns * torch.linalg.det(turns)[..., None, None]
+    return (turns[0] @ stretch.diag_embed() @ turns[1].mT).float().to(device)
+
+
+@pytest.mark.parametrize(("law", "ratio"), CASES, ids=lambda x: x if isinstance(x, str) else type(x).__name__)
+def test_wave_modulus_and_energy(kernel_device, law, ratio):
+    """Against float64, to what ten roundings of F (of 1.2e-7) change.
+
+    A modulus divides by the sum of two stretches, which is exact to the rounding of the largest. That of a corotated
+    body keeps but the root of the rounding where two eigenvalues in closed form are equal.
+    """
+    mu, lam = LAME[ratio]
+    F = _strained(kernel_device)
+    wave, energy = F.new_empty(len(F)), F.new_empty(len(F))
+    _launch(_scalars, len(F), F, wave, energy, mu, lam, KIND=energy_kind([law]))
+    wide = F.double()
+    parameters = [torch.full_like(wide[:, 0, 0], value) for value in (mu, lam)]
+    values = linalg.svd3(wide)[1]
+    expected = law.moduli(wide, *parameters)[0]
+    rounding = 5e-6 + 2e-7 * values[:, 0] / (values[:, 1] + values[:, 2]).abs()
+    if isinstance(law, materials.FixedCorotated):
+        rounding = 5e-4
+    error = (wave - expected).abs() / expected
+    assert bool((error <= rounding).all()), f"{float((error / rounding).max()):.1e}"
+    if lam > 0 or isinstance(law, materials.StVKHencky):  # or there is no network, and nothing stiffens
+        assert int((expected > 1.01 * (2 * mu + lam)).sum()) > 500
+    exact = law.energy(wide, *parameters)
+    slope = (exact * expected).sqrt()
+    error = (energy - exact).abs() / (exact + slope + 1e-6 * expected)
+    assert bool((error <= 3e-6).all()), f"{float(error.max()):.1e}"
+
+
+@pytest.mark.parametrize("law", ENERGIES, ids=lambda law: type(law).__name__)
+def test_what_is_not_finite_has_no_modulus(kernel_device, law):
+    """Whichever entry of F it is; maxima would lose it unless told not to."""
+    F = torch.eye(3, device=kernel_device).repeat(18, 1, 1)
+    F.view(18, 9)[range(9), range(9)] = math.nan
+    F.view(18, 9)[range(9, 18), range(9)] = math.inf
+    wave, energy = F.new_zeros(len(F)), F.new_zeros(len(F))
+    _launch(_scalars, len(F), F, wave, energy, MU, LAM, KIND=energy_kind([law]))
+    assert not bool(torch.isfinite(wave).any())
+
+
+def test_which_energy_holds_for_a_body():
+    """One kernel per energy: all laws on Hencky's share it, whatever flows in them."""
+    corotated, network, hencky = (energy_kind([law]) for law in ENERGIES)
+    assert 0 < corotated != network != hencky != corotated
+    on_hencky = [law for law in LAWS if isinstance(law, materials.StVKHencky)]
+    assert {type(law) for law in on_hencky} == {
+        materials.StVKHencky, materials.Sand, materials.Metal, materials.Plasticine, materials.Foam,
+    }  # fmt: skip
+    assert energy_kind(on_hencky) == hencky
+    assert energy_kind([materials.SpringNetwork(), materials.SpringNetwork()]) == network
+    for others in ([ENERGIES[0], ENERGIES[1]], [ENERGIES[1], ENERGIES[2]], *([law] for law in LAWS[-2:]), [LAWS[1]]):
+        assert energy_kind(others) == 0
 
 
 def test_every_law_of_the_package_has_a_form():

@@ -313,6 +313,68 @@ def test_points_move_with_the_module(make_scene):
     assert scene.points.position.dtype == scene.patch_area.dtype == torch.float64
 
 
+def _sheet_with_a_hole():
+    """A square of 1 m in small Gaussians, but for the middle, which is one large Gaussian, the last."""
+    cloud = FlagScene(width=1.0, height=1.0, spacing=0.05).generate()
+    middle = ((cloud.means - torch.tensor([0.5, 0.0, 0.5])).abs() < 0.3).all(-1)
+    edge, one = cloud.select(~middle), cloud.select(torch.tensor([0]))
+    edge = dataclasses.replace(edge, scales=edge.scales - 0.5)  # they end near the rim of the sheet
+    wide = one.scales + math.log(8) * (one.scales > one.scales.min())
+    large = dataclasses.replace(one, means=torch.tensor([[0.5, 0.0, 0.5]]), scales=wide)
+    fields = [f.name for f in dataclasses.fields(cloud) if getattr(cloud, f.name) is not None]
+    return dataclasses.replace(cloud, **{n: torch.cat([getattr(edge, n), getattr(large, n)]) for n in fields})
+
+
+def test_large_gaussians_get_further_points():
+    """They follow the Gaussians, have normals, areas and material of their own place, and are not drawn."""
+    cloud = _sheet_with_a_hole()
+    count = len(cloud)
+    lower = MaterialRegion(region=Box([None, None, None], [None, None, 0.49]), density=1000.0)
+    material = Material(density=100.0, thickness=0.02, regions=[lower])
+    plain = SimulatedScene(Scene(generator=_Given(cloud)), material, 0.1)
+    full = SimulatedScene(Scene(generator=_Given(cloud), particle_spacing=0.05), material, 0.1)
+    assert plain.on_surface == plain.points.count == count
+    assert full.on_surface == full.points.count > count + 50
+    assert torch.equal(full.points.position[:count], plain.points.position)
+    assert float(plain.patch_area.sum()) < 0.9 < float(full.patch_area.sum()) < 1.03
+    density = full.points.mass / full.points.volume
+    below = full.frame.point_to_scene(full.points.position.double())[:, 2] < 0.49
+    torch.testing.assert_close(density, torch.where(below, 1000.0, 100.0))
+    torch.testing.assert_close(full.points.volume, 0.02 * full.patch_area)
+    of_large = full.patch_normal[count - 1 :]  # the flag is not quite flat, and one normal stands for the hole
+    assert torch.equal(of_large, of_large[:1].expand_as(of_large))
+    state = _rest_state(full)
+    moved = full.deformed(state.replace(position=state.position + 0.25))
+    torch.testing.assert_close(moved.means, cloud.means + 0.25)
+    layered = SimulatedScene(Scene(generator=_Given(cloud), particle_spacing=0.05, layers=3), material, 0.1)
+    assert layered.on_surface == full.points.count
+    assert layered.points.count == 3 * full.points.count
+
+
+def test_further_points_in_the_paper_s_areas():
+    """Each Gaussian keeps pi s1 s2, shared among its points."""
+    cloud = _sheet_with_a_hole()
+    plain, full = (
+        SimulatedScene(Scene(generator=_Given(cloud), area="paper", particle_spacing=s), Material(), 0.1)
+        for s in (None, 0.05)
+    )
+    torch.testing.assert_close(full.patch_area.sum(), plain.patch_area.sum())
+    assert full.points.count > plain.points.count
+
+
+def test_spacing_of_the_particles_is_in_metres():
+    cloud = _sheet_with_a_hole()
+    one, half = (
+        SimulatedScene(Scene(generator=_Given(cloud), particle_spacing=s, metres_per_unit=m), Material(), 0.1)
+        for s, m in ((0.05, 1.0), (0.1, 2.0))
+    )
+    assert one.points.count == half.points.count
+    with pytest.raises(ValueError, match="particle_spacing"):
+        Scene(generator=_Given(cloud), particle_spacing=0.0)
+    with pytest.raises(ValueError, match="particle_spacing"):
+        Scene(generator=_Given(cloud), particle_spacing=0.05, filling=InteriorFilling())
+
+
 def test_three_layers_are_a_plate(make_cloud):
     """The mass of one, and its moment about the middle plane: that of a plate of this thickness, h² / 12."""
     cloud = make_cloud()

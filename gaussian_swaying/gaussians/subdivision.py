@@ -1,0 +1,120 @@
+"""Points between the centres of Gaussians that lie farther apart than a grid can follow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+from gaussian_swaying.gaussians.surface import quat_to_rotation
+
+_VISIBLE = 0.25  # opacity down to which a Gaussian counts as surface
+_NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: those amid a square of four
+_LONGEST = 2001  # pieces along an axis
+
+
+@dataclass(frozen=True)
+class Subdivision:
+    """Gaussians cut into pieces no larger than a spacing.
+
+    Attributes:
+        parent: Gaussian that each further piece is of, shape (K,).
+        means: Centres of the further pieces [scene units], shape (K, 3).
+        log_scales: Logarithms of the standard deviations of all pieces [scene units]: first those in the middle of
+            each Gaussian, then the further ones, shape (N + K, 3).
+        opacity: Opacities of all pieces, those of their Gaussians at their centres, shape (N + K,).
+    """
+
+    parent: Tensor
+    means: Tensor
+    log_scales: Tensor
+    opacity: Tensor
+
+
+@torch.no_grad()
+def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor, spacing: float) -> Subdivision:
+    r"""Points on large Gaussians, so that no two neighbours on the surface are much farther apart than a spacing.
+
+    Training leaves large Gaussians where a surface is of one colour. With one material point to each, such a place has
+    a hole that a grid of fine cells does not bridge. Here the ellipse in which a Gaussian has at least a quarter of
+    full opacity, :math:`o \exp(-m^2 / 2) \ge 1/4` at the Mahalanobis distance m in its plane, is laid with points a
+    spacing apart; its own centre is one of them. Points nearer than :math:`\sqrt{1/2}` spacings to the centre of any
+    Gaussian, or to a point nearer to its own centre, are left out: those places have a point already.
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        quats: Rotations, wxyz, of any length above zero, shape (N, 4).
+        log_scales: Logarithms of the standard deviations [scene units], shape (N, 3).
+        opacity: Opacities from 0 to 1, shape (N,).
+        spacing: Largest distance of neighbours [scene units].
+
+    Returns:
+        The pieces; Gaussians of at most a quarter of full opacity stay whole. The same on every device.
+
+    Raises:
+        ValueError: If ``spacing`` is not above zero or a tensor does not have the shape above.
+    """
+    check_positive("spacing", spacing)
+    count = len(means)
+    for name, value, size in (("means", means, 3), ("quats", quats, 4), ("log_scales", log_scales, 3)):
+        check_shape(name, value, count, size)
+    check_shape("opacity", opacity, count)
+    device, kind = means.device, means.dtype
+    means, quats, log_scales, opacity = (t.detach().cpu() for t in (means, quats, log_scales, opacity))
+    reach = (2 * (opacity.double() / _VISIBLE).clamp_min(1).log()).sqrt()  # in standard deviations
+    half = reach[:, None] * log_scales.double().exp()
+    normal_axis = log_scales.argmin(-1)
+    half[torch.arange(count), normal_axis] = 0
+    # an odd number along each axis, so that the centre is among them
+    pieces = (2 * (half / spacing - 0.5).ceil().clamp_min(0) + 1).clamp_max(_LONGEST).long()
+    step = 2 * half / pieces
+    parent, steps = _lattice(pieces // 2)
+    place = steps * step[parent]
+    squared = (place / half[parent].clamp_min(1e-300)).square().sum(-1)  # 1 on the rim of the ellipse
+    inside = (squared > 0) & (squared <= 1)
+    parent, place, squared = parent[inside], place[inside], squared[inside]
+    turned = (quat_to_rotation(quats.double())[parent] @ place[..., None])[..., 0]
+    where = means.double()[parent] + turned
+    kept = _thin(where, squared * reach[parent], means.double(), _NEAR * spacing)
+    parent, where, squared = parent[kept], where[kept], squared[kept]
+    shrunk = log_scales.double() - pieces.double().log()
+    faded = opacity.double()[parent] * (-0.5 * squared * reach[parent].square()).exp()
+    return Subdivision(
+        parent.to(device),
+        where.to(device, kind),
+        torch.cat([shrunk, shrunk[parent]]).to(device, kind),
+        torch.cat([opacity.double(), faded]).to(device, kind),
+    )
+
+
+def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:
+    """For each row of (N, 3) all integers from minus to plus its entries: which row, (L,), and the integers, (L, 3)."""
+    sizes = 2 * out + 1
+    length = sizes.prod(-1)
+    row = torch.repeat_interleave(torch.arange(len(out)), length)
+    rank = torch.arange(len(row)) - (length.cumsum(0) - length)[row]
+    x, y, z = sizes[row].unbind(-1)
+    steps = [rank % x, rank.div(x, rounding_mode="floor") % y, rank.div(x * y, rounding_mode="floor") % z]
+    return row, (torch.stack(steps, -1) - out[row]).double()
+
+
+def _thin(points: Tensor, order: Tensor, taken: Tensor, distance: float) -> Tensor:
+    """Indices of points that are at least a distance from those taken, and about as far from each other.
+
+    Of several in one cell of a grid of this size the first by ``order`` stays, then the same on a shifted grid.
+    """
+    if len(points) == 0:
+        return torch.zeros(0, dtype=torch.long)
+    far, _ = nearest_neighbours(taken, 1, points)
+    free = (far[:, 0] >= distance).nonzero()[:, 0]
+    free = free[order[free].argsort(stable=True)]
+    for shift in (0.0, 0.5):  # two grids, so that most pairs share a cell in one
+        cell = torch.floor(points[free] / distance + shift).long()
+        _, owner = torch.unique(cell, dim=0, return_inverse=True)
+        first = torch.full((int(owner.max()) + 1 if len(owner) else 0,), len(free), dtype=torch.long)
+        first.scatter_reduce_(0, owner, torch.arange(len(free)), "amin")
+        free = free[first.sort().values]
+    return free.sort().values
