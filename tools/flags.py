@@ -43,6 +43,11 @@ class Variant:
     training: tuple[str, ...] = ()
 
 
+def _grid(dx: float) -> tuple[str, ...]:
+    """Options for a grid spacing [m], with as many particles in a cell."""
+    return (f"--solver.dx={dx:g}", f"--scene.particle_spacing={0.45 * dx:g}")
+
+
 VARIANTS: dict[str, Variant] = {
     "ours": Variant("ours (`total`, three layers)"),
     "particle": Variant("PhysGaussian's way", ("particle",)),
@@ -52,10 +57,12 @@ VARIANTS: dict[str, Variant] = {
     "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
     "paper_area": Variant("areas π s1 s2", ("paper_area",)),
     "membrane": Variant("one layer: no bending stiffness", options=("--scene.layers=1",)),
-    "total_03": Variant("`total`, dx = 0.03 m", options=("--solver.dx=0.03",)),
-    "total_02": Variant("`total`, dx = 0.02 m", options=("--solver.dx=0.02",)),
-    "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",)),
-    "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), ("--solver.dx=0.02",)),
+    "one_point": Variant("one point to a Gaussian", options=("--scene.particle_spacing=null",)),
+    "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
+    "total_02": Variant("`total`, dx = 0.02 m", options=_grid(0.02)),
+    "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",), _grid(0.04)),
+    "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",)),
+    "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), _grid(0.02)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
     "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
