@@ -59,9 +59,10 @@ VARIANTS: dict[str, Variant] = {
     "membrane": Variant("one layer: no bending stiffness", options=("--scene.layers=1",)),
     "one_point": Variant("one point to a Gaussian", options=("--scene.particle_spacing=null",)),
     "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
+    "total_03": Variant("`total`, dx = 0.03 m", options=_grid(0.03)),
     "total_02": Variant("`total`, dx = 0.02 m", options=_grid(0.02)),
     "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",), _grid(0.04)),
-    "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",)),
+    "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), _grid(0.03)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), _grid(0.02)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
     "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
@@ -118,9 +119,10 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
 
 
 def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
-    """Train a splat of a flag from its photographs, unless it is there."""
+    """Train a splat of a flag from its photographs, unless it is there; how long it took lies beside it."""
+    account = target / "training.json"
     if (target / "point_cloud.ply").exists():
-        return {"kept": True}
+        return json.loads(account.read_text()) if account.exists() else {"kept": True}
     command = [sys.executable, str(ROOT / "tools" / "train.py"), "fit"]
     command += [f"--config={ROOT}/configs/train/default.yaml", f"--config={BENCH}/train.yaml"]
     command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
@@ -130,7 +132,9 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
     begin = time.perf_counter()
     with (target.parent / f"{target.name}.log").open("w") as log:
         subprocess.run(command, check=True, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
-    return {"seconds": time.perf_counter() - begin, "steps": steps}
+    row: Row = {"seconds": time.perf_counter() - begin, "steps": steps}
+    account.write_text(json.dumps(row))
+    return row
 
 
 def what_failed(told: str) -> str:

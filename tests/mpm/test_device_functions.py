@@ -251,10 +251,10 @@ def _strained(device):
 
 @pytest.mark.parametrize(("law", "ratio"), CASES, ids=lambda x: x if isinstance(x, str) else type(x).__name__)
 def test_wave_modulus_and_energy(kernel_device, law, ratio):
-    """Against float64, to what ten roundings of F (of 1.2e-7) change.
+    """Against float64, to what a hundred roundings (of 1.2e-7) change: roots and divisions of a GPU are of 2 ulp.
 
     A modulus divides by the sum of two stretches, which is exact to the rounding of the largest. That of a corotated
-    body keeps but the root of the rounding where two eigenvalues in closed form are equal.
+    body and of a network keeps but the root of the rounding where two eigenvalues in closed form are equal.
     """
     mu, lam = LAME[ratio]
     F = _strained(kernel_device)
@@ -264,9 +264,9 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
     parameters = [torch.full_like(wide[:, 0, 0], value) for value in (mu, lam)]
     values = linalg.svd3(wide)[1]
     expected = law.moduli(wide, *parameters)[0]
-    rounding = 5e-6 + 2e-7 * values[:, 0] / (values[:, 1] + values[:, 2]).abs()
-    if isinstance(law, materials.FixedCorotated):
-        rounding = 5e-4
+    rounding = 1.2e-5 + 5e-7 * values[:, 0] / (values[:, 1] + values[:, 2]).abs()
+    if not isinstance(law, materials.StVKHencky):
+        rounding = rounding.clamp(min=5e-4)
     error = (wave - expected).abs() / expected
     assert bool((error <= rounding).all()), f"{float((error / rounding).max()):.1e}"
     if lam > 0 or isinstance(law, materials.StVKHencky):  # or there is no network, and nothing stiffens

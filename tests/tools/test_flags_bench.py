@@ -138,3 +138,22 @@ def test_goals_and_what_one_change_does(flags):
     assert "half the thickness, twice E and density -0.20; no shading +0.00; without the" in lines[1]
     assert lines[1].endswith("damping +0.50")
     assert flags.pattern_lines(rows, 1) == []
+
+
+def test_a_training_that_is_there_is_kept_with_its_account(tmp_path, monkeypatch):
+    """And one that is not is run, and its account written."""
+    target = tmp_path / "all_losses"
+
+    def made(command, **_):
+        assert f"--trainer.default_root_dir={target}" in command
+        target.mkdir()
+        (target / "point_cloud.ply").write_bytes(b"ply")
+
+    monkeypatch.setattr(flags.subprocess, "run", made)
+    first = flags.train(1, flags.VARIANTS["ours"], tmp_path, target, 7)
+    assert first["steps"] == 7
+    assert first["seconds"] >= 0
+    monkeypatch.setattr(flags.subprocess, "run", lambda *_, **__: pytest.fail("trained again"))
+    assert flags.train(1, flags.VARIANTS["ours"], tmp_path, target, 7) == first
+    (target / "training.json").unlink()
+    assert flags.train(1, flags.VARIANTS["ours"], tmp_path, target, 7) == {"kept": True}
