@@ -180,7 +180,9 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
         "mass_kg": summary["mass_kg"],
     }
     row["ms_per_frame"] /= max(summary["frames"], 1)
-    found = compare_run(output, reference, frames=options.frames or summary["frames"], points=options.points)
+    on = "cuda" if summary["peak_memory_bytes"]["device"] is not None else "cpu"  # where it ran
+    frames = options.frames or summary["frames"]
+    found = compare_run(output, reference, frames=frames, points=options.points, device=on)
     row |= {key: found[key] for key in ("chamfer_share", "sampling_m", "psnr_of_mean_db") if key in found}
     row["mean"] = found["mean"]
     row["chamfer_per_frame_m"] = [entry.get("chamfer_m") for entry in found["per_frame"]]

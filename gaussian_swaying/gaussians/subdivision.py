@@ -13,6 +13,7 @@ from gaussian_swaying.gaussians.surface import quat_to_rotation
 
 _VISIBLE = 0.25  # opacity down to which a Gaussian counts as surface
 _NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: those amid a square of four
+_ROUNDS = 3  # of trying the next point of a cell
 _LONGEST = 2001  # pieces along an axis
 
 
@@ -104,17 +105,31 @@ def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:
 def _thin(points: Tensor, order: Tensor, taken: Tensor, distance: float) -> Tensor:
     """Indices of points that are at least a distance from those taken, and about as far from each other.
 
-    Of several in one cell of a grid of this size the first by ``order`` stays, then the same on a shifted grid.
+    Of several in one cell of a grid the first by ``order`` is tried; where it is too close to what is taken, the next.
     """
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.long)
-    far, _ = nearest_neighbours(taken, 1, points)
-    free = (far[:, 0] >= distance).nonzero()[:, 0]
-    free = free[order[free].argsort(stable=True)]
-    for shift in (0.0, 0.5):  # two grids, so that most pairs share a cell in one
-        cell = torch.floor(points[free] / distance + shift).long()
-        _, owner = torch.unique(cell, dim=0, return_inverse=True)
-        first = torch.full((int(owner.max()) + 1 if len(owner) else 0,), len(free), dtype=torch.long)
-        first.scatter_reduce_(0, owner, torch.arange(len(free)), "amin")
-        free = free[first.sort().values]
-    return free.sort().values
+    everything = torch.cat([taken, points])
+    ranked = torch.cat([torch.arange(len(taken)), order.argsort(stable=True) + len(taken)])
+    pool = _first_in_cell(everything, ranked, 0.5 * distance, 0.0)  # many Gaussians overlap
+    pool, kept = pool[pool >= len(taken)], pool[:0]
+    for _ in range(_ROUNDS):
+        tried = pool
+        for shift in (0.0, 0.5):  # two grids, so that most pairs share a cell in one
+            tried = _first_in_cell(everything, tried, distance, shift)
+        far, _ = nearest_neighbours(torch.cat([taken, everything[kept]]), 1, everything[tried])
+        kept = torch.cat([kept, tried[far[:, 0] >= distance]])
+        pool = pool[~torch.isin(pool, tried)]
+    return kept.sort().values - len(taken)
+
+
+def _first_in_cell(points: Tensor, ranked: Tensor, size: float, shift: float) -> Tensor:
+    """Of ranked indices of points those that come first in their cell of a grid, still ranked."""
+    cell = torch.floor(points[ranked] / size + shift).long()
+    cell -= cell.amin(0) if len(cell) else 0
+    extent = cell.amax(0) + 1 if len(cell) else cell.new_ones(3)
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    sorted_key, by_key = key.sort(stable=True)
+    first = torch.ones(len(key), dtype=torch.bool)
+    first[1:] = sorted_key[1:] != sorted_key[:-1]
+    return ranked[by_key[first].sort().values]

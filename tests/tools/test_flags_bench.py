@@ -140,7 +140,7 @@ def test_goals_and_what_one_change_does(flags):
     assert flags.pattern_lines(rows, 1) == []
 
 
-def test_a_training_that_is_there_is_kept_with_its_account(tmp_path, monkeypatch):
+def test_a_training_that_is_there_is_kept_with_its_account(flags, tmp_path, monkeypatch):
     """And one that is not is run, and its account written."""
     target = tmp_path / "all_losses"
 
