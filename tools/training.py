@@ -422,8 +422,9 @@ time on the host for each image, with its hooks, its optimiser wrapper and what 
 picture of this size keeps the GPU busy for little longer than its launches take. What brought it down so far: a
 random stream of its own in place of seeding every step, losses that reach the host one step late, images as bytes in
 page-locked memory, cameras kept on the device, a progress bar drawn every twentieth image, images moved without a
-search through their fields. Since these runs pictures are also put together from gsplat's functions, without the
-inversion of the camera's matrix for which the host waits in the middle of a step; that is not in the times below."""
+search through their fields, pictures put together from gsplat's functions without the inversion of the camera's matrix,
+for which the host waits in the middle of a step. The two pairs are of two runs; pairs that other work of the same
+machine ran beside were left out."""
 
 
 def page(recorded: list[Row]) -> list[str]:

@@ -23,6 +23,9 @@ def test_each_scene_has_its_files(gallery):
         files = [Path(part) for part in gallery.arguments(name, "preview") if part != "--config"]
         assert all(file.is_file() for file in files), files
         assert len(files) >= (2 if not name.startswith("solid_surface") else 1)
+    files = [Path(part) for part in gallery.arguments("sand_to_foam", "preview") if part != "--config"]
+    order = [f"{file.parent.name}/{file.stem}" for file in files]
+    assert order == ["sim/sand", "preview/sand", "variants/sand_to_foam"]
 
 
 def test_a_scene_is_run_and_pictured(gallery, tmp_path):
