@@ -49,8 +49,8 @@ LIMITS: list[str] = [
     " once fill the GPU.",
     "Frames: most of one is simulation, at more time for a substep than a long rollout takes, as a frame's substeps"
     " are their own rollout, which sorts, reads out and looks for the largest speed once. Tried for frames: idle lanes"
-    " in the middle of their cell, gusts recorded in the graphs, an energy kernel. In an object of few, crowded cells (the"
-    " guitar) one program for a cell was too few to fill the GPU: crowded cells are cut into pieces.",
+    " in the middle of their cell, gusts recorded in the graphs, an energy kernel. In an object of few, crowded cells"
+    " (the guitar) one program for a cell was too few to fill the GPU: crowded cells are cut into pieces.",
 ]
 """What limits the speed, a sentence each: text of the page that is no measurement."""
 
