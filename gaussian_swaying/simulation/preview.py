@@ -18,6 +18,7 @@ from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder, Not, Region, Union
+from gaussian_swaying.gaussians.subdivision import subdivide
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, smallest_axis_normal
 from gaussian_swaying.simulation.frame import SimFrame
 from gaussian_swaying.simulation.lean import SHELL_E, SHELL_THICKNESS, cantilever_lean, stiffness_for, thinned
@@ -173,6 +174,7 @@ class Suggestion:
         size: Sides of the object along the z-up axes [m].
         spacing: Particle spacing [m], see :func:`particle_spacing`.
         dx: Grid spacing [m].
+        fill_spacing: Spacing of further points on large Gaussians [m], see :func:`suggest_fill`; None if not needed.
         sheet: Whether the object is a thin sheet.
         azimuth: Azimuth of a camera that sees the broad side [degrees].
         flow: Wind across the picture, or along a sheet from where it is held [m/s], z up.
@@ -190,6 +192,7 @@ class Suggestion:
     size: tuple[float, ...]
     spacing: float
     dx: float
+    fill_spacing: float | None
     sheet: bool
     azimuth: float
     flow: tuple[float, ...]
@@ -283,6 +286,7 @@ def suggest(
         size=tuple(float(v) for v in metres.amax(0) - metres.amin(0)),
         spacing=spacing,
         dx=dx,
+        fill_spacing=suggest_fill(cloud.select(chosen.simulated), frame.metres_per_unit, dx),
         sheet=flat is not None,
         azimuth=round(azimuth + 20.0, 1),
         flow=tuple(round(c, 2) + 0.0 for c in flow),
@@ -691,6 +695,25 @@ def suggest_spacing(longest_side: float, spacing: float) -> float:
     """
     check_positive("longest_side", longest_side)
     return float(f"{max(longest_side / CELLS, 2 * spacing):.2g}")
+
+
+def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> float | None:
+    """``scene.particle_spacing``, if the splat has holes for the grid: points more than 0.6 cells from any centre.
+
+    Args:
+        cloud: What is simulated.
+        metres_per_unit: Length of a scene unit [m].
+        dx: Grid spacing [m].
+
+    Returns:
+        0.45 ``dx`` to 2 digits [m], or None if such points are fewer than two in a hundred.
+    """
+    spacing = float(f"{0.45 * dx:.2g}")
+    opacity = cloud.opacities.sigmoid()
+    further = subdivide(cloud.means, cloud.quats, cloud.scales, opacity, spacing / metres_per_unit).means
+    distance, _ = nearest_neighbours(cloud.means, 1, further)
+    holes = int((distance * metres_per_unit > 0.6 * dx).sum())
+    return spacing if holes > 0.02 * len(cloud) else None
 
 
 def broad_side(points: Tensor) -> float:

@@ -280,6 +280,8 @@ def _suggestion_lines(found: Suggestion) -> list[str]:
         f"{found.metres_per_unit:.4g} m, as the longest side is taken as {found.longest_side:g} m",
         f"grid            dx = {found.dx:g} m: {found.longest_side / found.dx:.0f} cells along the longest side, "
         f"{found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of {found.spacing:.3g} m",
+        "further points  "
+        + ("none needed" if found.fill_spacing is None else f"every {found.fill_spacing:g} m on large Gaussians"),
         f"material        {_material(found)}",
         f"wind            {_numbers(found.flow)} m/s, z up",
     ]

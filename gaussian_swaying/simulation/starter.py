@@ -49,6 +49,12 @@ aero:
 """
 
 
+def _fill(s: Suggestion) -> str:
+    if s.fill_spacing is None:
+        return f"{'null':<12}# m; where Gaussians are large for the grid, 0.45 dx fills the holes between their centres"
+    return f"{s.fill_spacing:<12g}# m; 0.45 dx: fills the holes between the centres of large Gaussians"
+
+
 def region_dict(region: Region) -> dict[str, Any]:
     """A region as ``class_path`` and ``init_args``, open sides as None.
 
@@ -113,6 +119,7 @@ scene:
   opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
   faint: carry
   area: coverage
+  particle_spacing: {_fill(s)}
 
 {_CLOTH if s.sheet else _shell(s)}
 solver:

@@ -1,11 +1,13 @@
 """Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known."""
 
+import dataclasses
 import itertools
 import math
 from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
@@ -31,11 +33,13 @@ from gaussian_swaying.simulation.preview import (
     particle_spacing,
     sheet_normal,
     suggest,
+    suggest_fill,
     suggest_region,
     suggest_spacing,
     suggest_threshold,
     visible_weight,
 )
+from gaussian_swaying.simulation.starter import starter_yaml
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
@@ -120,6 +124,21 @@ def test_fine_flag_gets_the_cells_of_its_longest_side():
     found = suggest(FlagScene(spacing=0.0125).generate(), longest_side=1.2)
     assert found.dx == float(f"{1.2 / CELLS:.2g}")
     assert found.metres_per_unit == pytest.approx(1.2 / (1.2 - 0.0125))
+
+
+def test_large_gaussians_get_further_points():
+    """A sheet of a few huge Gaussians: more points than Gaussians, as the run then has."""
+    cloud = FlagScene(spacing=0.05).generate()
+    assert suggest(cloud).fill_spacing is None
+    wide = cloud.scales + math.log(4) * (cloud.scales > cloud.scales.amin(-1, keepdim=True))
+    few = torch.arange(len(cloud)) % 5 == 0
+    found = suggest(dataclasses.replace(cloud, scales=wide).select(few), longest_side=1.0)
+    fine = suggest_fill(dataclasses.replace(cloud, scales=wide).select(few), found.metres_per_unit, 0.06)
+    assert fine == 0.027
+    text = starter_yaml(dataclasses.replace(found, fill_spacing=fine), "flag.ply")
+    assert yaml.safe_load(text)["scene"]["particle_spacing"] == fine
+    text = starter_yaml(dataclasses.replace(found, fill_spacing=None), "flag.ply")
+    assert yaml.safe_load(text)["scene"]["particle_spacing"] is None
 
 
 def test_given_values_replace_guesses():
