@@ -565,21 +565,25 @@ def difference(pattern: FlagPattern, a: Cloth, b: Cloth, every: int = 1, along: 
     }
 
 
-VARIANTS = ("steps doubled", "coarser", "finer", "hardly bending")
+VARIANTS = ("steps doubled", "coarser", "finer", "half the cells", "hardly bending", "self-contact")
 
 
 def variants(pattern: FlagPattern, names: Iterable[str] = VARIANTS) -> dict[str, FlagPattern]:
     """The same flag with twice the steps, and on a mesh of three and of five quarters as many cells along a side.
 
-    The last is another flag, with a fiftieth of the bending stiffness on half as many cells: what bending does to it.
-    Where the mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
+    The last two are other flags, on half as many cells: with a fiftieth of the bending stiffness, which tells what
+    bending does to it, and one that keeps away from itself. Beside them stands the same flag on that mesh. Where the
+    mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
     """
     coarser, finer = (replace(pattern, cells=times * pattern.cells // 4) for times in (3, 5))
-    slack = replace(pattern, cells=pattern.cells // 2, bending=0.02)
+    half = replace(pattern, cells=pattern.cells // 2)
+    slack, apart = replace(half, bending=0.02), replace(half, self_collision=True)
     table = {
         "steps doubled": replace(pattern, quality=2 * pattern.quality),
         "coarser": replace(coarser, quality=least_quality(coarser)),
         "finer": replace(finer, quality=least_quality(finer)),
+        "half the cells": replace(half, quality=least_quality(half)),
         "hardly bending": replace(slack, quality=least_quality(slack)),
+        "self-contact": replace(apart, quality=least_quality(apart)),
     }
     return {name: table[name] for name in names}

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from gaussian_swaying.data.capture import read_capture
-from gaussian_swaying.rendering.camera import TransformsCamera
+from gaussian_swaying.rendering.camera_path import TransformsCamera
 
 TOOLS = Path(__file__).parents[2] / "tools"
 NAMES = ("blender_cloth", "blender_checks", "blender_images", "flag_reference", "make_flag_dataset")
@@ -304,15 +304,17 @@ def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, t
         "steps doubled": (30, 16),
         "coarser": (22, 8),
         "finer": (37, 8),
+        "half the cells": (15, 8),
         "hardly bending": (15, 8),
+        "self-contact": (15, 8),
     }
     # the fake moves them alike; what is left is the ripple between the vertices of a coarser mesh, a (k face)^2 / 8
     bound = 0.003 * (1.5 * 3 * math.pi / 15) ** 2 / 8 / 1.2
     assert all(row["chamfer"] <= 1.5 * bound for row in written["variants"].values())
     assert written["variants"]["steps doubled"]["chamfer"] == 0
-    assert calls == [8, 16, 8, 8, 8]
+    assert calls == [8, 16, 8, 8, 8, 8, 8]
     tool.make_uncertainty(pattern, tmp_path, ["coarser"], lines.append, along=20)
-    assert len(calls) == 5
+    assert len(calls) == 7
 
 
 def test_bending_is_that_of_a_plate_unless_given(reference):
@@ -321,6 +323,9 @@ def test_bending_is_that_of_a_plate_unless_given(reference):
     assert pattern.material().bending == pytest.approx(3e3 * 0.01**3 / 12 / (1 - 0.3**2))
     slack = reference.variants(pattern, ["hardly bending"])["hardly bending"]
     assert slack.material().bending == pytest.approx(0.02 * pattern.material().bending)
+    apart = reference.variants(pattern, ["self-contact"])["self-contact"]
+    assert apart.run().self_collision
+    assert not pattern.run().self_collision
     assert "bending" not in pattern.cloth_settings()
     assert slack.cloth_settings()["bending"] == 0.02
 
