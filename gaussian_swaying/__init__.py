@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     )
     from gaussian_swaying.mpm.solver import MPMSolver
     from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
-    from gaussian_swaying.rendering.camera import Camera, LookAtCamera, OrbitCamera, TransformsCamera
+    from gaussian_swaying.rendering.camera import Camera
+    from gaussian_swaying.rendering.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
     from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
     from gaussian_swaying.rendering.keyframes import CameraKey, KeyframedCamera
     from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
@@ -61,10 +62,12 @@ if TYPE_CHECKING:
     from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
     from gaussian_swaying.simulation.edits import Edit
     from gaussian_swaying.simulation.frame import SimFrame
-    from gaussian_swaying.simulation.physgaussian import Normalisation, PhysGaussianCamera
+    from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera
+    from gaussian_swaying.simulation.physgaussian_space import Normalisation
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
-    from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
+    from gaussian_swaying.simulation.recorder import Recorder
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+    from gaussian_swaying.simulation.trajectory import load_trajectory
     from gaussian_swaying.training.densification import DefaultDensification, MCMCDensification
     from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
     from gaussian_swaying.training.module import SplatTrainer
@@ -112,7 +115,8 @@ _HOMES = {
     ),
     "mpm.solver": ("MPMSolver",),
     "mpm.state": ("GridSpec", "MPMState", "MaterialPoints"),
-    "rendering.camera": ("Camera", "LookAtCamera", "OrbitCamera", "TransformsCamera"),
+    "rendering.camera": ("Camera",),
+    "rendering.camera_path": ("LookAtCamera", "OrbitCamera", "TransformsCamera"),
     "rendering.gsplat_renderer": ("GsplatRenderer",),
     "rendering.keyframes": ("CameraKey", "KeyframedCamera"),
     "rendering.shading": ("DiffuseShader", "PhongShader"),
@@ -120,10 +124,12 @@ _HOMES = {
     "simulation.diagnostics": ("SimulationDiverged", "TearingGauge"),
     "simulation.edits": ("Edit",),
     "simulation.frame": ("SimFrame",),
-    "simulation.physgaussian": ("Normalisation", "PhysGaussianCamera"),
+    "simulation.physgaussian_camera": ("PhysGaussianCamera",),
+    "simulation.physgaussian_space": ("Normalisation",),
     "simulation.pipeline": ("SimulationPipeline",),
-    "simulation.recorder": ("Recorder", "load_trajectory"),
+    "simulation.recorder": ("Recorder",),
     "simulation.scene": ("Material", "Scene", "SimulatedScene"),
+    "simulation.trajectory": ("load_trajectory",),
     "training.densification": ("DefaultDensification", "MCMCDensification"),
     "training.losses": ("LossInputs", "LossTerm", "TotalLoss"),
     "training.module": ("SplatTrainer",),

@@ -4,8 +4,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from gaussian_swaying.simulation.files import atomic
 from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
-from gaussian_swaying.simulation.recorder import atomic
 
 
 def main(arguments=None):

@@ -12,15 +12,10 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.data.colmap import colmap_model, read_colmap_views
 from gaussian_swaying.data.transforms import transforms_files
 from gaussian_swaying.gaussians.surface import quat_to_rotation, rotation_to_quat
-from gaussian_swaying.rendering.camera import (
-    Camera,
-    CameraPath,
-    _check_pixels,
-    camera_of_transforms,
-    load_transforms,
-    resized_intrinsics,
-)
+from gaussian_swaying.rendering.camera import Camera, check_pixels, resized_intrinsics
+from gaussian_swaying.rendering.camera_path import CameraPath
 from gaussian_swaying.rendering.keyframes import INTERPOLATIONS, interpolate_keys
+from gaussian_swaying.rendering.transforms_json import camera_of_transforms, load_transforms
 
 
 def read_views(
@@ -103,8 +98,8 @@ class CaptureCamera(CameraPath):
         check_positive("near", near)
         self.path, self.view, self.seconds_per_view = path, view, float(seconds_per_view)
         self.interpolation, self.near = interpolation, float(near)
-        self.width = None if width is None else _check_pixels("width", width)
-        self.height = None if height is None else _check_pixels("height", height)
+        self.width = None if width is None else check_pixels("width", width)
+        self.height = None if height is None else check_pixels("height", height)
         self._cameras: list[Camera] = []
         self._rows: list[list[float]] = []
 

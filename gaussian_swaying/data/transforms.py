@@ -9,7 +9,7 @@ import torch
 
 from gaussian_swaying.data.images import PosedImage, image_size
 from gaussian_swaying.data.lens import Lens
-from gaussian_swaying.rendering.camera import load_transforms, read_intrinsics, read_number, read_pose
+from gaussian_swaying.rendering.transforms_json import load_transforms, read_intrinsics, read_number, read_pose
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _SPLITS = ("train", "val", "test")
@@ -36,8 +36,8 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
     """Read the cameras of a capture in the style of NeRF, Blender, instant-ngp or Nerfstudio.
 
     Intrinsics come from the frame or from the top of the file, as in
-    :func:`~gaussian_swaying.rendering.camera.camera_from_transforms`; a missing ``w`` and ``h`` is the size of the
-    image. ``file_path`` may lack its extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and ``p2``. A file per
+    :func:`~gaussian_swaying.rendering.transforms_json.camera_from_transforms`; a missing ``w`` and ``h`` is the size of
+    the image. ``file_path`` may lack its extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and ``p2``. A file per
     split, or lists ``train_filenames``, ``val_filenames`` and ``test_filenames``, say what is for training.
 
     Args:

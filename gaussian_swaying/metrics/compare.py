@@ -1,4 +1,4 @@
-"""A run beside a reference: pictures, surface and, with a network, video. Numbers, a table, a video of the errors."""
+"""A run beside a reference, frame by frame: pictures, surface and, with a network, video. Numbers, a table, files."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,97 +19,20 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.data.images import average_down, image_size, read_image
-from gaussian_swaying.data.point_cloud import PointCloud, sample_mesh
+from gaussian_swaying.data.images import image_size, read_image
+from gaussian_swaying.metrics.comparison_picture import comparison_picture
+from gaussian_swaying.metrics.reference import Cloth, frame_files, read_cloth, surface_points
 from gaussian_swaying.rendering.camera import rotation_from_z
+from gaussian_swaying.simulation.files import atomic, write_json
 from gaussian_swaying.simulation.frame import SimFrame
 from gaussian_swaying.simulation.pipeline import describe_device, versions
-from gaussian_swaying.simulation.recorder import VideoEncoder, atomic, load_trajectory, write_json
-from gaussian_swaying.training.panels import color_ramp
+from gaussian_swaying.simulation.trajectory import load_trajectory
+from gaussian_swaying.simulation.video import VideoEncoder
 
 if TYPE_CHECKING:
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
-ERROR_SCALE = 0.25  # absolute error at the bright end of the error map
-PANEL_WIDTH = 640  # pixels; wider pictures are averaged down by a whole number in the video
 _SSIM_WINDOW = 11
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Cloth:
-    """The surface of a reference.
-
-    Attributes:
-        positions: Vertices of each frame in the axes and from the origin of the scene [m], float32, shape (T, V, 3).
-        faces: Triangles as indices of vertices, shape (F, 3).
-        side: Its longer side at rest [m], if the file says so.
-    """
-
-    positions: Tensor
-    faces: Tensor
-    side: float | None = None
-
-
-def read_cloth(path: str | os.PathLike[str]) -> Cloth:
-    """Read ``cloth.npz``: ``positions`` (T, V, 3) [m] and ``faces`` (F, 3), or (F, 4), whose squares are halved.
-
-    The longer side [m] is ``side``, or else the larger of ``width`` and ``height`` in the JSON text ``settings``, if
-    they are there.
-
-    Raises:
-        ValueError: If the file is missing or damaged, lacks an array, or one has a wrong shape or value.
-    """
-    try:
-        with np.load(path) as arrays:
-            found = {name: arrays[name] for name in ("positions", "faces", "side", "settings") if name in arrays}
-    except Exception as error:  # not there, not a zip, pickled, ...
-        raise ValueError(f"The surface {path} cannot be read ({error}): make the reference again.") from error
-    for name in ("positions", "faces"):
-        if name not in found:
-            raise ValueError(f"The surface {path} has no array `{name}`: make the reference again.")
-    positions = torch.from_numpy(found["positions"].astype(np.float32))
-    faces = torch.from_numpy(found["faces"].astype(np.int64))
-    if positions.dim() != 3 or positions.shape[-1] != 3 or len(positions) == 0:
-        raise ValueError(f"Expected `positions` of {path} of shape (T, V, 3), but got {tuple(positions.shape)}.")
-    if faces.dim() != 2 or faces.shape[-1] not in (3, 4) or len(faces) == 0:
-        raise ValueError(f"Expected `faces` of {path} of shape (F, 3) or (F, 4), but got {tuple(faces.shape)}.")
-    if faces.shape[-1] == 4:
-        faces = torch.cat([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-    if int(faces.min()) < 0 or int(faces.max()) >= positions.shape[1]:
-        raise ValueError(f"Expected `faces` of {path} to hold indices from 0 to {positions.shape[1] - 1}.")
-    if not bool(torch.isfinite(positions).all()):
-        raise ValueError(f"Expected `positions` of {path} to be finite: make the reference again.")
-    return Cloth(positions, faces, _side(path, found))
-
-
-def _side(path: str | os.PathLike[str], found: dict[str, Any]) -> float | None:
-    if "side" in found:
-        side = float(found["side"])
-    else:
-        settings = json.loads(str(found.get("settings", "{}")))
-        if not {"width", "height"} <= set(settings):
-            return None
-        side = float(max(settings["width"], settings["height"]))
-    check_positive(f"side of {path}", side)
-    return side
-
-
-def surface_points(vertices: Tensor, faces: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Points drawn evenly by area from a triangle mesh; the same seed gives the same points of the same mesh.
-
-    Args:
-        vertices: Vertices [m], shape (V, 3).
-        faces: Triangles, shape (F, 3).
-        count: Number of points.
-        seed: Of the random numbers.
-
-    Returns:
-        Points [m], float32, shape (count, 3).
-
-    Raises:
-        ValueError: If the mesh has no area or a face names a vertex that does not exist.
-    """
-    return sample_mesh(PointCloud(vertices, torch.zeros_like(vertices)), faces, count, seed).points
 
 
 def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
@@ -141,53 +62,6 @@ def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
         "ssim": float(structural_similarity_index_measure(one, two, data_range=1.0)),  # type: ignore[arg-type]
         "mse": float((one - two).square().mean()),
     }
-
-
-def comparison_picture(
-    reference: Tensor,
-    image: Tensor,
-    labels: Sequence[str] = ("reference", "run"),
-    error_scale: float = ERROR_SCALE,
-    panel_width: int = PANEL_WIDTH,
-) -> np.ndarray:
-    """Reference, run and absolute error side by side, labelled.
-
-    The error is the mean over the colours, from dark blue (0) to yellow (``error_scale`` and more).
-
-    Args:
-        reference: Picture from 0 to 1, shape (H, W, 3).
-        image: Picture of the run, of the same shape.
-        labels: What is written above the two.
-        error_scale: Error at the bright end.
-        panel_width: Wider pictures are averaged down by the smallest whole number that makes them fit [pixels].
-
-    Returns:
-        Picture, uint8, shape (h + band, 3 w + gaps, 3).
-    """
-    from PIL import Image, ImageDraw, ImageFont
-
-    factor = math.ceil(reference.shape[1] / panel_width)
-    error = color_ramp((image - reference).abs().mean(-1) / error_scale)
-    panels = [average_down(p.permute(2, 0, 1).float(), factor).permute(1, 2, 0) for p in (reference, image, error)]
-    height, width = panels[0].shape[:2]
-    band, gap = max(16, height // 14), 2
-    ramp = color_ramp(torch.linspace(0, 1, width // 4)).expand(band // 2, -1, 3)
-    bytes_of = [(p.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy() for p in (*panels, ramp)]
-    whole = np.full((height + band, 3 * width + 2 * gap, 3), 24, dtype=np.uint8)
-    for number, pixels in enumerate(bytes_of[:3]):
-        whole[band:, number * (width + gap) :][:, :width] = pixels
-    picture = Image.fromarray(whole)
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(0.62 * band)
-    pad, middle = band // 3, band / 2
-    for number, label in enumerate((*labels, "absolute error")):
-        draw.text((number * (width + gap) + pad, middle), label, (235, 235, 235), font, anchor="lm")
-    end = whole.shape[1] - pad
-    end -= int(draw.textlength(f"{error_scale:g}", font))
-    draw.text((end, middle), f"{error_scale:g}", (235, 235, 235), font, anchor="lm")
-    bar = end - pad // 2 - ramp.shape[1]
-    picture.paste(Image.fromarray(bytes_of[3]), (bar, (band - len(ramp)) // 2))
-    draw.text((bar - pad // 2, middle), "0", (235, 235, 235), font, anchor="rm")
-    return np.asarray(picture)
 
 
 def compare_run(
@@ -439,23 +313,6 @@ def evaluate(
     return result
 
 
-def frame_files(folder: Path) -> list[Path]:
-    """The pictures ``frames/<number>.png`` of a folder in order; their numbers must follow one another.
-
-    Raises:
-        ValueError: If a name is not a number or a number is missing.
-    """
-    files = [path for path in (folder / "frames").glob("*.png") if not path.name.startswith(".")]
-    for path in files:
-        if not path.stem.isdecimal():
-            raise ValueError(f"Expected {path} to be named by the number of its frame: rename it, or take it away.")
-    files.sort(key=lambda path: int(path.stem))
-    for before, after in pairwise(files):
-        if int(after.stem) != int(before.stem) + 1:
-            raise ValueError(f"Between {before} and {after.name} frames are missing or double: make them again.")
-    return files
-
-
 class _Surface:
     """Chamfer distances between the particles of a run and the surface of a reference."""
 
@@ -612,14 +469,4 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
     return f"| {cells[0]:<{widths[0]}} | {cells[1]:>{widths[1]}} | {cells[2]:>{widths[2]}} |"
 
 
-__all__ = [
-    "Cloth",
-    "compare_run",
-    "comparison_picture",
-    "evaluate",
-    "frame_files",
-    "picture_errors",
-    "read_cloth",
-    "surface_points",
-    "table",
-]
+__all__ = ["compare_run", "evaluate", "picture_errors", "table"]

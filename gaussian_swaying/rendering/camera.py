@@ -1,11 +1,8 @@
-"""Pinhole cameras in the OpenCV convention, and the camera paths that a configuration can name."""
+"""Pinhole cameras in the OpenCV convention, and how to place one."""
 
-import json
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +11,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
 
 
-def _check_pixels(name: str, value: Any) -> int:
+def check_pixels(name: str, value: Any) -> int:
     """Return ``value`` if it is a positive integer, or raise an error that names the field."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"Expected `{name}` to be a whole number of pixels, but got {value!r}.")
@@ -23,10 +20,17 @@ def _check_pixels(name: str, value: Any) -> int:
     return value
 
 
-def _check_fov(name: str, value: float) -> float:
+def check_fov(name: str, value: float) -> float:
     """Return ``value`` if it is a field of view in degrees, or raise an error that names the field."""
     if not 0.0 < value < 180.0:
         raise ValueError(f"Expected `{name}` to be between 0 and 180 degrees (both excluded), but got {value}.")
+    return float(value)
+
+
+def check_elevation(name: str, value: float) -> float:
+    """Return ``value`` if it is an elevation in degrees, or raise an error that names the field."""
+    if not -90.0 < value < 90.0:
+        raise ValueError(f"Expected `{name}` to be between -90 and 90 degrees (both excluded), but got {value}.")
     return float(value)
 
 
@@ -58,8 +62,8 @@ class Camera:
     def __post_init__(self) -> None:
         check_shape("world_to_camera", self.world_to_camera, 4, 4)
         check_shape("intrinsics", self.intrinsics, 3, 3)
-        _check_pixels("width", self.width)
-        _check_pixels("height", self.height)
+        check_pixels("width", self.width)
+        check_pixels("height", self.height)
         check_positive("near", self.near)
 
     @property
@@ -105,7 +109,7 @@ def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
     Raises:
         ValueError: If ``up`` is zero or not finite.
     """
-    return torch.tensor(_rows_from_z(_unit("up", up)), dtype=torch.float64)
+    return torch.tensor(_rows_from_z(check_direction("up", up)), dtype=torch.float64)
 
 
 # A camera is made for every frame: plain numbers take a tenth of the time of small tensors.
@@ -120,8 +124,8 @@ def _rows_from_z(up: Sequence[float]) -> list[list[float]]:
     return [[1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]]
 
 
-def _unit(name: str, value: Sequence[float] | Tensor) -> tuple[float, ...]:
-    """Return a checked 3-vector of length one."""
+def check_direction(name: str, value: Sequence[float] | Tensor) -> tuple[float, ...]:
+    """Return ``value`` as a 3-vector of length one, or raise an error that names the field."""
     vector = check_vector(name, value)
     length = math.hypot(*vector)
     if length < 1e-12:
@@ -174,9 +178,9 @@ def look_at_camera(
         >>> look_at_camera((0, -2, 0), (0, 0, 0), (0, 0, 1), 40.0, 480, 270).position[1]
         tensor(-2.)
     """
-    width, height = _check_pixels("width", width), _check_pixels("height", height)
-    tangent = math.tan(math.radians(0.5 * _check_fov("fov_y_degrees", fov_y_degrees)))
-    eye_point, up_axis = check_vector("eye", eye), _unit("up", up)
+    width, height = check_pixels("width", width), check_pixels("height", height)
+    tangent = math.tan(math.radians(0.5 * check_fov("fov_y_degrees", fov_y_degrees)))
+    eye_point, up_axis = check_vector("eye", eye), check_direction("up", up)
     forward = [a - b for a, b in zip(check_vector("target", target), eye_point, strict=True)]
     distance = math.hypot(*forward)
     if distance < 1e-12:
@@ -240,79 +244,14 @@ def orbit_camera(
         ValueError: If a number is out of range.
     """
     check_positive("radius", radius)
-    _check_elevation("elevation_degrees", elevation_degrees)
+    check_elevation("elevation_degrees", elevation_degrees)
     azimuth, elevation = math.radians(azimuth_degrees), math.radians(elevation_degrees)
     horizontal = math.cos(elevation)
     local = [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), math.sin(elevation)]
     center_point = check_vector("center", center)
-    offset = [_dot(row, local) for row in _rows_from_z(_unit("up", up))]
+    offset = [_dot(row, local) for row in _rows_from_z(check_direction("up", up))]
     eye = [c + radius * o for c, o in zip(center_point, offset, strict=True)]
     return look_at_camera(eye, center_point, up, fov_y_degrees, width, height, near, device=device, dtype=dtype)
-
-
-def _check_elevation(name: str, value: float) -> float:
-    """Return ``value`` if it is an elevation in degrees that leaves the up direction defined."""
-    if not -90.0 < value < 90.0:
-        raise ValueError(f"Expected `{name}` to be between -90 and 90 degrees (both excluded), but got {value}.")
-    return float(value)
-
-
-def camera_from_transforms(
-    path: str | Path,
-    frame: int,
-    width: int | None = None,
-    height: int | None = None,
-    near: float = 0.01,
-) -> Camera:
-    """Read one camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
-
-    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). The intrinsics come from
-    ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
-    the frame wins over the one at the top of the file. Missing ``cx`` and ``cy`` are the image centre, missing
-    ``fl_y`` makes square pixels (or comes from ``camera_angle_y``). Lens distortion (``k1``, ``p1``, ...) is ignored:
-    undistort the images first.
-
-    Args:
-        path: The file.
-        frame: Index in its list ``frames``, from 0.
-        width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
-            the one that keeps the file's aspect ratio when only ``height`` is given.
-        height: Height of the image to render [pixels], likewise.
-        near: Near plane [scene units].
-
-    Returns:
-        The camera, in the default precision of torch.
-
-    Raises:
-        TypeError: If ``frame``, ``width`` or ``height`` is not an integer.
-        ValueError: If the file is missing, is not JSON, lacks a field or has a bad one. The message names the file,
-            the field and the remedy.
-    """
-    if isinstance(frame, bool) or not isinstance(frame, int):
-        raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
-    return camera_of_transforms(path, load_transforms(path), frame, width, height, near)
-
-
-def camera_of_transforms(
-    path: str | Path,
-    data: dict[str, Any],
-    frame: int,
-    width: int | None = None,
-    height: int | None = None,
-    near: float = 0.01,
-) -> Camera:
-    """One camera of a ``transforms.json`` that :func:`load_transforms` has read; see :func:`camera_from_transforms`."""
-    where = f"`{path}`"
-    frames = data["frames"]
-    if not 0 <= frame < len(frames):
-        raise ValueError(f"The camera file {where} has no frame {frame}: set `frame` between 0 and {len(frames) - 1}.")
-    for name, size in (("width", width), ("height", height)):
-        if size is not None:
-            _check_pixels(name, size)
-    pixels = read_intrinsics(where, {**data, **frames[frame]}, width, height)
-    intrinsics, width, height = resized_intrinsics(*pixels, width, height)
-    world_to_camera = torch.linalg.inv(read_pose(where, frame, frames[frame]))
-    return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
 
 
 def resized_intrinsics(
@@ -344,271 +283,3 @@ def resized_intrinsics(
         width,
         height,
     )
-
-
-def load_transforms(path: str | Path) -> dict[str, Any]:
-    """Read a ``transforms.json`` of NeRF, Blender or instant-ngp.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its fields; ``frames`` is a list of at least one dictionary.
-
-    Raises:
-        ValueError: If the file is missing, is not JSON or has no list ``frames``.
-    """
-    where = f"`{path}`"
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the camera file {where} ({error.strerror}): check `path`.") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"The camera file {where} is not valid JSON ({error}): export it again.") from error
-    frames = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
-        raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")
-    return data
-
-
-def read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
-    """Return a finite number of a transforms.json, or None if the field is missing."""
-    value = fields.get(name)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"The field `{name}` of the camera file {where} is {value!r}: set it to a number.")
-    return float(value)
-
-
-def read_intrinsics(
-    where: str, fields: dict[str, Any], width: int | None, height: int | None
-) -> tuple[float, float, float, float, float, float]:
-    """Return width, height, fx, fy, cx, cy [pixels] at the resolution of a transforms.json."""
-    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
-    w, h, fx, fy, cx, cy, angle_x, angle_y = (read_number(where, fields, name) for name in names)
-    if fx is not None and (w is None or h is None):
-        raise ValueError(f"The camera file {where} has `fl_x` but no `w` and `h`: add the size of its images [pixels].")
-    w = float(width) if w is None and width is not None else w
-    h = float(height) if h is None and height is not None else h
-    if w is None or h is None:
-        raise ValueError(f"The camera file {where} has no image size `w` and `h`: set both `width` and `height`.")
-    for name, angle in (("camera_angle_x", angle_x), ("camera_angle_y", angle_y)):
-        if angle is not None and not 0.0 < angle < math.pi:
-            raise ValueError(
-                f"The field `{name}` of the camera file {where} is {angle}: set it in radians, above 0 and below pi."
-            )
-    if fx is None and angle_x is None:
-        raise ValueError(
-            f"The camera file {where} has no focal length: add `fl_x` [pixels] or `camera_angle_x` [radians]."
-        )
-    if fx is None and angle_x is not None:
-        fx = 0.5 * w / math.tan(0.5 * angle_x)
-    assert fx is not None
-    if fy is None:
-        fy = fx if angle_y is None else 0.5 * h / math.tan(0.5 * angle_y)
-    for name, value in (("w", w), ("h", h), ("fl_x", fx), ("fl_y", fy)):
-        if value <= 0:
-            raise ValueError(f"The field `{name}` of the camera file {where} is {value}: set it to a positive number.")
-    return w, h, fx, fy, 0.5 * w if cx is None else cx, 0.5 * h if cy is None else cy
-
-
-def read_pose(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
-    """Return the camera-to-world matrix of a frame with OpenCV axes, in float64, shape (4, 4)."""
-    name = f"frames[{frame}].transform_matrix"
-    if "transform_matrix" not in fields:
-        raise ValueError(f"The camera file {where} has no `{name}`: add the camera-to-world matrix, 4 rows of 4.")
-    try:
-        matrix = torch.tensor(fields["transform_matrix"], dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"The field `{name}` of the camera file {where} must be 4 rows of 4 numbers.") from error
-    if tuple(matrix.shape) != (4, 4) or not bool(torch.isfinite(matrix).all()):
-        raise ValueError(
-            f"The field `{name}` of the camera file {where} must be 4 rows of 4 finite numbers, "
-            f"but has shape {tuple(matrix.shape)}."
-        )
-    if abs(float(torch.linalg.det(matrix))) < 1e-9:
-        raise ValueError(f"The field `{name}` of the camera file {where} is singular: export the camera again.")
-    return matrix * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenGL y, z -> OpenCV y, z
-
-
-class CameraPath(ABC):
-    """Base class of the camera paths that a configuration can name.
-
-    Attributes:
-        captured: Whether the cameras stood where photographs were taken, be it within the object's box.
-    """
-
-    captured: bool = False
-
-    @abstractmethod
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame.
-
-        Args:
-            frame: Index of the frame.
-            time: Time of the frame [s].
-            center: Centre of the object [scene units], shape (3,).
-            up: Up direction of the scene, shape (3,).
-            size: Longest side of the object [scene units].
-
-        Returns:
-            The camera, on the device and in the precision of ``center``.
-        """
-
-
-class OrbitCamera(CameraPath):
-    """Camera that looks at the object from a sphere around it, and may travel about the up direction.
-
-    See :func:`orbit_camera` for what azimuth and elevation mean.
-
-    Args:
-        width: Image width [pixels].
-        height: Image height [pixels].
-        fov_y: Vertical field of view [degrees].
-        azimuth: Angle about the up direction at time 0 [degrees].
-        elevation: Angle above the horizontal plane [degrees], between -90 and 90 (both excluded).
-        radius: Distance from the target, in multiples of the object's longest side.
-        degrees_per_second: Speed of the azimuth [degrees/s].
-        target_offset: From the object's centre to the point looked at, along the scene's axes, in multiples of the
-            object's longest side.
-        near: Near plane [scene units].
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range.
-    """
-
-    def __init__(
-        self,
-        width: int = 480,
-        height: int = 270,
-        fov_y: float = 40.0,
-        azimuth: float = -60.0,
-        elevation: float = 15.0,
-        radius: float = 2.0,
-        degrees_per_second: float = 0.0,
-        target_offset: Sequence[float] = (0.0, 0.0, 0.0),
-        near: float = 0.01,
-    ) -> None:
-        self.width, self.height = _check_pixels("width", width), _check_pixels("height", height)
-        self.fov_y = _check_fov("fov_y", fov_y)
-        self.azimuth = check_vector("azimuth", [azimuth], 1)[0]
-        self.elevation = _check_elevation("elevation", elevation)
-        check_positive("radius", radius)
-        self.radius = float(radius)
-        self.degrees_per_second = check_vector("degrees_per_second", [degrees_per_second], 1)[0]
-        self.target_offset = check_vector("target_offset", target_offset)
-        check_positive("near", near)
-        self.near = float(near)
-
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        check_positive("size", size)
-        return orbit_camera(
-            [c + size * o for c, o in zip(check_vector("center", center), self.target_offset, strict=True)],
-            up,
-            size * self.radius,
-            self.azimuth + self.degrees_per_second * time,
-            self.elevation,
-            self.fov_y,
-            self.width,
-            self.height,
-            self.near,
-            device=center.device,
-            dtype=center.dtype,
-        )
-
-
-class LookAtCamera(CameraPath):
-    """Camera that stands still at a given point.
-
-    Args:
-        eye: Position [scene units], 3 numbers.
-        target: Point at the image centre [scene units], 3 numbers.
-        up: Direction seen upwards in the image, 3 numbers; that of the scene when None.
-        width: Image width [pixels].
-        height: Image height [pixels].
-        fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units].
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range, or the line of sight is not defined.
-    """
-
-    def __init__(
-        self,
-        eye: Sequence[float],
-        target: Sequence[float],
-        up: Sequence[float] | None = None,
-        width: int = 480,
-        height: int = 270,
-        fov_y: float = 40.0,
-        near: float = 0.01,
-    ) -> None:
-        self.eye, self.target = check_vector("eye", eye), check_vector("target", target)
-        if self.eye == self.target:
-            raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(self.eye)}.")
-        self.up = None if up is None else _unit("up", up)
-        self.width, self.height = _check_pixels("width", width), _check_pixels("height", height)
-        self.fov_y = _check_fov("fov_y", fov_y)
-        check_positive("near", near)
-        self.near = float(near)
-
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        return look_at_camera(
-            self.eye,
-            self.target,
-            up if self.up is None else self.up,
-            self.fov_y,
-            self.width,
-            self.height,
-            self.near,
-            device=center.device,
-            dtype=center.dtype,
-        )
-
-
-class TransformsCamera(CameraPath):
-    """Captured camera of a ``transforms.json``; the file is read at the first frame.
-
-    Args:
-        path: The file, see :func:`camera_from_transforms`.
-        frame: Index of the camera in the file, from 0. It is the same camera in every frame of the video.
-        width: Image width [pixels]; by default that of the file.
-        height: Image height [pixels]; by default that of the file.
-        near: Near plane [scene units].
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range; at the first frame, if the file is bad.
-    """
-
-    captured = True
-
-    def __init__(
-        self,
-        path: str | Path,
-        frame: int = 0,
-        width: int | None = None,
-        height: int | None = None,
-        near: float = 0.01,
-    ) -> None:
-        if isinstance(frame, bool) or not isinstance(frame, int):
-            raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
-        if frame < 0:
-            raise ValueError(f"Expected `frame` not to be negative, but got {frame}.")
-        self.path, self.frame = path, frame
-        self.width = None if width is None else _check_pixels("width", width)
-        self.height = None if height is None else _check_pixels("height", height)
-        check_positive("near", near)
-        self.near = float(near)
-        self._camera: Camera | None = None
-
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        if self._camera is None:
-            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, self.near)
-        return self._camera.to(center.device, center.dtype)

@@ -13,13 +13,13 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.rendering.camera import (
     Camera,
-    CameraPath,
-    _check_elevation,
-    _check_fov,
-    _check_pixels,
+    check_elevation,
+    check_fov,
+    check_pixels,
     look_at_camera,
     orbit_camera,
 )
+from gaussian_swaying.rendering.camera_path import CameraPath
 
 INTERPOLATIONS = ("smooth", "linear")
 
@@ -153,17 +153,17 @@ class KeyframedCamera(CameraPath):
             columns = [_carried_on(name, [getattr(key, name) for key in keys]) for name in _ANGLES]
             self.places = [list(row) for row in zip(*columns, strict=True)]
             for _, elevation, radius in self.places:
-                _check_elevation("keys.elevation", elevation)
+                check_elevation("keys.elevation", elevation)
                 check_positive("keys.radius", radius)
         else:
             eyes = _carried_on("eye", [key.eye for key in keys])
             self.places = [list(check_vector("keys.eye", eye)) for eye in eyes]
         targets = _filled([key.target for key in keys], None)
         self.targets = [None if target is None else check_vector("keys.target", target) for target in targets]
-        self.fovs = [[_check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], fov_y)]
+        self.fovs = [[check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], fov_y)]
         self.interpolation = interpolation
         self.up = None if up is None else check_vector("up", up)
-        self.width, self.height = _check_pixels("width", width), _check_pixels("height", height)
+        self.width, self.height = check_pixels("width", width), check_pixels("height", height)
         check_positive("near", near)
         self.near = float(near)
 

@@ -18,12 +18,14 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.data.capture_camera import CaptureCamera
 from gaussian_swaying.mpm.boundary import RegionInFrame
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera import CameraPath, OrbitCamera
+from gaussian_swaying.rendering.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.keyframes import KeyframedCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.physgaussian import Normalisation, PhysGaussianCamera, convert, read_config, to_yaml
+from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
+from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera
+from gaussian_swaying.simulation.physgaussian_space import Normalisation
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene

@@ -1,4 +1,4 @@
-"""PhysGaussian's JSON configurations as settings of this package, and the normalised space that their boxes are in.
+"""PhysGaussian's JSON configurations as settings of this package, key by key.
 
 See ``docs/physgaussian.md`` for what each key becomes and what it means there and here.
 """
@@ -11,23 +11,15 @@ import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.gaussians.selection import select_simulated
-from gaussian_swaying.mpm.boundary import Boundary, RegionInFrame
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera import Camera, CameraPath, look_at_camera, rotation_from_z
-from gaussian_swaying.simulation.frame import SimFrame
-from gaussian_swaying.simulation.scene import Material, Scene
-
-CENTER = (1.0, 1.0, 1.0)
-"""Where the simulated part is centred in the normalised space."""
+from gaussian_swaying.simulation.physgaussian_camera import read_json
+from gaussian_swaying.simulation.physgaussian_space import CENTER, Normalisation, heading, tidy, up_direction
 
 FOREVER = 999.0
 """End from which a condition of PhysGaussian is taken to last for ever [s]."""
@@ -41,279 +33,12 @@ RESET_SUBSTEPS = 15
 _YIELD = math.sqrt(1.5)  # from a bound on |dev tau| to the yield stress in uniaxial tension
 
 
-# ---- the normalised space
-
-
-def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
-    """Rotation by each angle about its axis, one after the other.
-
-    Args:
-        degrees: Angles [degrees].
-        axes: 0, 1 or 2 for x, y or z, as many as angles.
-
-    Returns:
-        Scene axes to turned axes in float64, shape (3, 3).
-
-    Raises:
-        ValueError: If there are not as many axes as angles, or an axis is none of 0, 1 and 2.
-    """
-    if len(degrees) != len(axes):
-        raise ValueError(
-            f"Expected as many entries of `rotation_degree` as of `rotation_axis`, but got {len(degrees)} and "
-            f"{len(axes)}."
-        )
-    total = torch.eye(3, dtype=torch.float64)
-    for angle, axis in zip(check_vector("rotation_degree", degrees, len(degrees)), axes, strict=True):
-        if axis not in (0, 1, 2):
-            raise ValueError(f"Expected `rotation_axis` to hold 0, 1 or 2 for x, y or z, but got {axis!r}.")
-        i, j = ((1, 2), (2, 0), (0, 1))[int(axis)]
-        quarters, rest = divmod(angle, 90.0)
-        cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        if rest == 0:  # without round-off
-            cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
-        turn = torch.eye(3, dtype=torch.float64)
-        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = cosine, -sine, sine, cosine
-        total = turn @ total
-    return total
-
-
-def up_direction(rotation: Tensor) -> list[float]:
-    """``scene.up`` whose z-up frame has the z axis of the turned axes; scene axes to turned ones (3, 3)."""
-    return _tidy(rotation[2])
-
-
-def heading(rotation: Tensor) -> Tensor:
-    """Turned axes to the axes of the simulation, which may differ by a turn about z; shape (3, 3), float64."""
-    return rotation_from_z(up_direction(rotation)).T @ rotation.T
-
-
-@dataclass
-class Normalisation:
-    """PhysGaussian's normalised space, in which boundaries and regions of the material are then given.
-
-    The scene is turned, and the simulated part scaled and centred at (1, 1, 1). A region of the scene itself is given
-    in turned axes, but in the scene's units. The unit of the normalised space is a metre.
-
-    Args:
-        rotation_degree: Angles by which the scene is turned, one after the other [degrees].
-        rotation_axis: Axis of each: 0, 1 or 2 for x, y or z.
-        scale: Longest side of the simulated part along the turned axes [m].
-    """
-
-    rotation_degree: list[float] = field(default_factory=list)
-    rotation_axis: list[int] = field(default_factory=list)
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_positive("normalisation.scale", self.scale)
-        rotation_matrix(self.rotation_degree, self.rotation_axis)
-
-    @property
-    def rotation(self) -> Tensor:
-        """Scene axes to turned axes, shape (3, 3), float64."""
-        return rotation_matrix(self.rotation_degree, self.rotation_axis)
-
-    def fit(self, points: Tensor) -> SimFrame:
-        """From the normalised space to a scene.
-
-        Args:
-            points: Points of the simulated part in scene units, shape (N, 3).
-
-        Returns:
-            A frame whose ``point_to_sim`` takes points of the normalised space to scene units, and whose
-            ``point_to_scene`` takes them back.
-
-        Raises:
-            ValueError: If the points have no extent.
-        """
-        rotation = self.rotation
-        turned = points.detach().cpu().double() @ rotation.T
-        low, high = turned.amin(0), turned.amax(0)
-        extent = float((high - low).amax())
-        if extent <= 0:
-            raise ValueError("The simulated part has no extent that `normalisation` could scale.")
-        scale = self.scale / extent
-        origin = torch.tensor(CENTER, dtype=torch.float64) - scale * 0.5 * (low + high)
-        return SimFrame(origin, rotation.T.contiguous(), 1 / scale)
-
-    def place(self, scene: Scene, material: Material, solver: MPMSolver, camera: CameraPath | None = None) -> SimFrame:
-        """Bring regions, boundaries and camera to scene units, and give the scene its scale.
-
-        Args:
-            scene: Its region gets scene axes, and ``metres_per_unit`` is set; the splat is read.
-            material: Its regions get scene units.
-            solver: Its boundaries get scene units.
-            camera: A :class:`PhysGaussianCamera` gets scene units; any other is left alone.
-
-        Returns:
-            The frame of :meth:`fit`.
-
-        Raises:
-            ValueError: If the scene has a scale of its own, or nothing is simulated.
-        """
-        if scene.longest_side is not None or scene.metres_per_unit is not None:
-            raise ValueError(
-                "`normalisation` sets the scale of the scene: leave out `scene.longest_side` and "
-                "`scene.metres_per_unit`, or `normalisation`."
-            )
-        turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
-        scene.region = RegionInFrame(scene.region, turned)
-        cloud = scene.cloud()
-        chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
-        frame = self.fit(cloud.means[chosen])
-        scene.metres_per_unit = 1 / frame.metres_per_unit
-        material.regions = [
-            dataclasses.replace(entry, region=RegionInFrame(entry.region, frame)) for entry in material.regions
-        ]
-        conditions = [b for b in solver.boundaries if isinstance(b, Boundary)]
-        solver.boundaries = nn.ModuleList([b.in_frame(frame) for b in conditions])
-        if isinstance(camera, PhysGaussianCamera):
-            camera.frame = frame
-        return frame
-
-
-class PhysGaussianCamera(CameraPath):
-    """Camera of a PhysGaussian configuration: one of its model's, or one that looks at a point from a sphere.
-
-    Azimuth is counted as in PhysGaussian: from the horizontal part of (1, 1, 1) [of (0.72, 0.37, -0.67) if that is
-    nearly across ``up``], clockwise about ``up`` as seen from above.
-
-    Args:
-        cameras: ``cameras.json`` of the model, for the lens and for ``index``; without it ``fov_y`` and the size count.
-        index: Which of its cameras, from 0; -1 for the sphere.
-        azimuth: Angle about ``up`` in the first moving frame [degrees].
-        elevation: Angle above the horizontal plane [degrees].
-        radius: Distance [scene units].
-        delta_azimuth: Change per frame [degrees].
-        delta_elevation: Change per frame [degrees].
-        delta_radius: Change per frame [scene units].
-        viewpoint: Point looked at, in the normalised space of ``normalisation``; in scene units if there is none.
-        up: Direction seen upwards, likewise.
-        width: Image width [pixels].
-        height: Image height [pixels].
-        fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units].
-
-    Raises:
-        ValueError: If a number is out of range; at the first frame, if the file is bad.
-    """
-
-    def __init__(
-        self,
-        cameras: str | os.PathLike[str] | None = None,
-        index: int = -1,
-        azimuth: float = 0.0,
-        elevation: float = 0.0,
-        radius: float = 2.0,
-        delta_azimuth: float = 0.0,
-        delta_elevation: float = 0.0,
-        delta_radius: float = 0.0,
-        viewpoint: Sequence[float] = CENTER,
-        up: Sequence[float] = (0.0, 0.0, 1.0),
-        width: int = 960,
-        height: int = 540,
-        fov_y: float = 40.0,
-        near: float = 0.01,
-    ) -> None:
-        check_positive("radius", radius)
-        if index >= 0 and cameras is None:
-            raise ValueError(f"The camera {index} is one of the model's: give its `cameras.json` as `cameras`.")
-        self.cameras, self.index, self.radius = cameras, int(index), float(radius)
-        self.azimuth, self.elevation = float(azimuth), float(elevation)
-        self.delta = (float(delta_azimuth), float(delta_elevation), float(delta_radius))
-        self.viewpoint, self.up = check_vector("viewpoint", viewpoint), check_vector("up", up)
-        if not any(self.up):
-            raise ValueError("Expected `up` to be a direction, but got zero.")
-        check_positive("near", near)
-        self.width, self.height, self.fov_y, self.near = width, height, float(fov_y), float(near)
-        self.frame: SimFrame | None = None
-        self._model: Camera | None = None
-
-    def eye(self, frame: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the sphere's camera stands in a frame, what it looks at, and up: scene units, shape (3,), float64."""
-        moved = max(frame - 1, 0)  # the first frame here is the rest, which PhysGaussian does not draw
-        azimuth = math.radians(self.azimuth + moved * self.delta[0])
-        elevation = math.radians(self.elevation + moved * self.delta[1])
-        radius = self.radius + moved * self.delta[2]
-        check_positive("radius", radius)
-        target, up = (torch.tensor(v, dtype=torch.float64) for v in (self.viewpoint, self.up))
-        if self.frame is not None:
-            target, up = self.frame.point_to_sim(target), self.frame.direction_to_sim(up)
-        up = up / up.norm()
-        ahead = torch.ones(3, dtype=torch.float64)
-        if abs(float(ahead @ up)) < 0.01:
-            ahead = torch.tensor([0.72, 0.37, -0.67], dtype=torch.float64)
-        ahead = ahead - (ahead @ up) * up
-        ahead = ahead / ahead.norm()
-        aside = torch.linalg.cross(ahead, up)
-        level = math.cos(azimuth) * ahead + math.sin(azimuth) * aside
-        return target + radius * (math.cos(elevation) * level + math.sin(elevation) * up), target, up
-
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        if self._model is None and self.cameras is not None:
-            self._model = read_model_camera(self.cameras, max(self.index, 0), self.near)
-        if self._model is not None and self.index >= 0:
-            return self._model.to(center.device, center.dtype)
-        width, height = (self.width, self.height) if self._model is None else (self._model.width, self._model.height)
-        camera = look_at_camera(*self.eye(frame), self.fov_y, width, height, self.near, dtype=torch.float64)
-        if self._model is not None:
-            camera = dataclasses.replace(camera, intrinsics=self._model.intrinsics)
-        return camera.to(center.device, center.dtype)
-
-
-def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.01) -> Camera:
-    """Read a camera of the ``cameras.json`` that 3DGS keeps beside its model.
-
-    Args:
-        path: The file: a list of cameras with ``position``, ``rotation`` (camera to world, OpenCV axes), ``fx``, ``fy``
-            [pixels], ``width`` and ``height``.
-        index: Which of them, from 0.
-        near: Near plane [scene units].
-
-    Returns:
-        The camera in float64; the principal point is the image's centre.
-
-    Raises:
-        ValueError: If the file cannot be read, has no such camera, or the camera lacks a field.
-    """
-    entries = _read_json(path, "camera file")
-    if not isinstance(entries, list) or not 0 <= index < len(entries):
-        count = len(entries) if isinstance(entries, list) else 0
-        raise ValueError(f"The camera file `{path}` has {count} cameras, and none with the index {index}.")
-    try:
-        entry = entries[index]
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.tensor(entry["rotation"], dtype=torch.float64)
-        pose[:3, 3] = torch.tensor(entry["position"], dtype=torch.float64)
-        width, height = int(entry["width"]), int(entry["height"])
-        rows = [[float(entry["fx"]), 0.0, 0.5 * width], [0.0, float(entry["fy"]), 0.5 * height], [0.0, 0.0, 1.0]]
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(
-            f"The camera {index} of `{path}` is not one of 3DGS ({error}): it needs position, rotation, fx, fy, width "
-            "and height."
-        ) from error
-    return Camera(torch.linalg.inv(pose), torch.tensor(rows, dtype=torch.float64), width, height, near)
-
-
-# ---- the configuration
-
-
 def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a PhysGaussian configuration; ValueError if it is missing or no JSON object."""
-    config = _read_json(path, "PhysGaussian configuration")
+    config = read_json(path, "PhysGaussian configuration")
     if not isinstance(config, dict):
         raise ValueError(f"The PhysGaussian configuration `{path}` is no JSON object: give one of its config/*.json.")
     return config
-
-
-def _read_json(path: str | os.PathLike[str], what: str) -> Any:
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the {what} `{path}` ({error.strerror}): check the path.") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"The {what} `{path}` is not valid JSON ({error}).") from error
 
 
 def convert(
@@ -510,12 +235,7 @@ class _Space:
     substep: float
 
     def vector(self, value: Sequence[float]) -> list[float]:
-        return _tidy(self.turn @ torch.tensor(value, dtype=torch.float64))
-
-
-def _tidy(vector: Tensor) -> list[float]:
-    """Numbers without the round-off of a rotation, and without -0."""
-    return [round(v, 12) + 0.0 for v in vector.tolist()]
+        return tidy(self.turn @ torch.tensor(value, dtype=torch.float64))
 
 
 def _part(name: str, **arguments: Any) -> dict[str, Any]:
@@ -650,7 +370,7 @@ def _gravity(take: _Fields, turn: Tensor) -> list[float]:
             f"Expected `g` to be a list of 3 numbers, for example [0, 0, -9.8], but got {value!r}; PhysGaussian's own "
             "default, a single number, stops it too."
         )
-    return _tidy(turn @ torch.tensor(check_vector("g", value), dtype=torch.float64))
+    return tidy(turn @ torch.tensor(check_vector("g", value), dtype=torch.float64))
 
 
 def _damping(take: _Fields, substep: float, notes: _Notes) -> float:
@@ -884,7 +604,7 @@ def _camera(take: _Fields, cameras: str | None, notes: _Notes) -> dict[str, Any]
     moves = take.flag("move_camera", False)
     if take.flag("show_hint", False):
         notes.add("`show_hint` has no effect: PhysGaussian prints the camera's angles and stops.")
-    orbit = "gaussian_swaying.simulation.physgaussian.PhysGaussianCamera"
+    orbit = "gaussian_swaying.simulation.physgaussian_camera.PhysGaussianCamera"
     if index >= 0 and cameras is None:
         notes.add(
             f"`default_camera_index` {index} is a camera of the 3DGS model, whose cameras.json was not given, so it is "
@@ -918,14 +638,4 @@ def _camera(take: _Fields, cameras: str | None, notes: _Notes) -> dict[str, Any]
     )
 
 
-__all__ = [
-    "Normalisation",
-    "PhysGaussianCamera",
-    "convert",
-    "heading",
-    "read_config",
-    "read_model_camera",
-    "rotation_matrix",
-    "to_yaml",
-    "up_direction",
-]
+__all__ = ["convert", "read_config", "to_yaml"]

@@ -26,7 +26,8 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
-from gaussian_swaying.rendering.camera import Camera, CameraPath
+from gaussian_swaying.rendering.camera import Camera
+from gaussian_swaying.rendering.camera_path import CameraPath
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,

@@ -235,6 +235,7 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "mass_kg": float(scene.points.mass.sum()),
         "area_m2": float(scene.patch_area.sum()),
         "filled": scene.filled,
+        "further": scene.on_surface - len(scene.simulated),
         "dx_m": pipeline.solver.dx,
         "formulation": pipeline.solver.formulation,
         "flow": mean_flow(pipeline).tolist(),
@@ -302,7 +303,7 @@ def _run_lines(run: dict[str, Any]) -> list[str]:
         f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
         f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
         f"  follow them     {run['carried']:,} faint ones",
-        f"  fill the inside {run['filled']:,} points",
+        f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
         f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
         *(f"                  {region}" for region in run["regions"]),
         f"  frame           {run['frame']}",

@@ -1,25 +1,19 @@
-"""What a run leaves on disk. Every file is written under a temporary name and then renamed.
+"""What a run leaves on disk. Every file is written under a temporary name and then renamed, see :mod:`.files`.
 
-Frames are written in the background, see :mod:`gaussian_swaying.simulation.writer`; the video is encoded meanwhile.
+Frames are written in the background (:mod:`.writer`), the video is encoded meanwhile (:mod:`.video`), and positions and
+deformation gradients end up in one file (:mod:`.trajectory`).
 """
 
 from __future__ import annotations
 
-import csv
-import json
 import os
 import re
 import shutil
-import subprocess
-import tempfile
-import threading
-import weakref
-import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +23,10 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.gaussians.export import SUFFIXES, UsdFilm, export_cloud, read_usd_frame, usd_arrays
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.rendering.passes import PASSES
+from gaussian_swaying.simulation.files import atomic, write_json, write_table
 from gaussian_swaying.simulation.frame import SimFrame
+from gaussian_swaying.simulation.trajectory import pack_trajectory
+from gaussian_swaying.simulation.video import VideoEncoder, encode_video
 from gaussian_swaying.simulation.writer import FrameWriter, HostCopy
 
 MARKER = "run.json"
@@ -39,155 +36,6 @@ _OURS += ["config.yaml", "video.mp4", "cameras", "depth", "depth_raw", "normal",
 _OURS += [*(name for name in SUFFIXES if name != "ply"), "animation.usdc"]
 _OURS += ["depth.mp4", "normal.mp4", "force.mp4"]
 NORMAL_AXES = ("camera", "world")
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-
-
-@contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """Give a temporary path in the same folder that becomes ``path`` if the block succeeds, and nothing if not."""
-    temporary = _temporary(path)
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON, whole or not at all."""
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n")
-
-
-def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write dicts as CSV with a header, whole or not at all; what a row lacks stays empty."""
-    names = list({name: None for row in rows for name in row})
-    with atomic(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=names)
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-class VideoEncoder:
-    """ffmpeg in a process of its own, given one frame after the other.
-
-    H.264 in yuv420p; odd sizes are padded by a row or column, as the format needs even ones. The file appears under its
-    name in :meth:`finish`. An encoder that is given up before leaves neither a process nor a file behind.
-
-    Args:
-        path: The .mp4 file.
-        fps: Frames per second.
-    """
-
-    def __init__(self, path: Path, fps: float) -> None:
-        self.path, self.fps = path, fps
-        self._temporary = _temporary(path)
-        self._lock = threading.Lock()
-        self._closed = False
-        self._size: tuple[int, ...] = ()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._end: Callable[[], Any] = lambda: None
-
-    def write(self, image: np.ndarray) -> None:
-        """Add a frame, uint8 (H, W, 3). One thread at a time.
-
-        Raises:
-            OSError: If ffmpeg fails, with its last message, or the frame has another size than the first.
-        """
-        with self._lock:
-            if self._closed:
-                raise OSError(f"{self.path.name} is closed")
-            if self._process is None:
-                self._start(*image.shape[:2])
-        if image.shape[:2] != self._size:
-            (height, width), (first_height, first_width) = image.shape[:2], self._size
-            raise OSError(
-                f"ffmpeg could not write {self.path.name}: a frame is {width} x {height}, the first one is "
-                f"{first_width} x {first_height}"
-            )
-        assert self._process is not None
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(np.ascontiguousarray(image).data)
-        except BrokenPipeError:
-            raise self._failure() from None
-
-    def finish(self) -> None:
-        """Wait for ffmpeg and give the file its name; without frames there is none.
-
-        Raises:
-            OSError: If ffmpeg fails, with its last message.
-        """
-        if self._process is None:
-            return
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # the exit status tells
-            self._process.stdin.close()
-        if self._process.wait() != 0:
-            raise self._failure()
-        os.replace(self._temporary, self.path)
-        self.abort()
-
-    def abort(self) -> None:
-        """Give up what is not finished; no more frames are taken."""
-        with self._lock:
-            self._closed = True
-        self._end()
-
-    def _start(self, height: int, width: int) -> None:
-        import imageio_ffmpeg
-
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-        command += ["-s", f"{width}x{height}", "-r", str(self.fps), "-i", "-", "-an", "-vcodec", "libx264"]
-        command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18"]
-        command += ["-movflags", "+faststart", str(self._temporary.resolve())]
-        self._size = (height, width)
-        self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - unlike a pipe, never full
-        # in a session of its own, so that Ctrl-C does not end it before its last frame
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=self._messages, start_new_session=True)
-        self._end = weakref.finalize(self, _end_process, self._process, self._messages, self._temporary)
-
-    def _failure(self) -> OSError:
-        assert self._process is not None
-        self._process.wait()
-        self._messages.seek(0)
-        message = self._messages.read().decode(errors="replace").strip()
-        return OSError(f"ffmpeg could not write {self.path.name}: {message.splitlines()[-1] if message else '?'}")
-
-
-def _end_process(process: subprocess.Popen[bytes], messages: IO[bytes], temporary: Path) -> None:
-    process.kill()
-    process.wait()
-    assert process.stdin is not None
-    with suppress(OSError):
-        process.stdin.close()
-    messages.close()
-    temporary.unlink(missing_ok=True)
-
-
-def encode_video(frames: list[Path], path: Path, fps: float) -> None:
-    """Encode images with :class:`VideoEncoder`.
-
-    Args:
-        frames: PNG files in order.
-        path: The .mp4 file.
-        fps: Frames per second.
-
-    Raises:
-        OSError: If ffmpeg fails, with its last message, or the images differ in size.
-    """
-    import imageio.v3 as iio
-
-    encoder = VideoEncoder(path, fps)
-    try:
-        for frame in frames:
-            encoder.write(iio.imread(frame)[..., :3])
-        encoder.finish()
-    finally:
-        encoder.abort()
 
 
 class _Film:
@@ -572,7 +420,7 @@ class Recorder:
             if self.ply_every and frames:
                 made.append(self._pack_usd(frames) if self.export_format == "usd" else self.folder / self.export_format)
             if self.trajectory and frames:
-                self._pack_trajectory(frames)
+                pack_trajectory(self.folder / "trajectory", self.folder / "trajectory.npz", frames)
                 made.append(self.folder / "trajectory.npz")
             if self.images and frames:
                 made += [self.folder / place for place in self._picture_folders()]
@@ -607,23 +455,6 @@ class Recorder:
         if summary.get("per_frame"):
             write_table(self.folder / "diagnostics.csv", summary["per_frame"])
 
-    def _pack_trajectory(self, frames: int) -> None:
-        """Join the frames into one .npz, copying their arrays without unpacking all of them at once."""
-        target, shards = self.folder / "trajectory.npz", self.folder / "trajectory"
-        wanted = {f"{index:05d}" for index in range(frames)}
-        with atomic(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as out:
-            sources = [target] if target.exists() else []
-            done: set[str] = set()
-            # frames of a resumed run replace those of the run before it
-            for source in [*sorted(shards.glob("[0-9]*.npz"), reverse=True), *sources]:
-                with zipfile.ZipFile(source) as archive:
-                    for name in archive.namelist():
-                        if name.rsplit("_", 1)[1][:5] in wanted and name not in done:
-                            done.add(name)
-                            out.writestr(name, archive.read(name))
-        if shards.exists():  # if not closed before
-            shutil.rmtree(shards)
-
     def _pack_usd(self, frames: int) -> Path:
         """Join the frames into one film, those of an earlier part of a resumed run from the film of that part."""
         target, shards = self.folder / "animation.usdc", self.folder / "usd"
@@ -643,23 +474,6 @@ class Recorder:
         film.save(target)
         shutil.rmtree(shards)
         return target
-
-
-def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, Tensor]:
-    """Position [m, z up] (P, 3) and F (P, 3, 3) of the simulated particles at one recorded frame.
-
-    Args:
-        path: ``trajectory.npz`` of a run.
-        frame: Frame number from 0.
-
-    Raises:
-        ValueError: If the file does not hold the frame.
-    """
-    with np.load(path) as arrays:
-        name = f"{frame:05d}"
-        if f"position_{name}" not in arrays:
-            raise ValueError(f"{path} holds no frame {frame}: it has {len(arrays.files) // 2} frames.")
-        return torch.from_numpy(arrays[f"position_{name}"]), torch.from_numpy(arrays[f"F_{name}"]).float()
 
 
 def _first_change(old: str, new: str) -> str:
@@ -684,6 +498,3 @@ def _free_name(path: Path) -> Path:
     while (candidate := path.with_name(f"{path.name}.{number}")).exists():
         number += 1
     return candidate
-
-
-__all__ = ["Recorder", "VideoEncoder", "atomic", "encode_video", "load_trajectory", "write_json"]

@@ -20,7 +20,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.config import main
 from gaussian_swaying.simulation.frame import SimFrame
-from gaussian_swaying.simulation.recorder import load_trajectory
+from gaussian_swaying.simulation.trajectory import load_trajectory
 
 pytestmark = pytest.mark.gpu
 FLAG = str(Path(__file__).resolve().parents[2] / "configs" / "sim" / "flag.yaml")

@@ -14,7 +14,7 @@ import torch
 
 from gaussian_swaying.simulation.config import main
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.recorder import load_trajectory
+from gaussian_swaying.simulation.trajectory import load_trajectory
 
 ROOT = Path(__file__).parents[2]
 PIN = (

@@ -9,18 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying.metrics.compare import (
-    compare_run,
-    comparison_picture,
-    evaluate,
-    picture_errors,
-    read_cloth,
-    surface_points,
-    table,
-)
+from gaussian_swaying.metrics.compare import compare_run, evaluate, picture_errors, table
 from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 from gaussian_swaying.simulation.frame import SimFrame
-from gaussian_swaying.training.panels import color_ramp
 
 HEIGHT, WIDTH = 16, 24
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
@@ -59,82 +50,6 @@ def test_pictures_that_do_not_fit():
         picture_errors(torch.rand(20, 31, 3), torch.rand(20, 30, 3))
     with pytest.raises(ValueError, match="at least 11 x 11 pixels, but got 30 x 10"):
         picture_errors(torch.rand(10, 30, 3), torch.rand(10, 30, 3))
-
-
-def test_the_picture_shows_reference_run_and_error():
-    reference, image = torch.zeros(60, 80, 3), torch.full((60, 80, 3), 0.2)
-    reference[:30] = 0.2
-    whole = comparison_picture(reference, image, error_scale=0.2)
-    band = whole.shape[0] - 60
-    assert whole.shape == (60 + band, 3 * 80 + 4, 3)
-    left, middle, right = (whole[band:, start : start + 80] for start in (0, 82, 164))
-    assert np.array_equal(left, (reference * 255 + 0.5).byte().numpy())
-    assert np.array_equal(middle, (image * 255 + 0.5).byte().numpy())
-    none, full = (color_ramp(torch.tensor(v)).mul(255).add(0.5).byte().numpy() for v in (0.0, 1.0))
-    assert (right[:30] == none).all()
-    assert (right[30:] == full).all()
-    assert whole[:band].std() > 10  # there are labels
-
-
-def test_large_pictures_are_made_smaller():
-    whole = comparison_picture(torch.rand(60, 200, 3), torch.rand(60, 200, 3), panel_width=100)
-    assert whole.shape[1] == 3 * 100 + 4
-    assert whole.shape[0] - 30 in range(16, 20)
-
-
-# ---- surfaces
-
-
-def test_points_are_even_by_area():
-    """Two triangles of areas 1 to 3: a quarter of the points lies in the smaller one; the same ones every time."""
-    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -3, 0]])
-    faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
-    points = surface_points(vertices, faces, 4000)
-    share = float((points[:, 1] > 0).float().mean())
-    assert share == pytest.approx(0.25, abs=5 * math.sqrt(0.25 * 0.75 / 4000))
-    assert torch.equal(points, surface_points(vertices, faces, 4000))
-    assert not torch.equal(points, surface_points(vertices, faces, 4000, seed=1))
-
-
-def test_a_cloth_is_read(make_reference):
-    cloth = read_cloth(make_reference(side=2.0) / "cloth.npz")
-    assert cloth.positions.shape == (4, 17 * 9, 3)
-    assert cloth.positions.dtype == torch.float32
-    assert cloth.side == 2.0
-
-
-def test_squares_are_halved_and_the_side_may_be_in_the_settings(make_reference):
-    squares = np.array([[0, 9, 10, 1]])
-    cloth = read_cloth(make_reference(faces=squares, settings=json.dumps({"width": 1.0, "height": 2.5})) / "cloth.npz")
-    assert cloth.side == 2.5
-    assert cloth.faces.tolist() == [[0, 9, 10], [0, 10, 1]]
-
-
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
-        ({"positions": np.zeros((4, 5, 2))}, r"Expected `positions` of .*cloth\.npz of shape \(T, V, 3\)"),
-        ({"faces": np.zeros((4, 5), int)}, r"Expected `faces` of .*cloth\.npz of shape \(F, 3\)"),
-        ({"faces": np.array([[0, 1, 999]])}, r"indices from 0 to 152"),
-        ({"positions": np.full((4, 9, 3), np.nan), "faces": np.array([[0, 1, 2]])}, "to be finite"),
-        ({"side": -1.0}, "to be positive"),
-    ],
-)
-def test_a_bad_cloth(make_reference, arrays, message):
-    with pytest.raises(ValueError, match=message):
-        read_cloth(make_reference(**arrays) / "cloth.npz")
-
-
-def test_a_damaged_or_incomplete_cloth(tmp_path):
-    path = tmp_path / "cloth.npz"
-    with pytest.raises(ValueError, match=r"cloth\.npz cannot be read"):
-        read_cloth(path)
-    path.write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"cloth\.npz cannot be read"):
-        read_cloth(path)
-    np.savez(path, positions=np.zeros((2, 3, 3)))
-    with pytest.raises(ValueError, match="has no array `faces`"):
-        read_cloth(path)
 
 
 # ---- runs

@@ -12,7 +12,7 @@ from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.rendering.camera_path import OrbitCamera
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 

@@ -13,8 +13,9 @@ from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
 from gaussian_swaying.mpm.materials import FixedCorotated, Foam, NeoHookean, Plasticine, Sand
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
-from gaussian_swaying.simulation.recorder import Recorder, load_trajectory
+from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, MaterialRegion
+from gaussian_swaying.simulation.trajectory import load_trajectory
 
 FREE_HALF = [0.55, None, None], [None, None, None]
 WHITE = [0.95, 0.95, 0.95]

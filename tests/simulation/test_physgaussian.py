@@ -17,15 +17,9 @@ from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Pl
 from gaussian_swaying.mpm.constitutive import lame_parameters
 from gaussian_swaying.mpm.materials import Foam, Metal, Plasticine, Sand, Snow
 from gaussian_swaying.simulation.config import build_parser, build_pipeline, main
-from gaussian_swaying.simulation.physgaussian import (
-    Normalisation,
-    PhysGaussianCamera,
-    convert,
-    heading,
-    read_model_camera,
-    rotation_matrix,
-    to_yaml,
-)
+from gaussian_swaying.simulation.physgaussian import convert, to_yaml
+from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera, read_model_camera
+from gaussian_swaying.simulation.physgaussian_space import Normalisation, heading, rotation_matrix
 
 TOOL = Path(__file__).parents[2] / "tools/convert_physgaussian.py"
 PAGE = Path(__file__).parents[2] / "docs/physgaussian.md"

@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.base import finite_gaussians, make_renderer
-from gaussian_swaying.rendering.camera import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch

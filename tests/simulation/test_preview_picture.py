@@ -73,7 +73,7 @@ def test_parts_are_those_of_the_run(make_pipeline):
 
 def test_picture_shows_pinned_and_static_gaussians(make_pipeline):
     """The flag is white: red where it is held, grey-blue lines apart nothing else."""
-    from gaussian_swaying.rendering.camera import LookAtCamera
+    from gaussian_swaying.rendering.camera_path import LookAtCamera
 
     cloud = FlagScene(spacing=0.1, pattern="white").generate()
     pipeline = make_pipeline(cloud=cloud, camera=LookAtCamera([0.6, -2.5, 0.4], [0.6, 0.0, 0.4]))

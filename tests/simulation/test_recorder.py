@@ -22,18 +22,12 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.gaussians.surface import covariance
-from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.rendering.camera_path import OrbitCamera
 from gaussian_swaying.simulation import recorder as recorder_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.recorder import (
-    Recorder,
-    VideoEncoder,
-    atomic,
-    encode_video,
-    load_trajectory,
-    write_json,
-    write_table,
-)
+from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.trajectory import load_trajectory
+from gaussian_swaying.simulation.video import VideoEncoder
 
 
 def _names(folder):
@@ -45,24 +39,6 @@ def _run(pipeline, folder, frames=3, recorder=None, **settings):
 
 
 # ---- files
-
-
-def test_a_file_appears_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "value.json"
-    write_json(path, {"a": 1})
-    with pytest.raises(TypeError):
-        write_json(path, {"a": object()})
-
-    def fail_half_way():
-        with atomic(path) as temporary:
-            temporary.write_text("{")
-            assert temporary.parent == path.parent  # a rename across file systems is not atomic
-            raise RuntimeError("half way")
-
-    with pytest.raises(RuntimeError, match="half way"):
-        fail_half_way()
-    assert json.loads(path.read_text()) == {"a": 1}
-    assert _names(tmp_path) == ["value.json"]
 
 
 def _failing(monkeypatch, target, name):
@@ -144,12 +120,6 @@ def test_diagnostics_are_a_table_too(make_pipeline, tmp_path):
     for row, entry in zip(rows, summary["per_frame"], strict=True):
         assert {name: float(value) for name, value in row.items()} == pytest.approx(entry)
     assert float(rows[-1]["wind_work"]) > 0
-
-
-def test_rows_of_an_older_run_leave_their_gaps(tmp_path):
-    write_table(tmp_path / "table.csv", [{"a": 1}, {"a": 2, "b": 3}])
-    with (tmp_path / "table.csv").open(newline="") as file:
-        assert list(csv.DictReader(file)) == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]
 
 
 def test_what_is_switched_off_is_not_written(make_pipeline, tmp_path):
@@ -239,17 +209,6 @@ def test_the_video(make_pipeline, tmp_path):
     assert iio.imread(tmp_path / "run" / "frames" / "00000.png").shape == (19, 33, 3)
 
 
-def test_video_frames_are_in_order_at_the_rate_asked_for(tmp_path):
-    files = []
-    for k in range(5):
-        files.append(tmp_path / f"{k}.png")
-        iio.imwrite(files[-1], np.full((16, 16, 3), 50 * k, dtype=np.uint8))
-    encode_video(files, tmp_path / "out.mp4", 10.0)
-    frames = iio.imread(tmp_path / "out.mp4")
-    assert [round(float(frame.mean()) / 50) for frame in frames] == [0, 1, 2, 3, 4]
-    assert "10 fps" in _probe(tmp_path / "out.mp4")
-
-
 def test_a_video_that_cannot_be_made_loses_nothing_else(make_pipeline, tmp_path, monkeypatch):
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: "false")
     with pytest.raises(OSError, match=r"ffmpeg could not write video\.mp4"):
@@ -257,15 +216,6 @@ def test_a_video_that_cannot_be_made_loses_nothing_else(make_pipeline, tmp_path,
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 3
     load_trajectory(tmp_path / "run" / "trajectory.npz", 2)
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
-
-
-def test_frames_of_different_sizes_are_no_video(tmp_path):
-    files = [tmp_path / "0.png", tmp_path / "1.png"]
-    for file, width in zip(files, (16, 32), strict=True):
-        iio.imwrite(file, np.zeros((16, width, 3), dtype=np.uint8))
-    with pytest.raises(OSError, match=r"out\.mp4: a frame is 32 x 16, the first one is 16 x 16"):
-        encode_video(files, tmp_path / "out.mp4", 10.0)
-    assert _names(tmp_path) == ["0.png", "1.png"]
 
 
 # ---- in the background

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.rendering.camera_path import OrbitCamera
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.simulation.recorder import Recorder, frame_folder, video_file
 

@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.selection import Box, Not, Sphere
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.rendering.camera_path import OrbitCamera
 from gaussian_swaying.simulation.config import build_parser, build_pipeline, main
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recorder import Recorder

@@ -36,7 +36,7 @@ from gaussian_swaying.mpm.materials import (
 )
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.rendering.camera import OrbitCamera
+from gaussian_swaying.rendering.camera_path import OrbitCamera
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
 from gaussian_swaying.simulation.pipeline import SimulationPipeline, describe_device, versions
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene

@@ -1,0 +1,61 @@
+"""The camera of each frame of a run."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.rendering.camera import orbit_camera
+from gaussian_swaying.rendering.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
+
+
+def test_orbit_path_scales_with_the_object_and_turns_with_time():
+    path = OrbitCamera(64, 48, 30.0, 10.0, 20.0, 3.0, degrees_per_second=40.0, target_offset=(0.0, 0.5, 0.0))
+    center, up = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])
+    camera = path(7, 2.0, center, up, 0.2)
+    expected = orbit_camera((1.0, 2.1, 3.0), (0, 0, 1), 0.6, 90.0, 20.0, 30.0, 64, 48, dtype=torch.float64)
+    assert camera.intrinsics.dtype == torch.float64
+    torch.testing.assert_close(camera.world_to_camera, expected.world_to_camera)
+    torch.testing.assert_close(camera.intrinsics, expected.intrinsics)
+    assert (camera.width, camera.height) == (64, 48)
+
+
+def test_look_at_path_takes_the_up_direction_of_the_scene_by_default(project):
+    center, scene_up = torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])
+    camera = LookAtCamera((0, 0, -2), (0, 0, 0), None, 64, 48, 30.0)(0, 0.0, center, scene_up, 1.0)
+    assert project(camera, (0, -0.1, 0))[0][1] < 24
+    camera = LookAtCamera((0, 0, -2), (0, 0, 0), (0, 1, 0), 64, 48, 30.0)(0, 0.0, center, scene_up, 1.0)
+    assert project(camera, (0, -0.1, 0))[0][1] > 24
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "field"),
+    [
+        ({"width": 0}, ValueError, "width"),
+        ({"height": 10.5}, TypeError, "height"),
+        ({"width": True}, TypeError, "width"),
+        ({"fov_y": 180.0}, ValueError, "fov_y"),
+        ({"fov_y": 0.0}, ValueError, "fov_y"),
+        ({"elevation": 90.0}, ValueError, "elevation"),
+        ({"azimuth": math.nan}, ValueError, "azimuth"),
+        ({"radius": 0.0}, ValueError, "radius"),
+        ({"target_offset": (0, 0)}, ValueError, "target_offset"),
+        ({"near": -1.0}, ValueError, "near"),
+    ],
+)
+def test_bad_orbit_arguments(arguments, error, field):
+    with pytest.raises(error, match=f"`{field}`"):
+        OrbitCamera(**arguments)
+
+
+def test_bad_look_at_and_transforms_arguments():
+    with pytest.raises(ValueError, match="`eye`"):
+        LookAtCamera((0, 0), (0, 0, 0))
+    with pytest.raises(ValueError, match="`eye` and `target`"):
+        LookAtCamera((0, 0, 0), (0, 0, 0))
+    with pytest.raises(ValueError, match="`up`"):
+        LookAtCamera((0, 0, 1), (0, 0, 0), (0, 0, 0))
+    with pytest.raises(ValueError, match="`frame`"):
+        TransformsCamera("transforms.json", -1)
+    with pytest.raises(TypeError, match="`width`"):
+        TransformsCamera("transforms.json", width=0.5)
