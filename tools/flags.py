@@ -396,9 +396,10 @@ _ABOUT = """\
 
 **Pattern 1** falls past its pole and crumples against it. Which folds it then hangs in depends on the mesh and the
 steps of the reference too (below), so what is left is of the size of that. Damping is the largest single influence,
-which both sides share. A trained splat has large Gaussians, since the flag is of one colour;
-`scene.particle_spacing` gives the material points between their centres, but they are drawn whole and blur the folds:
-that costs more PSNR than shading brings, while PhysGaussian's way, equally blurred, has no shade at the wrong place.
+which both sides share. Neither side keeps the cloth away from itself; a reference that does so hangs in other folds.
+A trained splat has large Gaussians, since the flag is of one colour; `scene.particle_spacing` gives the material points
+between their centres, but they are drawn whole and blur the folds: that costs more PSNR than shading brings, while
+PhysGaussian's way, equally blurred, has no shade at the wrong place.
 
 **Pattern 2** has its free corner at the upwind end, where wind and weight are nearly in balance: small differences let
 the corner swing up once more or once less. What holds it are squares of 4 cm at three corners, of which a coarse grid
