@@ -446,7 +446,7 @@ def page(recorded: list[Row]) -> list[str]:
         "mean over frames, as a share of the flag's longer side.",
         "",
     ]
-    for result in recorded:
+    for result in sorted(recorded, key=lambda r: "CPU" in r["device"]):  # GPUs first
         stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
         lines += [f"## Splats {result['splats']}, on {result['device']}", "", f"{stack}; seed {result['seed']}."]
         lines += [f"Further options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
