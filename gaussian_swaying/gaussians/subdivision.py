@@ -14,7 +14,7 @@ from gaussian_swaying.gaussians.surface import quat_to_rotation
 _VISIBLE = 0.25  # opacity down to which a Gaussian counts as surface
 _NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: those amid a square of four
 _ROUNDS = 3  # of trying the next point of a cell
-_LONGEST = 2001  # pieces along an axis
+_MOST = 5_000_000  # points before those too close are left out
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,8 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
         The pieces; Gaussians of at most a quarter of full opacity stay whole. The same on every device.
 
     Raises:
-        ValueError: If ``spacing`` is not above zero or a tensor does not have the shape above.
+        ValueError: If ``spacing`` is not above zero, a tensor does not have the shape above, or more than 5 million
+            points would have to be looked at.
     """
     check_positive("spacing", spacing)
     count = len(means)
@@ -70,9 +71,18 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
     normal_axis = log_scales.argmin(-1)
     half[torch.arange(count), normal_axis] = 0
     # an odd number along each axis, so that the centre is among them
-    pieces = (2 * (half / spacing - 0.5).ceil().clamp_min(0) + 1).clamp_max(_LONGEST).long()
+    pieces = (2 * (half / spacing - 0.5).ceil().clamp_min(0) + 1).clamp_max(_MOST).long()
+    large = (pieces > 1).any(-1).nonzero()[:, 0]
+    if float(pieces[large].double().prod(-1).sum()) > _MOST:
+        widest = float(half.amax() / spacing)
+        raise ValueError(
+            f"Some Gaussians reach {widest:.3g} spacings of {spacing:.3g} far, which makes too many points: raise the "
+            "spacing (`scene.particle_spacing`), or leave such haze out with `scene.region` or "
+            "`scene.opacity_threshold`."
+        )
     step = 2 * half / pieces
-    parent, steps = _lattice(pieces // 2)
+    row, steps = _lattice(pieces[large] // 2)
+    parent = large[row]
     place = steps * step[parent]
     squared = (place / half[parent].clamp_min(1e-300)).square().sum(-1)  # 1 on the rim of the ellipse
     inside = (squared > 0) & (squared <= 1)

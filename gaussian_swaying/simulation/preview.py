@@ -706,11 +706,14 @@ def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> flo
         dx: Grid spacing [m].
 
     Returns:
-        0.45 ``dx`` to 2 digits [m], or None if such points are fewer than two in a hundred.
+        0.45 ``dx`` to 2 digits [m], or None if such points are fewer than two in a hundred, or far too many.
     """
     spacing = float(f"{0.45 * dx:.2g}")
     opacity = cloud.opacities.sigmoid()
-    further = subdivide(cloud.means, cloud.quats, cloud.scales, opacity, spacing / metres_per_unit).means
+    try:
+        further = subdivide(cloud.means, cloud.quats, cloud.scales, opacity, spacing / metres_per_unit).means
+    except ValueError:  # haze, on which nothing is to be put
+        return None
     distance, _ = nearest_neighbours(cloud.means, 1, further)
     holes = int((distance * metres_per_unit > 0.6 * dx).sum())
     return spacing if holes > 0.02 * len(cloud) else None

@@ -90,6 +90,14 @@ def test_overlapping_ones_do_not_pile_up():
     assert float(to_centres.min()) >= math.sqrt(0.5) * 0.05 * (1 - 1e-5)
 
 
+def test_haze_is_refused():
+    """A Gaussian of a hundred metres among small ones, before memory runs out."""
+    means, quats, scales, opacity = _sheet(1.0, 0.1, 0.02)
+    scales[3, :2] = math.log(100.0)
+    with pytest.raises(ValueError, match="particle_spacing"):
+        subdivide(means, quats, scales, opacity, 0.01)
+
+
 @pytest.mark.parametrize("spacing", [0.0, -1.0, float("nan")])
 def test_bad_spacing(spacing):
     with pytest.raises(ValueError, match="`spacing`"):
