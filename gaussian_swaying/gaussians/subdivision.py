@@ -13,6 +13,7 @@ from gaussian_swaying.gaussians.surface import quat_to_rotation
 
 _VISIBLE = 0.25  # opacity down to which a Gaussian counts as surface
 _NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: those amid a square of four
+_SMOOTH = 0.6  # standard deviations of split Gaussians, in steps of their lattice
 _ROUNDS = 3  # of trying the next point of a cell
 _MOST = 5_000_000  # points before those too close are left out
 
@@ -66,7 +67,7 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
     check_shape("opacity", opacity, count)
     device, kind = means.device, means.dtype
     means, quats, log_scales, opacity = (t.detach().cpu() for t in (means, quats, log_scales, opacity))
-    reach = (2 * (opacity.double() / _VISIBLE).clamp_min(1).log()).sqrt()  # in standard deviations
+    reach = _reach(opacity.double())
     half = reach[:, None] * log_scales.double().exp()
     normal_axis = log_scales.argmin(-1)
     half[torch.arange(count), normal_axis] = 0
@@ -99,6 +100,59 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
         torch.cat([shrunk, shrunk[parent]]).to(device, kind),
         torch.cat([opacity.double(), faded]).to(device, kind),
     )
+
+
+@dataclass(frozen=True)
+class Split:
+    """Gaussians in the place of larger ones.
+
+    Attributes:
+        source: Gaussian that each is of, shape (M,), the first N in their order.
+        means: Centres [scene units], shape (M, 3).
+        log_scales: Logarithms of the standard deviations [scene units], shape (M, 3).
+        opacity: Opacities, shape (M,).
+    """
+
+    source: Tensor
+    means: Tensor
+    log_scales: Tensor
+    opacity: Tensor
+
+
+@torch.no_grad()
+def split_large(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor, size: float) -> Split:
+    """Gaussians no larger than a size in the place of larger ones; a training that goes on smooths what they show.
+
+    They stand where :func:`subdivide` puts points, on a lattice of at most 5/3 of the size, and are 0.6 of a step of
+    the lattice large, so that together they look nearly even.
+
+    Args:
+        means: Centres [scene units], shape (N, 3).
+        quats: Rotations, wxyz, of any length above zero, shape (N, 4).
+        log_scales: Logarithms of the standard deviations [scene units], shape (N, 3).
+        opacity: Opacities from 0 to 1, shape (N,).
+        size: Largest standard deviation [scene units].
+
+    Returns:
+        All Gaussians. Those of at most a quarter of full opacity stay as they are, whatever their size.
+
+    Raises:
+        ValueError: As :func:`subdivide`.
+    """
+    check_positive("size", size)
+    large = log_scales.exp().amax(-1) > size
+    pieces = subdivide(means, quats, log_scales, torch.where(large, opacity, 0), size / _SMOOTH)
+    source = torch.cat([torch.arange(len(means), device=means.device), pieces.parent])
+    reach = _reach(opacity)[source, None]
+    divided = (pieces.log_scales[: len(means)] < log_scales - 1e-6)[source]
+    scales = pieces.log_scales + torch.where(divided, (2 * _SMOOTH * reach).clamp_min(1e-6).log(), 0)
+    peak = torch.cat([opacity, pieces.opacity[len(means) :]])
+    return Split(source, torch.cat([means, pieces.means]), scales.to(log_scales.dtype), peak)
+
+
+def _reach(opacity: Tensor) -> Tensor:
+    """Mahalanobis distance at which a Gaussian's opacity falls to a quarter; 0 if it is less everywhere."""
+    return (2 * (opacity / _VISIBLE).clamp_min(1).log()).sqrt()
 
 
 def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:

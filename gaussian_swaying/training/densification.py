@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying.gaussians.subdivision import split_large
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
 from gaussian_swaying.rendering.base import ScreenGaussians
 
@@ -143,9 +144,13 @@ class DefaultDensification(Densification):
         pause_after_reset: Steps after a reset without changes; 0 for none.
         absgrad: Use absolute gradients (Ye et al. 2024, "AbsGS"); CUDA only.
         revised_opacity: Opacities of split Gaussians after Rota Bulo et al. 2024 (arXiv 2404.06109).
+        split_at: Step at which all large Gaussians are split, at ``stop`` or later (see
+            :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. Where a surface is of one
+            colour nothing else makes them small, and large ones blur the folds of a cloth that moves.
+        split_size: Largest standard deviation of what they become [scene units].
 
     Raises:
-        ValueError: If an argument is negative, or ``every`` or ``reset_every`` is 0.
+        ValueError: If an argument is negative, ``every`` or ``reset_every`` is 0, or ``split_at`` is before ``stop``.
     """
 
     def __init__(
@@ -162,9 +167,19 @@ class DefaultDensification(Densification):
         pause_after_reset: int = 0,
         absgrad: bool = False,
         revised_opacity: bool = False,
+        split_at: int | None = None,
+        split_size: float = 0.008,
     ) -> None:
         super().__init__()
         _check_steps(start=start, stop=stop, every=every, reset_every=reset_every, pause_after_reset=pause_after_reset)
+        check_positive("densification.split_size", split_size)
+        if split_at is not None:
+            _check_steps(split_at=split_at)
+            if split_at < stop:
+                raise ValueError(
+                    f"Expected `densification.split_at` at `densification.stop` ({stop}) or later, but got {split_at}."
+                )
+        self.split_at, self.split_size = split_at, float(split_size)
         for name, value in (("every", every), ("reset_every", reset_every), ("grow_grad2d", grow_grad2d)):
             check_positive(f"densification.{name}", value)
         for name, value in (("grow_scale3d", grow_scale3d), ("prune_scale3d", prune_scale3d)):
@@ -207,11 +222,32 @@ class DefaultDensification(Densification):
 
     def after_step(self, step: int, screen: ScreenGaussians) -> None:
         """See :meth:`Densification.after_step`."""
+        if step == self.split_at:
+            self._split_large()
         if step >= self.stop:
             return
         if screen.means2d.grad is None:  # nothing was drawn
             screen.means2d.grad = torch.zeros_like(screen.means2d)
         super().after_step(step, screen)
+
+    @torch.no_grad()
+    def _split_large(self) -> None:
+        model = self._model
+        assert model is not None, "attach comes first"
+        found = split_large(model.means, model.quats, model.scales, model.opacity(), self.split_size)
+        new = {"means": found.means, "scales": found.log_scales, "opacities": torch.logit(found.opacity, 1e-6)}
+        old = len(model)
+        for name in PARAMETERS:
+            before = getattr(model, name)
+            values = new.get(name, before.detach()[found.source])
+            parameter = nn.Parameter(values.contiguous(), requires_grad=before.requires_grad)
+            optimizer = self._optimizers[name]
+            kept = optimizer.state.pop(before, {})
+            # what was there goes on with its momenta, what is new starts without
+            room = {k: v.new_zeros(len(values) - old, *v.shape[1:]) for k, v in kept.items() if _is_per_row(v, old)}
+            optimizer.state[parameter] = kept | {k: torch.cat([kept[k], zeros]) for k, zeros in room.items()}
+            optimizer.param_groups[0]["params"] = [parameter]
+            setattr(model, name, parameter)
 
     def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
         self._strategy.step_post_backward(
@@ -221,6 +257,10 @@ class DefaultDensification(Densification):
             from gsplat.strategy.ops import reset_opa
 
             reset_opa(parameters, self._optimizers, self._state, value=2.0 * self.prune_opacity)
+
+
+def _is_per_row(value: Any, rows: int) -> bool:
+    return isinstance(value, Tensor) and value.ndim > 0 and len(value) == rows
 
 
 class MCMCDensification(Densification):

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
-from gaussian_swaying.gaussians.subdivision import subdivide
+from gaussian_swaying.gaussians.subdivision import split_large, subdivide
 
 
 def _sheet(side, spacing, size, opacity=0.99):
@@ -104,3 +104,31 @@ def test_bad_spacing(spacing):
         subdivide(*_sheet(0.1, 0.1, 0.2), spacing)
     with pytest.raises(ValueError, match="opacity"):
         subdivide(*_sheet(0.1, 0.1, 0.2)[:3], torch.ones(2), 0.1)
+
+
+def test_split_gaussians_look_like_the_large_one():
+    """Opacities composed over a line through its centre, within what a lattice of 0.6 steps leaves uneven."""
+    means, quats, scales, opacity = _sheet(0.1, 0.1, 0.3, opacity=0.95)
+    found = split_large(means, quats, scales, opacity, 0.03)
+    assert float(found.log_scales.exp().amax()) <= 0.03 * (1 + 1e-6)
+    assert len(found.means) > 100
+    assert int(found.source.max()) == 0
+    line = means[0] + torch.linspace(-0.3, 0.3, 101)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+
+    def seen(means, scales, opacity):
+        squared = ((line[:, None] - means) / scales)[..., :2].square().sum(-1)
+        return 1 - (1 - opacity * (-0.5 * squared).exp()).prod(-1)
+
+    before = seen(means, scales.exp(), opacity)
+    after = seen(found.means, found.log_scales.exp(), found.opacity)
+    assert float(before.min()) > 0.5
+    assert float((after - before).abs().mean()) < 0.2
+    assert float(after.min()) > 0.5
+
+
+def test_small_ones_are_not_split():
+    means, quats, scales, opacity = _sheet(1.0, 0.1, 0.02)
+    found = split_large(means, quats, scales, opacity, 0.02)
+    assert torch.equal(found.means, means)
+    assert torch.equal(found.log_scales, scales)
+    assert torch.equal(found.opacity, opacity)

@@ -149,3 +149,46 @@ def test_foreign_optimizers_are_refused():
 def test_bad_settings(options):
     with pytest.raises(ValueError, match=f"`densification.{next(iter(options))}`"):
         DefaultDensification(**options)
+
+
+def test_large_ones_are_split_once():
+    """At its step: none larger than the size, colours of their own, momenta of what was there, none of what is new."""
+    model = _model(3, opacity=0.9)
+    with torch.no_grad():
+        model.scales.copy_(torch.tensor([[0.02, 0.02, 1e-3]]).log().expand(3, 3))
+        model.scales[1] = torch.tensor([0.3, 0.1, 1e-3]).log()
+        model.means.mul_(2.0)  # apart
+    optimizers = _optimizers(model)
+    momenta = {name: optimizers[name].state[getattr(model, name)]["exp_avg"].clone() for name in PARAMETERS}
+    densification = DefaultDensification(start=0, stop=5, split_at=7, split_size=0.05)
+    densification.attach(model, optimizers, 1.0)
+    for step in (5, 6):
+        densification.after_step(step, _screen([0.0], [0]))
+    assert len(model) == 3
+    densification.after_step(7, _screen([0.0], [0]))
+    count = len(model)
+    assert count > 10
+    assert float(model.scales.detach().exp().max()) <= 0.05
+    offset = model.means.detach()[3:] - model.means.detach()[1]
+    assert bool((offset[:, 0].abs() < 0.6).all())
+    assert bool((offset[:, 2].abs() < 0.01).all())
+    assert torch.equal(model.sh0.detach()[3:], model.sh0.detach()[1:2].expand(count - 3, 1, 3))
+    for name in PARAMETERS:
+        parameter = getattr(model, name)
+        assert optimizers[name].param_groups[0]["params"][0] is parameter
+        assert dict(model.named_parameters())[name] is parameter
+        state = optimizers[name].state[parameter]["exp_avg"]
+        assert state.shape == parameter.shape
+        assert torch.equal(state[:3], momenta[name])
+        assert not bool(state[3:].any())
+        parameter.grad = torch.ones_like(parameter)
+        optimizers[name].step()
+    densification.after_step(8, _screen([0.0], [0]))
+    assert len(model) == count
+
+
+def test_a_split_before_the_end_of_densification_is_refused():
+    with pytest.raises(ValueError, match="split_at"):
+        DefaultDensification(stop=100, split_at=99)
+    with pytest.raises(ValueError, match="split_size"):
+        DefaultDensification(split_size=0.0)
