@@ -90,7 +90,7 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
     parent, place, squared = parent[inside], place[inside], squared[inside]
     turned = (quat_to_rotation(quats.double())[parent] @ place[..., None])[..., 0]
     where = means.double()[parent] + turned
-    kept = _thin(where, squared * reach[parent], means.double(), _NEAR * spacing)
+    kept = _thin(where, squared * reach[parent].square(), means.double(), _NEAR * spacing)
     parent, where, squared = parent[kept], where[kept], squared[kept]
     shrunk = log_scales.double() - pieces.double().log()
     faded = opacity.double()[parent] * (-0.5 * squared * reach[parent].square()).exp()

@@ -235,8 +235,9 @@ class DefaultDensification(Densification):
         model = self._model
         assert model is not None, "attach comes first"
         found = split_large(model.means, model.quats, model.scales, model.opacity(), self.split_size)
-        new = {"means": found.means, "scales": found.log_scales, "opacities": torch.logit(found.opacity, 1e-6)}
         old = len(model)
+        opacities = torch.cat([model.opacities, torch.logit(found.opacity[old:], 1e-6)])
+        new = {"means": found.means, "scales": found.log_scales, "opacities": opacities}
         for name in PARAMETERS:
             before = getattr(model, name)
             values = new.get(name, before.detach()[found.source])

@@ -105,12 +105,15 @@ def test_the_page_tells_what_was_and_what_was_not(flags):
     stopped = row | {"status": "diverged", "frames": 31}
     result = {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0, "splats": "made in code"}
     result["rows"] = {"ours": {"1": row, "3": stopped}, "particle": {"1": {"failed": "x"}}}
+    result |= {"more": "--solver.dx=0.03", "note": "Other work ran beside these."}
     known = {"cells": 60, "quality": 16, "frames_compared": 250, "chamfer": 0.034}
     result["uncertainty"] = {"1": {"coarser": known, "hardly bending": known | {"chamfer": 0.082}}}
     text = "\n".join(flags.page([result]))
     ours = flags.VARIANTS["ours"].title
     assert f"| {ours} | 2.13 % | 22.50 | - | - | stopped at frame 31 | 22.50 |" in text
     assert "| PhysGaussian's way | failed | - | - | - | - | - |" in text
+    assert "`--solver.dx=0.03`" in text
+    assert "Other work ran beside these." in text
     assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in text
     assert "a fiftieth of its bending stiffness 8.20 %" in text
     assert "(reference itself: 3.40 %)" in text

@@ -158,7 +158,9 @@ def test_large_ones_are_split_once():
         model.scales.copy_(torch.tensor([[0.02, 0.02, 1e-3]]).log().expand(3, 3))
         model.scales[1] = torch.tensor([0.3, 0.1, 1e-3]).log()
         model.means.mul_(2.0)  # apart
+        model.opacities[0] = 30.0  # opaque to the last bit
     optimizers = _optimizers(model)
+    opacities = model.opacities.detach().clone()
     momenta = {name: optimizers[name].state[getattr(model, name)]["exp_avg"].clone() for name in PARAMETERS}
     densification = DefaultDensification(start=0, stop=5, split_at=7, split_size=0.05)
     densification.attach(model, optimizers, 1.0)
@@ -168,6 +170,8 @@ def test_large_ones_are_split_once():
     densification.after_step(7, _screen([0.0], [0]))
     count = len(model)
     assert count > 10
+    assert torch.equal(model.opacities.detach()[:3], opacities)
+    assert bool(torch.isfinite(model.opacities).all())
     assert float(model.scales.detach().exp().max()) <= 0.05
     offset = model.means.detach()[3:] - model.means.detach()[1]
     assert bool((offset[:, 0].abs() < 0.6).all())
