@@ -61,6 +61,8 @@ VARIANTS: dict[str, Variant] = {
     "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
     "total_03": Variant("`total`, dx = 0.03 m", options=_grid(0.03)),
     "total_02": Variant("`total`, dx = 0.02 m", options=_grid(0.02)),
+    "total_0167": Variant("`total`, dx = 0.0167 m", options=_grid(0.0167), patterns=(3,)),
+    "total_01": Variant("`total`, dx = 0.01 m", options=_grid(0.01), patterns=(1, 2)),
     "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",), _grid(0.04)),
     "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), _grid(0.03)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), _grid(0.02)),
@@ -71,8 +73,11 @@ VARIANTS: dict[str, Variant] = {
     "thin": Variant("half the thickness, twice E and density", options=("--material.thickness=0.005",)),
     **{
         f"b_{b:g}": Variant(
-            f"size loss b = {b:g}",
-            training=(f"--model.loss_terms.size.init_args.b={b:g}",),
+            f"size loss b = {b:g}, no late split",
+            training=(
+                f"--model.loss_terms.size.init_args.b={b:g}",
+                "--model.densification.init_args.split_at=null",  # or it would make all sizes alike
+            ),
             patterns=(3,),
         )
         for b in (0.001, 0.004, 0.008, 0.02, 0.1)

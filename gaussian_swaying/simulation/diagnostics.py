@@ -13,6 +13,8 @@ from gaussian_swaying.mpm.linalg import determinant, matmul3, symmetric_eigenval
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 
+_SAMPLE = 4096  # particles whose nearest neighbour is looked for
+
 
 class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way StopIteration ends a loop)
     """The simulation left the range where its numbers mean anything.
@@ -133,7 +135,8 @@ def check_spacing(solver: MPMSolver) -> None:
     position = solver.points.position.detach().reshape(-1, *solver.points.position.shape[-2:])[0]
     if len(position) < 16:  # a few may be meant to be alone
         return
-    spacing = float(nearest_neighbours(position, 1)[0].median())
+    some = position[:: math.ceil(len(position) / _SAMPLE)]
+    spacing = float(nearest_neighbours(position, 2, some)[0][:, 1].median())  # the first is the particle itself
     if spacing > 2 * solver.dx:
         raise ValueError(
             f"Half of the particles are more than {spacing:.3g} m from their nearest neighbour, more than two cells of "

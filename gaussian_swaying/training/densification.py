@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
@@ -147,7 +148,7 @@ class DefaultDensification(Densification):
         split_at: Step at which all large Gaussians are split, at ``stop`` or later (see
             :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. Where a surface is of one
             colour nothing else makes them small, and large ones blur the folds of a cloth that moves.
-        split_size: Largest standard deviation of what they become [scene units].
+        split_size: Largest standard deviation of what they become [scene units], and of all Gaussians from then on.
 
     Raises:
         ValueError: If an argument is negative, ``every`` or ``reset_every`` is 0, or ``split_at`` is before ``stop``.
@@ -224,6 +225,10 @@ class DefaultDensification(Densification):
         """See :meth:`Densification.after_step`."""
         if step == self.split_at:
             self._split_large()
+        if self.split_at is not None and step >= self.split_at:  # or they would grow again
+            assert self._model is not None, "attach comes first"
+            with torch.no_grad():
+                self._model.scales.clamp_(max=math.log(self.split_size))
         if step >= self.stop:
             return
         if screen.means2d.grad is None:  # nothing was drawn

@@ -152,7 +152,7 @@ def test_bad_settings(options):
 
 
 def test_large_ones_are_split_once():
-    """At its step: none larger than the size, colours of their own, momenta of what was there, none of what is new."""
+    """At its step: none larger than the size, colours of their own, momenta of what was there, none of what is new. Later none is larger either."""
     model = _model(3, opacity=0.9)
     with torch.no_grad():
         model.scales.copy_(torch.tensor([[0.02, 0.02, 1e-3]]).log().expand(3, 3))
@@ -187,8 +187,11 @@ def test_large_ones_are_split_once():
         assert not bool(state[3:].any())
         parameter.grad = torch.ones_like(parameter)
         optimizers[name].step()
+    with torch.no_grad():
+        model.scales.add_(1.0)
     densification.after_step(8, _screen([0.0], [0]))
     assert len(model) == count
+    assert float(model.scales.detach().exp().max()) <= 0.05 * (1 + 1e-6)
 
 
 def test_a_split_before_the_end_of_densification_is_refused():
