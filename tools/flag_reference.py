@@ -219,8 +219,6 @@ class FlagPattern:
     def cloth_settings(self) -> dict[str, Any]:
         """All that the motion depends on."""
         own = {name: value for name, value in asdict(self).items() if name not in ("texture", "paper_drag")}
-        if own["bending"] == 1.0:  # as it was before there was a choice
-            del own["bending"]
         blender = blender_settings(self.grid(), self.material(), self.run())
         return own | {f"blender.{name}": value for name, value in blender.items()}
 
@@ -239,7 +237,7 @@ PATTERNS = {
         5e3, 0.3, 50.0, (0.0, 0.0, 0.0), "left", texture="white", paper_drag=None, ripple=0.003, damping=2.0
     ),
     2: FlagPattern(3e3, 0.3, 30.0, (2.5, 0.5, 0.0), "corners", drag=0.8),
-    3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=140, quality=32),
+    3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=140, quality=64),
 }
 """The paper's three patterns. The wind of pattern 3 would blow along the flag's plane: the flag stands at 35 degrees to
 it, so that in patterns 2 and 3 alike the air comes from the camera's side. Drag and damping are chosen so that the

@@ -149,6 +149,8 @@ class DefaultDensification(Densification):
             :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. Where a surface is of one
             colour nothing else makes them small, and large ones blur the folds of a cloth that moves.
         split_size: Largest standard deviation of what they become [scene units], and of all Gaussians from then on.
+            Rotations are held from then on: the tilt of a small Gaussian shows in no picture, so that training would
+            turn it by degrees from where the large one was right, and wind acts on normals.
 
     Raises:
         ValueError: If an argument is negative, ``every`` or ``reset_every`` is 0, or ``split_at`` is before ``stop``.
@@ -254,6 +256,7 @@ class DefaultDensification(Densification):
             optimizer.state[parameter] = kept | {k: torch.cat([kept[k], zeros]) for k, zeros in room.items()}
             optimizer.param_groups[0]["params"] = [parameter]
             setattr(model, name, parameter)
+        self._optimizers["quats"].param_groups[0]["lr"] = 0.0
 
     def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
         self._strategy.step_post_backward(

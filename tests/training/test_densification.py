@@ -152,7 +152,10 @@ def test_bad_settings(options):
 
 
 def test_large_ones_are_split_once():
-    """At its step: none larger than the size, colours of their own, momenta of what was there, none of what is new. Later none is larger either."""
+    """At its step: none larger than the size, colours of their own, momenta of what was there, none of what is new.
+
+    From then on none is larger and none turns.
+    """
     model = _model(3, opacity=0.9)
     with torch.no_grad():
         model.scales.copy_(torch.tensor([[0.02, 0.02, 1e-3]]).log().expand(3, 3))
@@ -185,8 +188,10 @@ def test_large_ones_are_split_once():
         assert state.shape == parameter.shape
         assert torch.equal(state[:3], momenta[name])
         assert not bool(state[3:].any())
+        before = parameter.detach().clone()
         parameter.grad = torch.ones_like(parameter)
         optimizers[name].step()
+        assert torch.equal(parameter.detach(), before) == (name == "quats")  # rotations are held
     with torch.no_grad():
         model.scales.add_(1.0)
     densification.after_step(8, _screen([0.0], [0]))
