@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ class Variant:
         options: Further options of tools/sim.py.
         patterns: Flags for which it differs from ``ours``.
         training: Further options of tools/train.py; a variant with some has a splat of its own.
+        true_normals: Whether the Gaussians are turned to the reference's normals at rest.
     """
 
     title: str
@@ -41,6 +42,7 @@ class Variant:
     options: tuple[str, ...] = ()
     patterns: tuple[int, ...] = PATTERNS
     training: tuple[str, ...] = ()
+    true_normals: bool = False
 
 
 def _grid(dx: float) -> tuple[str, ...]:
@@ -57,6 +59,7 @@ VARIANTS: dict[str, Variant] = {
     "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
     "paper_area": Variant("areas π s1 s2", ("paper_area",)),
     "membrane": Variant("one layer: no bending stiffness", options=("--scene.layers=1",)),
+    "true_normals": Variant("with the reference's normals at rest", patterns=(2, 3), true_normals=True),
     "one_point": Variant("one point to a Gaussian", options=("--scene.particle_spacing=null",)),
     "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
     "total_03": Variant("`total`, dx = 0.03 m", options=_grid(0.03)),
@@ -143,6 +146,27 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
     row: Row = {"seconds": time.perf_counter() - begin, "steps": steps}
     account.write_text(json.dumps(row))
     return row
+
+
+def turn_to_reference(splat: Path, cloth: Path, target: Path) -> None:
+    """Write a splat whose Gaussians are turned, the shortest way, to the normals of the reference at rest."""
+    import numpy as np
+    import torch
+
+    from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+    from gaussian_swaying.gaussians.ply import read_ply, write_ply
+    from gaussian_swaying.gaussians.surface import quat_to_rotation, rotation_to_quat, smallest_axis_normal
+
+    cloud = read_ply(splat)
+    with np.load(cloth) as reference:
+        vertices = torch.from_numpy(reference["positions"][0].astype(np.float64))
+        normals = torch.from_numpy(reference["rest_normals"].astype(np.float64))
+    own = smallest_axis_normal(cloud.quats.double(), cloud.scales.double())
+    true = normals[nearest_neighbours(vertices, 1, cloud.means)[1][:, 0]]
+    true = torch.where((own * true).sum(-1, keepdim=True) < 0, -true, true)
+    arc = torch.cat([1 + (own * true).sum(-1, keepdim=True), torch.linalg.cross(own, true)], -1)
+    turned = rotation_to_quat(quat_to_rotation(arc) @ quat_to_rotation(cloud.quats.double()))
+    write_ply(target, replace(cloud, quats=turned.to(cloud.quats), normals=None))
 
 
 def what_failed(told: str) -> str:
@@ -287,8 +311,11 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
                     target = home / (name if variant.training else "all_losses")
                     row["training"] = train(pattern, variant, Path(options.dataset), target, options.train_steps)
                     splat = target / "point_cloud.ply"
-                elif variant.training:
-                    continue  # there is nothing to train
+                    if variant.true_normals:
+                        own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
+                        turn_to_reference(own, Path(options.dataset) / f"pattern{pattern}" / "cloth.npz", splat)
+                elif variant.training or variant.true_normals:
+                    continue  # there is nothing to train, and normals are right
                 row |= run_row(pattern, name, options, splat, Path(scratch))
                 rows.setdefault(name, {})[str(pattern)] = row
                 shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from imageio.v3 import imread, imwrite
 
 from gaussian_swaying.simulation.config import build_parser
@@ -54,6 +55,30 @@ def test_pictures_have_the_size_of_the_reference(flags, tmp_path):
     (video / "camera.json").write_text(json.dumps({"w": 320, "h": 180}))
     settings = build_parser().parse_args(flags.sim_arguments(2, flags.VARIANTS["ours"], tmp_path, None))
     assert (settings.camera.init_args.width, settings.camera.init_args.height) == (320, 180)
+
+
+def test_gaussians_turned_to_the_reference(flags, tmp_path):
+    """Normals are those of the nearest vertex, the normal's own axis is the one that was turned, sizes stay."""
+    from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
+    from gaussian_swaying.gaussians.surface import smallest_axis_normal
+
+    generator = torch.Generator().manual_seed(0)
+    quats = torch.randn(50, 4, generator=generator)
+    cloud = GaussianCloud(
+        torch.rand(50, 3, generator=generator), quats, torch.tensor([[-4.0, -3.0, -9.0]]).repeat(50, 1),
+        torch.zeros(50), torch.zeros(50, 1, 3),
+    )  # fmt: skip
+    write_ply(tmp_path / "own.ply", cloud)
+    vertices = np.array([[[0.0, 0.5, 0.5], [1.0, 0.5, 0.5]]])
+    normals = np.array([[0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
+    np.savez(tmp_path / "cloth.npz", positions=vertices, rest_normals=normals)
+    flags.turn_to_reference(tmp_path / "own.ply", tmp_path / "cloth.npz", tmp_path / "turned.ply")
+    turned = read_ply(tmp_path / "turned.ply")
+    expected = torch.from_numpy(normals)[(cloud.means[:, 0] > 0.5).long()]
+    found = smallest_axis_normal(turned.quats.double(), turned.scales.double())
+    torch.testing.assert_close((found * expected).sum(-1).abs(), torch.ones(50, dtype=torch.float64))
+    assert torch.equal(turned.scales, cloud.scales)
+    assert torch.equal(turned.means, cloud.means)
 
 
 def test_a_row_is_simulated_and_compared(flags, tmp_path):
