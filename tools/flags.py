@@ -430,34 +430,34 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
 _ABOUT = """\
 ## What differs from the reference, and why
 
-**Both sides at rest.** Two things were found by setting the first ten frames of both sides beside each other, and mended:
-Blender's diagonals do not push (see [flag_dataset.md](flag_dataset.md)), and splats made in code had a ripple where the
-reference has none. Neither shows in a hanging panel or in a picture at rest. Before, pattern 2 was beyond 3 % with splats
-made in code too, and what one changed, damping, bending or the grid, moved it by percents in either direction.
+**Both sides at rest.** Two things were found by setting the first ten frames of both sides beside each other, and
+mended: Blender's diagonals do not push (see [flag_dataset.md](flag_dataset.md)), and splats made in code had a ripple
+where the reference has none. Neither shows in a hanging panel or in a picture at rest. Before, whatever one changed in
+pattern 2, damping, bending or the grid, moved it by percents in either direction.
 
 **Pattern 1** falls past its pole and crumples against it. Which folds it then hangs in depends on the mesh and the
 steps of the reference too (below), so what is left is of the size of that, and PhysGaussian's way, which hangs as a
-narrow strip at the same place, is hardly farther away: a distance between surfaces sees little of folds, a picture does.
-Neither side keeps the cloth away from itself; a reference that does so hangs in other folds. A flag of one colour is
-trained as few large Gaussians, which blur folds: `densification.split_at` makes them small late in the training. The few
-dark dots are Gaussians whose normals training left wrong.
+narrow strip at the same place, is hardly farther away: a distance between surfaces sees little of folds, a picture
+does. Neither side keeps the cloth away from itself; a reference that does so hangs in other folds. A flag of one
+colour is trained as few large Gaussians, which blur folds: `densification.split_at` makes them small late in the
+training. The few dark dots are Gaussians whose normals training left wrong.
 
-**Pattern 2** has its free corner at the upwind end, where wind and weight are nearly in balance, and the wind comes at 11
-degrees from its plane: a degree is 9 % of the pressure. With splats made in code ours stays near the reference. Training
-leaves normals that are wrong by less than a degree over larger parts of the flag, which lets the corner swing out:
-turning the same Gaussians to the reference's normals at rest, and nothing else, takes away more than half of the
-distance (its row above). Normals of planes through neighbouring centres were tried and are not good enough either: the
-trained surface itself is uneven by that much. With it falls what is measured against it, the distance without surface
-modelling among others.
+**Pattern 2** has its free corner at the upwind end, where wind and weight are nearly in balance, and the wind comes
+at 11 degrees from its plane: a degree is 9 % of the pressure. With splats made in code ours stays near the reference.
+Training leaves normals that are wrong by less than a degree over larger parts of the flag, which lets the corner
+swing out: turning the same Gaussians to the reference's normals at rest, and nothing else, takes away more than half
+of the distance (its row above). Normals of planes through neighbouring centres were tried and are not good enough
+either: the trained surface itself is uneven by that much. With it falls what is measured against it, the distance
+without surface modelling among others.
 
-**Pattern 3** is ruled by bending: the reference with a fiftieth of its bending stiffness is another flag (below). With
-three layers ours follows the reference closely. A trained splat ends a little short of the edge that is held, so the grid
-is held over one row of nodes more. The b of the size loss matters little, since the loss is a mean and most Gaussians are
-small; making the large ones small late in the training matters more. Gusts that the reference does not have cost what
-one would expect.
+**Pattern 3** is ruled by bending: the reference with a fiftieth of its bending stiffness is another flag (below).
+With three layers ours follows the reference closely. A trained splat ends a little short of the edge that is held, so
+the grid is held over one row of nodes more. The b of the size loss matters little, since the loss is a mean and most
+Gaussians are small; making the large ones small late in the training matters more. Gusts that the reference does not
+have cost what one would expect.
 
-The law of the stretching (`SpringNetwork`, which the reference's lattice is, against fixed corotated) matters as soon as
-cloth stretches by tens of per cent, which it does beside its pins.
+The law of the stretching (`SpringNetwork`, which the reference's lattice is, against fixed corotated) matters as soon
+as cloth stretches by tens of per cent, which it does beside its pins.
 """.splitlines()
 
 
