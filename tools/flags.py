@@ -435,12 +435,13 @@ mended: Blender's diagonals do not push (see [flag_dataset.md](flag_dataset.md))
 where the reference has none. Neither shows in a hanging panel or in a picture at rest. Before, whatever one changed in
 pattern 2, damping, bending or the grid, moved it by percents in either direction.
 
-**Pattern 1** falls past its pole and crumples against it. Which folds it then hangs in depends on the mesh and the
-steps of the reference too (below), so what is left is of the size of that, and PhysGaussian's way, which hangs as a
-narrow strip at the same place, is hardly farther away: a distance between surfaces sees little of folds, a picture
-does. Neither side keeps the cloth away from itself; a reference that does so hangs in other folds. A flag of one
-colour is trained as few large Gaussians, which blur folds: `densification.split_at` makes them small late in the
-training. The few dark dots are Gaussians whose normals training left wrong.
+**Pattern 1** falls past its pole and crumples against it. In which folds it then hangs is settled by small things at
+rest: in the reference by a ripple of 3 mm; a trained splat is uneven by a millimetre or two itself, and a coarse grid
+has no room for folds. PhysGaussian's way, which hangs as a narrow strip at the same place, is hardly farther away: a
+distance between surfaces sees little of folds, a picture does. Neither side keeps the cloth away from itself; a
+reference that does so hangs in other folds. A flag of one colour is trained as few large Gaussians, which blur folds:
+`densification.split_at` makes them small late in the training. The few dark dots are Gaussians whose normals training
+left wrong.
 
 **Pattern 2** has its free corner at the upwind end, where wind and weight are nearly in balance, and the wind comes
 at 11 degrees from its plane: a degree is 9 % of the pressure. With splats made in code ours stays near the reference.
