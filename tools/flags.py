@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from flag_reference import PATTERNS as REFERENCES
 
 from gaussian_swaying.metrics.compare import compare_run
 
@@ -87,7 +88,6 @@ VARIANTS: dict[str, Variant] = {
 }
 """All rows, by name."""
 
-_FLAT = (2, 3)  # references without a ripple at rest
 _TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
 
 PAPER = {
@@ -111,8 +111,8 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
     arguments = [part for path in configs for part in ("--config", str(path))]
     if splat is not None:
         arguments += ["--scene.ply", str(splat)]
-    elif pattern in _FLAT:  # a ripple of 3 mm changes the incidence of the wind by more than a degree
-        arguments += ["--scene.generator.init_args.ripple=0"]
+    else:  # a ripple of 3 mm changes the incidence of the wind by more than a degree
+        arguments += [f"--scene.generator.init_args.ripple={REFERENCES[pattern].ripple}"]
     camera = dataset / f"pattern{pattern}" / "video" / "camera.json"
     if camera.exists():
         arguments += ["--camera=TransformsCamera", f"--camera.path={camera}"]
