@@ -111,10 +111,12 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         UserWarning: Once, naming the properties that were ignored; once, if infinite opacity logits were replaced.
     """
     path = Path(path)
-    data = _read_vertices(path)
+    data: np.ndarray = read_elements(path)["vertex"].data
     names = data.dtype.names or ()
     if "packed_position" in names:
-        raise ValueError(f"{path} is a compressed .ply; export it as an uncompressed 3DGS .ply.")
+        raise ValueError(
+            f"{path} is a compressed .ply; read it with `read_gaussians`, or export it as an uncompressed 3DGS .ply."
+        )
     for name in _REQUIRED:
         if name not in names:
             raise ValueError(f"{path} has no property `{name}`, so it is not a 3DGS file; export it from a 3DGS tool.")
@@ -141,17 +143,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
     opacities = _read_opacities(path, data)
     means, quats, scales = columns(_MEANS), columns(_QUATS), columns(_SCALES)
-    with np.errstate(over="ignore", under="ignore"):
-        size = np.exp(scales)
-    _reject(
-        path,
-        ((size == 0) | ~np.isfinite(size)).any(axis=1),
-        "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
-        "remove them or store the logarithm of the size",
-    )
-    with np.errstate(under="ignore"):
-        zero_quats = np.square(quats).sum(axis=1) == 0
-    _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
+    check_sizes_and_rotations(path, scales, quats)
     sh = columns(_DC)[:, None, :]
     if rest:
         sh = np.concatenate([sh, columns(rest).reshape(len(data), 3, -1).transpose(0, 2, 1)], axis=1)
@@ -207,8 +199,23 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def _read_vertices(path: Path) -> np.ndarray:
-    """The vertex table of a binary .ply file as a structured array, or an error that names what is wrong."""
+def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:
+    """Raise ValueError if a logarithm of a size (N, 3) gives none, or a quaternion (N, 4) is zero."""
+    with np.errstate(over="ignore", under="ignore"):
+        size = np.exp(scales)
+    _reject(
+        path,
+        ((size == 0) | ~np.isfinite(size)).any(axis=1),
+        "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
+        "remove them or store the logarithm of the size",
+    )
+    with np.errstate(under="ignore"):
+        zero_quats = np.square(quats).sum(axis=1) == 0
+    _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
+
+
+def read_elements(path: Path) -> Any:
+    """The elements of a binary .ply file with vertices, as plyfile reads them, or an error that names what is wrong."""
     from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
 
     if not path.exists():
@@ -230,8 +237,7 @@ def _read_vertices(path: Path) -> np.ndarray:
     if "vertex" not in ply:
         found = ", ".join(element.name for element in ply.elements) or "none"
         raise ValueError(f"{path} has no element `vertex` (elements: {found}); export it from a 3DGS tool.")
-    data: np.ndarray = ply["vertex"].data
-    return data
+    return ply
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:

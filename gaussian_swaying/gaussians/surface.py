@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.mpm.linalg import cofactor, determinant, matmul3, polar_rotation
 
@@ -364,8 +365,8 @@ class GaussianSurfaceModel(nn.Module):
 
     @classmethod
     def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:
-        """The model of the Gaussians in a file, with the errors of :func:`gaussian_swaying.gaussians.ply.read_ply`."""
-        return cls(read_ply(path), requires_grad)
+        """The model of the Gaussians in a file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads."""
+        return cls(read_gaussians(path), requires_grad)
 
     def to_cloud(self) -> GaussianCloud:
         """The Gaussians in storage form, detached; they share memory with the parameters except for ``sh``."""

@@ -377,10 +377,11 @@ def _read_summary(run: Path) -> dict[str, Any]:
 
 def _sim_frame(run: Path, summary: dict[str, Any]) -> SimFrame:
     """The frame of the simulation, from the numbers of the summary or else from its line for people."""
-    exact = summary.get("sim_frame")
-    if exact is not None:
-        origin, rotation = (torch.tensor(exact[name], dtype=torch.float64) for name in ("origin", "rotation"))
-        return SimFrame(origin, rotation, float(exact["metres_per_unit"]))
+    if "sim_frame" in summary:
+        try:
+            return SimFrame.from_summary(summary)
+        except ValueError as error:
+            raise ValueError(f"The summary.json of {run} cannot be used: {error}.") from error
     line = re.fullmatch(r"1 scene unit = (\S+) m; origin (\[.*\]); up (\[.*\]) .*", str(summary.get("frame")))
     if line is None:
         raise ValueError(f"The summary.json of {run} does not say where the scene lies (`frame`): run it again.")

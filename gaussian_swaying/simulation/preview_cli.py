@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.simulation.config import _one_sentence, build_parser, build_pipeline
 from gaussian_swaying.simulation.cost import Cost, estimate_cost
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
@@ -84,7 +85,7 @@ def preview_scene(options: argparse.Namespace, starter_path: Path) -> Preview:
         ValueError: If the splat or an option is bad, or the configuration does not run.
         FileNotFoundError: If there is no such splat.
     """
-    cloud = read_ply(options.scene)
+    cloud = read_gaussians(options.scene)
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
     found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind)

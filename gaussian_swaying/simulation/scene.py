@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
+from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.neighbours import nearest_neighbours
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
+from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
 from gaussian_swaying.gaussians.surface import (
@@ -90,7 +91,7 @@ class Scene:
     """Where the Gaussians come from and which of them are simulated.
 
     Args:
-        ply: A 3DGS .ply file; takes precedence over ``generator``.
+        ply: A 3DGS .ply, a compressed .ply or a .splat; takes precedence over ``generator``.
         generator: A scene made in code.
         region: Part that is simulated, in scene units; the rest stays as it is and is rendered with it.
         opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
@@ -163,7 +164,7 @@ class Scene:
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
         if self.ply is not None:
-            return read_ply(self.ply)
+            return read_gaussians(self.ply)
         assert self.generator is not None
         return self.generator.generate()
 
