@@ -101,7 +101,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
             raise ValueError(f"{path} has no property `{name}`, so it is no compressed .ply; export it again.")
         if vertices.dtype[name].kind not in "iu":
             raise ValueError(f"{path}: property `{name}` is not a whole number; export the file again.")
-    chunks = ply["chunk"].data if "chunk" in ply else np.empty(0)
+    chunks: Any = ply["chunk"].data if "chunk" in ply else np.empty(0)
     if len(chunks) < -(-count // CHUNK):
         raise ValueError(
             f"{path} has {len(chunks)} chunks, too few for {count} Gaussians in chunks of {CHUNK}; export it again."

@@ -365,7 +365,7 @@ class GaussianSurfaceModel(nn.Module):
 
     @classmethod
     def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:
-        """The model of the Gaussians in a file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads."""
+        """The model of a file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads."""
         return cls(read_gaussians(path), requires_grad)
 
     def to_cloud(self) -> GaussianCloud:
