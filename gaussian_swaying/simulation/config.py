@@ -6,6 +6,7 @@ import os
 import sys
 from argparse import SUPPRESS, Action, ArgumentError
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +22,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.keyframes import KeyframedCamera
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.continuing import how_to_resume
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
@@ -29,6 +31,7 @@ from gaussian_swaying.simulation.physgaussian_space import Normalisation
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.signals import exit_code, stop_signals
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -228,6 +231,12 @@ def _one_sentence(message: str, arguments: Sequence[str]) -> str:
     return " ".join(kept)
 
 
+def _tell_how_to_resume(pipeline: SimulationPipeline | None, arguments: Sequence[str], diverged: bool = False) -> None:
+    """Name the checkpoint that a run has left, if it has left one."""
+    if pipeline is not None and pipeline.resumable is not None:
+        print(how_to_resume(*pipeline.resumable, arguments, diverged), file=sys.stderr)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, build, run.
 
@@ -235,8 +244,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command line; that of the process if None.
 
     Returns:
-        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C. With the
-        environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM,
+        129 by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
@@ -245,6 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ArgumentError as error:
         print(f"error: {_one_sentence(str(error), arguments)}; --help lists the options.", file=sys.stderr)
         return 2
+    pipeline = None
     try:
         pipeline, recorder = build_pipeline(parser, settings)
         folder = output_folder(settings)
@@ -255,15 +265,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(scene.frame.describe())
         extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
         text = config_text(parser, settings)
-        summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
-    except KeyboardInterrupt:
-        print("Stopped; what was recorded is kept. If there is a checkpoint, --resume continues.", file=sys.stderr)
-        return 130
+        with stop_signals():
+            summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
+    except KeyboardInterrupt as stop:
+        with suppress(OSError):  # a terminal that has gone
+            print("Stopped; what was recorded is kept.", file=sys.stderr)
+            _tell_how_to_resume(pipeline, arguments)
+        return exit_code(stop)
     except torch.OutOfMemoryError as error:
         print(
             f"error: {error} Remedy: a smaller `scene.region`, a coarser `solver.dx` or a smaller picture.",
             file=sys.stderr,
         )
+        _tell_how_to_resume(pipeline, arguments)
         return 2
     except (ValueError, TypeError, OSError, SimulationDiverged) as error:
         if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
@@ -272,6 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "Does not validate" in message:  # a class within a class, whose own message the parser wraps
             message = _one_sentence(message, arguments)
         print(f"error: {message}", file=sys.stderr)
+        _tell_how_to_resume(pipeline, arguments, isinstance(error, SimulationDiverged))
         return 2
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")

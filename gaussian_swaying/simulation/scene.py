@@ -199,11 +199,13 @@ class SimulatedScene(nn.Module):
         moving: Indices of the Gaussians that move, the simulated and then the carried ones, shape (M,).
         all_move: Whether these are all, in their order.
         rest_facing: Normals at rest of those that move, in the z-up frame, shape (M, 3).
+        source: The .ply file; None for a scene made in code.
     """
 
     def __init__(self, scene: Scene, material: Material, dx: float, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
         cloud = scene.cloud()
+        self.source = scene.ply
         opacity = torch.sigmoid(cloud.opacities)
         chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold)
         faint = scene.region.contains(cloud.means) & ~chosen

@@ -12,6 +12,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from gaussian_swaying.simulation.checkpoint import write_checkpoint
 from gaussian_swaying.simulation.config import main
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.trajectory import load_trajectory
@@ -120,8 +121,13 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
     assert not (folder / "summary.json").exists()
-    (folder / "trajectory" / ".00004.1234.npz").write_bytes(b"half")
+    (folder / "trajectory" / ".00004.gs-writing-1234.npz").write_bytes(b"half")
+    (folder / ".my.notes.txt").write_text("precious")
+    (folder / "frames" / ".a.b.c").write_text("precious")
     assert main(_arguments(folder, "--resume")) == 0
+    assert (folder / ".my.notes.txt").read_text() == "precious"
+    assert sorted(path.name for path in folder.rglob(".*")) == [".a.b.c", ".my.notes.txt"]
+    (folder / "frames" / ".a.b.c").unlink()
     _same_as_uninterrupted(folder, whole)
 
 
@@ -131,7 +137,9 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
     folder, full, go_on = tmp_path / "run", tmp_path / "full", tmp_path / "go_on"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     code = (
-        "import functools, pathlib, sys, time\n"
+        "import functools, pathlib, signal, sys, time\n"
+        # ignored where a script starts the tests in the background
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import imageio.v3 as iio\n"
         "from gaussian_swaying.simulation import config, recorder\n"
         f"full, go_on = pathlib.Path({str(full)!r}), pathlib.Path({str(go_on)!r})\n"
@@ -245,7 +253,7 @@ def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
     checkpoint = torch.load(file, weights_only=True)
     for name in ("position", "velocity", "affine", "F_elastic", "lost"):
         checkpoint["state"][name] = checkpoint["state"][name][:50]
-    torch.save(checkpoint, file)
+    write_checkpoint(file, checkpoint)
     check_refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
 
 
