@@ -3,6 +3,7 @@
 import argparse
 import sys
 
+from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.export import SUFFIXES, convert
 
 
@@ -12,14 +13,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("source", help="A 3DGS .ply, or a folder of them for an animated USD.")
     parser.add_argument("target", help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}.")
     parser.add_argument("--fps", type=float, default=25.0, help="Frames per second of a folder.")
-    settings = parser.parse_args(arguments)
-    try:
-        convert(settings.source, settings.target, settings.fps)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return run_command(
+        lambda: export(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="fewer Gaussians"
+    )
+
+
+def export(settings: argparse.Namespace) -> None:
+    """Convert, and say what was written."""
+    convert(settings.source, settings.target, settings.fps)
     print(f"wrote {settings.target}")
-    return 0
 
 
 if __name__ == "__main__":
