@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import sys
-import warnings
 from argparse import ArgumentError
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -15,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from gaussian_swaying.cli.errors import parser_sentence, run_command
+from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.simulation.config import _one_sentence, build_parser, build_pipeline
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.cost import Cost, estimate_cost
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
@@ -146,9 +145,10 @@ def _pipeline(arguments: list[str], text: str | None = None) -> tuple[Simulation
     """The run of a configuration, given by options or as text, and its settings."""
     parser = build_parser()
     try:
-        settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
+        with guessing(parser):
+            settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
     except ArgumentError as error:
-        raise ValueError(_one_sentence(str(error), arguments)) from error
+        raise ValueError(parser_sentence(str(error), arguments)) from error
     return build_pipeline(parser, settings)[0], settings
 
 
@@ -371,36 +371,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With the environment variable
         ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
-    options = build_options().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
-    try:
-        if options.scene is None and options.config is None:
-            raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
-        if options.frames < 1:
-            raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
-        if not 64 <= options.height <= 4320:
-            raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
-        folder = Path(options.output or Path("outputs/preview") / Path(options.scene or options.config[-1]).stem)
-        starter = folder / "starter.yaml"
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            found = preview_scene(options, starter) if options.config is None else preview_config(options)
-        print(found.report)
-        for text in dict.fromkeys(str(entry.message) for entry in caught):  # the splat is read twice
-            print(f"warning: {text}", file=sys.stderr)
-        for path in write(found, folder):
-            print(f"wrote {path}")
-    except KeyboardInterrupt:
-        print("Stopped; nothing was written.", file=sys.stderr)
-        return 130
-    except (ValueError, TypeError, OSError, torch.OutOfMemoryError) as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        message = str(error)
-        if "Does not validate" in message:
-            message = _one_sentence(message, arguments or sys.argv[1:])
-        print(f"error: {message}", file=sys.stderr)
-        return 2
-    return 0
+    arguments = _joined(sys.argv[1:] if arguments is None else arguments)
+    parser = build_options()
+    return run_command(
+        lambda: _preview(parser.parse_args(arguments)),
+        stopped="Stopped; nothing was written.",
+        memory="a smaller --region, or fewer Gaussians",
+        arguments=arguments,
+    )
+
+
+def _preview(options: argparse.Namespace) -> None:
+    """Look, report, write."""
+    if options.scene is None and options.config is None:
+        raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
+    if options.frames < 1:
+        raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
+    if not 64 <= options.height <= 4320:
+        raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
+    folder = Path(options.output or Path("outputs/preview") / Path(options.scene or options.config[-1]).stem)
+    starter = folder / "starter.yaml"
+    found = preview_scene(options, starter) if options.config is None else preview_config(options)
+    print(found.report)
+    for path in write(found, folder):
+        print(f"wrote {path}")
 
 
 def write(found: Preview, folder: Path) -> list[Path]:
