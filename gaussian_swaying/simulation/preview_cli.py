@@ -21,8 +21,9 @@ from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.simulation.config import _one_sentence, build_parser, build_pipeline
 from gaussian_swaying.simulation.cost import Cost, estimate_cost
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
 from gaussian_swaying.simulation.starter import region_dict, starter_yaml
 
 

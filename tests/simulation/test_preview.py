@@ -13,25 +13,17 @@ from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
+from gaussian_swaying.simulation.hold import PIN_DEPTH, end_region, guess_hold
 from gaussian_swaying.simulation.lean import LEAN, SHELL_E
 from gaussian_swaying.simulation.preview import (
     CELLS,
-    CONVENTION,
     KEPT_AREA,
     MAX_BOXES,
-    PIN_DEPTH,
-    SHEET,
-    bounds,
     broad_side,
     connected_parts,
-    end_region,
-    floor_mask,
     gaussian_statistics,
     given_region,
-    guess_hold,
-    guess_up,
     particle_spacing,
-    sheet_normal,
     suggest,
     suggest_fill,
     suggest_region,
@@ -39,7 +31,9 @@ from gaussian_swaying.simulation.preview import (
     suggest_threshold,
     visible_weight,
 )
+from gaussian_swaying.simulation.shape import SHEET, bounds, sheet_normal
 from gaussian_swaying.simulation.starter import starter_yaml
+from gaussian_swaying.simulation.up import CONVENTION, floor_mask, guess_up
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
