@@ -182,8 +182,11 @@ def suggest(
     metres = frame.point_to_sim(points.double())
     spacing = particle_spacing(points) * frame.metres_per_unit
     dx = suggest_spacing(longest_side, spacing)
-    ground = bool(upward.ground.any())
-    held = guess_hold(points, visible, upward.direction, ground) if hold is None else given_hold(hold, upward.direction)
+    if hold is None:
+        rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
+        held = guess_hold(points, visible, upward.direction, dx / frame.metres_per_unit, rest)
+    else:
+        held = given_hold(hold, upward.direction)
     pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
     azimuth = broad_side(metres)
     flow = _across_picture(azimuth, speed)

@@ -26,6 +26,7 @@ class UpGuess:
         scores: Points of each direction.
         reasons: What spoke for the winner, in words.
         ground: Which Gaussians form the floor below, shape (N,).
+        options: What ``--up`` takes for this direction and for the next best; empty if it was given.
     """
 
     direction: tuple[float, ...]
@@ -33,6 +34,7 @@ class UpGuess:
     scores: dict[str, float]
     reasons: list[str]
     ground: Tensor
+    options: tuple[str, ...] = ()
 
 
 def floor_mask(points: Tensor, normals: Tensor, weight: Tensor, up: Sequence[float]) -> Tensor:
@@ -138,7 +140,7 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
     lead = scores[best] - scores[second]
     confidence = "high" if lead >= 2 else "medium" if lead >= 1 else "low"
     reasons = [*why[best], f"{second} comes next, {lead:.2g} behind"]
-    return UpGuess(DIRECTIONS[best], confidence, scores, reasons, floors[best])
+    return UpGuess(DIRECTIONS[best], confidence, scores, reasons, floors[best], (best, second))
 
 
 def given_up(up: Sequence[float] | str, points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:

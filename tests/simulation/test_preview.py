@@ -13,7 +13,7 @@ from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
-from gaussian_swaying.simulation.hold import PIN_DEPTH, end_region, guess_hold
+from gaussian_swaying.simulation.hold import PIN_DEPTH, end_region
 from gaussian_swaying.simulation.lean import LEAN, SHELL_E
 from gaussian_swaying.simulation.preview import (
     CELLS,
@@ -266,25 +266,6 @@ def test_a_long_chain_is_one_part():
 
 
 # ---- pins
-
-
-def _cone(upside_down):
-    height = torch.rand(3000, 1) ** 0.5
-    radius = torch.cat([0.3 * height * (torch.rand(3000, 2) - 0.5), height], -1)
-    return radius if not upside_down else radius * torch.tensor([1, 1, -1.0])
-
-
-def test_thin_end_is_held():
-    weight = torch.ones(3000)
-    stalk = guess_hold(_cone(False), weight, (0, 0, 1), ground=False)
-    assert (stalk.end, stalk.direction, stalk.confidence) == ("bottom", (0, 0, -1), "medium")
-    lamp = guess_hold(_cone(True), weight, (0, 0, 1), ground=False)
-    assert (lamp.end, lamp.direction, lamp.confidence) == ("top", (0, 0, 1), "low")
-    assert guess_hold(_cone(True), weight, (0, 0, 1), ground=True).end == "bottom"  # a cone on a floor
-    column = torch.rand(3000, 3)
-    assert guess_hold(column, weight, (0, 0, 1), ground=False).confidence == "low"
-    curtain = torch.rand(3000, 3) * torch.tensor([1, 0.01, 1]) + 5
-    assert guess_hold(curtain, weight, (0, 0, 1), ground=False).end == "top"
 
 
 def test_end_region_of_a_tilted_axis_holds_that_end():
