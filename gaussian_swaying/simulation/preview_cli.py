@@ -20,9 +20,11 @@ from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.cost import Cost, estimate_cost
+from gaussian_swaying.simulation.doubts import doubts
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
 from gaussian_swaying.simulation.starter import region_dict, starter_yaml
 
 
@@ -58,6 +60,7 @@ def build_options() -> argparse.ArgumentParser:
         metavar="FILE",
         help="show what this configuration does, instead of guessing one; may be given several times, as for sim.py",
     )
+    add("--capture", metavar="DIR", help="photos' cameras (COLMAP or transforms.json): they tell up and the object")
     add("--output", metavar="DIR", help="folder of the results; default: outputs/preview/<name of the splat>")
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, -x, ... or -z, instead of a guess")
@@ -101,7 +104,9 @@ def preview_scene(options: argparse.Namespace, starter_path: Path) -> Preview:
         "run": run_dict(pipeline),
         "cost": asdict(cost) | {"total_seconds": cost.total_seconds},
     }
-    report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found), *_cost_lines(cost)]
+    report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found)]
+    report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
+    report += _cost_lines(cost)
     name = Path(options.scene).stem
     report += ["", f"next: python tools/sim.py --config {starter_path} --output {Path('outputs') / name}"]
     return Preview("\n".join(report), data, preview_picture(pipeline, options.height), text)
@@ -287,13 +292,6 @@ def _suggestion_lines(found: Suggestion) -> list[str]:
         f"material        {_material(found)}",
         f"wind            {_numbers(found.flow)} m/s, z up",
     ]
-    if found.up.confidence == "low":
-        lines.append("warning: the up axis is a weak guess; look at the picture, and give --up if it is wrong")
-    if found.region.loose:
-        lines.append(
-            f"warning: {found.region.loose:,} specks inside the region hang on nothing and will fall; give a smaller "
-            "--region, or raise scene.opacity_threshold"
-        )
     return ["", "guesses (each can be given instead, see --help)", *(f"  {line}" for line in lines)]
 
 

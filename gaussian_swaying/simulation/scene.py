@@ -286,7 +286,11 @@ class SimulatedScene(nn.Module):
         for entry in material.regions:
             inside = entry.region.contains(where)
             if not bool(inside.any()):
-                raise ValueError(f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian.")
+                low, high = entry.region.bounds(where)
+                raise ValueError(
+                    f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie between "
+                    f"{low} and {high}{entry.region.axes}; move or enlarge it."
+                )
             for name in _MATERIAL_FIELDS:
                 if getattr(entry, name) is not None:
                     fields[name][inside] = getattr(entry, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
     boundaries = " []               # nothing holds it: it will fall"
     if s.pin is not None:
         boundaries = f"""
-    # {s.hold.reason}
+{_comment(s.hold.reason, 4)}
     - class_path: PinnedRegion
       init_args:
         region: {json.dumps(region_dict(s.pin))}"""
@@ -114,7 +115,7 @@ scene:
   ply: {path}
   up: {_padded(json.dumps([round(c, 6) for c in s.up.direction]), 26)}# scene axes; confidence: {s.up.confidence}
   longest_side: {s.longest_side:<16.6g}# m; the real one, if you know it
-  # {s.region.reason}
+{_comment(s.region.reason, 2)}
   region: {where}
   opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
   faint: carry
@@ -166,3 +167,9 @@ recorder:
 def _padded(text: str, width: int) -> str:
     """Text with blanks up to a width, at least one."""
     return f"{text:<{width - 1}} "
+
+
+def _comment(text: str, indent: int) -> str:
+    """Text as comment lines of at most 120 characters."""
+    begin = " " * indent + "# "
+    return textwrap.fill(text, 120, initial_indent=begin, subsequent_indent=begin, break_long_words=False)
