@@ -67,26 +67,20 @@ def check_pictures(folder: Path, place: str, frames: int, video: str | None = No
         if look != first:
             shown = [f"{width} x {height} {mode}" for (width, height), mode in (look, first)]
             raise damaged(path, f"it is {shown[0]}, and the frames before it are {shown[1]}")
-    return tell_missing(missing, f"{video} leaves out" if video else "there will not be")
+    return tell_missing(missing, video)
 
 
 def check_frames(folder: Path, place: str, suffix: str, wanted: Iterable[int]) -> list[str]:
     """Tell which files of the frames so far are missing."""
     files = [folder / place / f"{index:05d}{suffix}" for index in wanted]
-    return tell_missing([file for file in files if kind_of(file) is None], "there will not be")
+    return tell_missing([file for file in files if kind_of(file) is None])
 
 
 def check_positions(folder: Path, frames: int, particles: int | None) -> list[str]:
     """Look at the trajectory of the frames so far; ValueError if a file of it is damaged."""
     held = check_trajectory(folder / "trajectory", folder / "trajectory.npz", frames, particles)
     lost = sorted(set(range(frames)) - held)
-    if not lost:
-        return []
-    more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
-    return [
-        f"The trajectory of frame {lost[0]}{more} in {folder} is missing, so trajectory.npz leaves it out; start again "
-        "without --resume to have it."
-    ]
+    return tell_missing([folder / "trajectory" / f"{index:05d}.npz" for index in lost], "trajectory.npz")
 
 
 def check_shards(folder: Path, wanted: Iterable[int]) -> list[str]:
@@ -110,7 +104,7 @@ def check_shards(folder: Path, wanted: Iterable[int]) -> list[str]:
         except ValueError as error:
             raise damaged(film, str(error)) from error
         missing = []
-    return tell_missing(missing, f"{film.name} leaves out")
+    return tell_missing(missing, film.name)
 
 
 def damaged(path: Path, why: str) -> ValueError:
@@ -119,10 +113,10 @@ def damaged(path: Path, why: str) -> ValueError:
     return ValueError(f"{path} is damaged ({why}): remove it to go on without it, or start again without --resume.")
 
 
-def tell_missing(files: Sequence[Path], consequence: str) -> list[str]:
-    """A sentence that names the first of some missing files, if there are any."""
+def tell_missing(files: Sequence[Path], film: str | None = None) -> list[str]:
+    """A sentence that names the first of some missing files, if there are any, and the film that is made of them."""
     if not files:
         return []
-    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    what = "it" if len(files) == 1 else "them"
-    return [f"{files[0]}{more} is missing, so {consequence} {what}; start again without --resume to have {what}."]
+    what, many = ("it", f"{files[0]} is") if len(files) == 1 else ("them", f"{files[0]} and {len(files) - 1} more are")
+    so = f", so {film} will be without {what}" if film else ""
+    return [f"{many} missing{so}; start again without --resume to have {what}."]
