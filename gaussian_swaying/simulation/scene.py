@@ -21,7 +21,7 @@ from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
     deform_all,
-    limit_stretch,
+    limit_deformed,
 )
 from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
@@ -106,8 +106,9 @@ class Scene:
         wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
             those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
         max_stretch: How many times its size at rest a Gaussian is drawn at most (see
-            :func:`~gaussian_swaying.gaussians.surface.limit_stretch`), in pictures and exports; null for no limit,
-            which suits what is elastic. Without one, material that flows is drawn as streaks.
+            :func:`~gaussian_swaying.gaussians.surface.limit_deformed`), in pictures and exports; null for no limit.
+            Nothing changes below the limit. Beyond it a Gaussian would be a streak: there two parts of the object that
+            share cells of the grid were pulled apart, or a material flowed.
         layers: Layers of material points through the thickness: 1, a membrane that folds without resistance, or 3,
             which resists bending as a plate does (the Gaussians in the middle plane, two more points at the faces of
             the sheet, weights of Simpson's rule). Three times the points.
@@ -129,7 +130,7 @@ class Scene:
         area: str = "coverage",
         filling: InteriorFilling | None = None,
         wind_on: str = "surface",
-        max_stretch: float | None = None,
+        max_stretch: float | None = 2.0,
         layers: int = 1,
         particle_spacing: float | None = None,
     ) -> None:
@@ -380,10 +381,20 @@ class SimulatedScene(nn.Module):
         self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """``deform_all`` and the limit of the scene."""
-        deformed, normals, turns = deform_all(F, covariances, normals, rotations)
+        # the limit needs the rotations; on a GPU they cost next to nothing, and all of them are computed
+        wanted = rotations or (self.max_stretch is not None and F.device.type == "cuda")
+        deformed, normals, turns = deform_all(F, covariances, normals, wanted)
         if self.max_stretch is not None:
-            deformed = limit_stretch(deformed, covariances, self.max_stretch)
-        return deformed, normals, turns
+            deformed = limit_deformed(F, deformed, covariances, self.max_stretch, self._solid(), turns)
+        return deformed, normals, turns if rotations else None
+
+    def _solid(self) -> Tensor:
+        """Which of the Gaussians that move keep their shape, as their law has no return map; bool, shape (M,)."""
+        laws, index = self.points.laws, self.points.law_index
+        count = len(self.simulated)
+        solid = torch.stack([self.simulated.new_full((), not law.plastic, dtype=torch.bool) for law in laws])
+        own = solid[:1].expand(count) if index is None else solid[index[:count]]
+        return torch.cat([own, own[self.anchor]])
 
     def on_gaussians(self, values: Tensor) -> Tensor:
         """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.
