@@ -15,6 +15,7 @@ _SWITCHES = {
     "hold": "--hold",
     "region": "--region",
     "longest_side": "--longest-side",
+    "sway": "--sway",
     "wind": "--wind",
     "frames": "--frames",
     "height": "--height",

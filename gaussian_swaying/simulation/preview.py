@@ -19,14 +19,16 @@ from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Not, Region, Union
 from gaussian_swaying.gaussians.subdivision import subdivide
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, smallest_axis_normal
+from gaussian_swaying.gaussians.surface import smallest_axis_normal
 from gaussian_swaying.simulation.frame import SimFrame
 from gaussian_swaying.simulation.hold import HoldGuess, end_region, given_hold, guess_hold
-from gaussian_swaying.simulation.lean import SHELL_E, SHELL_THICKNESS, cantilever_lean, stiffness_for, thinned
 from gaussian_swaying.simulation.shape import FEWEST, bounds, quantile, rounded, sheet_normal
 from gaussian_swaying.simulation.up import UpGuess, given_up, guess_up
 
 CELLS = 24  # along the longest side: enough to bend, few enough for a laptop
+DRAFT_CELLS = 16  # the same for a first look
+CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
+SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; anything else: a shell of rubber
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
 KEPT_AREA = 0.95  # share of the visible area that the threshold has to leave
 MAX_BOXES = 8  # boxes that cut specks out of the region
@@ -112,8 +114,9 @@ class Suggestion:
         sheet: Whether the object is a thin sheet.
         azimuth: Azimuth of a camera that sees the broad side [degrees].
         flow: Wind across the picture, or along a sheet from where it is held [m/s], z up.
-        youngs_modulus: Young's modulus of what is no sheet [Pa].
-        thickness: Its thickness [m].
+        youngs_modulus: Young's modulus [Pa], a first guess; :mod:`~gaussian_swaying.simulation.calibration` finds a
+            better one.
+        thickness: Thickness of the surface [m], likewise.
         stiffness_reason: Why, in words.
     """
 
@@ -197,22 +200,6 @@ def suggest(
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
     elif flat is not None:  # a curtain is moved by wind onto it
         flow = _across_picture(azimuth - 90, speed)
-    modulus, why = SHELL_E, "soft rubber"
-    thickness = SHELL_THICKNESS * longest_side
-    if held.end == "bottom" and flat is None and pin is not None and speed > 0:
-        part = thinned(cloud.select(chosen.simulated))
-        patches = GaussianSurfaceModel.from_cloud(part, requires_grad=False)
-        area = frame.area_to_sim(patches.areas("coverage").double())
-        normal = frame.direction_to_sim(patches.normals().double())
-        foot = metres[pin.contains(points)]
-        where = frame.point_to_sim(part.means.double())
-        height = (where[:, 2] - foot[:, 2].amax()).clamp(min=0)
-        lean = cantilever_lean(where, height, normal, area, flow, SHELL_E, thickness, dx) / longest_side
-        modulus, gain = stiffness_for(lean)
-        flow = tuple(c * gain for c in flow)
-        why = (
-            f"as a beam it then leans by about {lean * SHELL_E / modulus * gain**2:.2g} of its longest side on average"
-        )
     return Suggestion(
         up=upward,
         region=chosen,
@@ -227,9 +214,9 @@ def suggest(
         sheet=flat is not None,
         azimuth=round(azimuth + 20.0, 1),
         flow=tuple(round(c, 2) + 0.0 for c in flow),
-        youngs_modulus=modulus,
-        thickness=thickness,
-        stiffness_reason=why,
+        youngs_modulus=SHELL_E if flat is None else CLOTH_E,
+        thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
+        stiffness_reason="rubber, not tried" if flat is None else "the cloth of the paper's flags, not tried",
     )
 
 
@@ -387,18 +374,19 @@ def particle_spacing(points: Tensor, sample: int = 4000) -> float:
     return quantile(distance[:, 1], 0.9)
 
 
-def suggest_spacing(longest_side: float, spacing: float) -> float:
-    """Grid spacing: the longest side over ``CELLS``, no finer than twice the particle spacing, to 2 digits.
+def suggest_spacing(longest_side: float, spacing: float, cells: int = CELLS) -> float:
+    """Grid spacing: the longest side over ``cells``, no finer than twice the particle spacing, to 2 digits.
 
     Args:
         longest_side: Longest side of the object [m].
         spacing: From :func:`particle_spacing` [m].
+        cells: Cells along the longest side.
 
     Returns:
         Grid spacing [m].
     """
     check_positive("longest_side", longest_side)
-    return float(f"{max(longest_side / CELLS, 2 * spacing):.2g}")
+    return float(f"{max(longest_side / cells, 2 * spacing):.2g}")
 
 
 def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> float | None:

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from gaussian_swaying.simulation.lean import LEAN, SHELL_E
 
 from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
 from gaussian_swaying.simulation.hold import PIN_DEPTH, end_region
-from gaussian_swaying.simulation.lean import LEAN, SHELL_E
 from gaussian_swaying.simulation.preview import (
     CELLS,
     KEPT_AREA,
