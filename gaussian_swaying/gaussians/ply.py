@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
+from gaussian_swaying.simulation.files import atomic
 
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -191,12 +192,8 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     rest = tuple(f"f_rest_{index}" for index in range(rest_count))
     names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
     rows = table.astype("<f4", copy=False).view([(name, "<f4") for name in names]).reshape(count)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with atomic(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:

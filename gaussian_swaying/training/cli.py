@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import sys
 import warnings
-from argparse import ArgumentError
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,11 @@ import gaussian_swaying.data.datamodule
 import gaussian_swaying.data.generated_datamodule
 import gaussian_swaying.training.densification
 import gaussian_swaying.training.losses  # noqa: F401
+from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
+
+_STOPPED = "Stopped; --ckpt_path with the last checkpoint continues."
 
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_steps": 60_000,
@@ -78,7 +80,8 @@ class TrainCLI(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse, and refuse a checkpoint that cannot be read."""
-        super().parse_arguments(parser, args)
+        with guessing(parser):
+            super().parse_arguments(parser, args)
         command = self.config.get("subcommand")
         path = self.config.get(command, {}).get("ckpt_path") if command else None
         if path is None or not Path(str(path)).suffix:  # best, last ...
@@ -130,15 +133,6 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainC
     )
 
 
-def _sentence(error: BaseException) -> str:
-    """The lines of a parser's message that name the value and the reason, or the last of a worker's traceback."""
-    if str(error).startswith("Caught "):
-        return str(error).strip().rpartition("Error: ")[2]
-    noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-    lines = [line.strip() for line in str(error).splitlines()]
-    return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(noise))
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and run.
 
@@ -149,25 +143,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input or a training that diverged, 130 if stopped with Ctrl-C. With the
         environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
+    return run_command(
+        lambda: _train(arguments),
+        stopped=_STOPPED,
+        memory="smaller images (`data.init_args.downscale`)",
+        expected=(TrainingDiverged, MisconfigurationException),
+        arguments=arguments,
+    )
+
+
+def _train(arguments: Sequence[str] | None) -> int:
+    """Parse and run, and say what was written."""
     # checkpoints are written after the step, which is what a resumed run needs
     warnings.filterwarnings("ignore", message="Using ModelCheckpoint with manual optimization")
     warnings.filterwarnings("ignore", message="(?s).*does not have many workers")
     warnings.filterwarnings("ignore", message=".*LeafSpec")
     try:
         cli = make_cli(arguments)
-    except (KeyboardInterrupt, SystemExit) as stop:
-        if isinstance(stop, SystemExit) and stop.code != 1:  # Lightning leaves with 1 after Ctrl-C
+    except SystemExit as stop:
+        if stop.code != 1:  # Lightning leaves with 1 after Ctrl-C
             raise
-        print("Stopped; --ckpt_path with the last checkpoint continues.", file=sys.stderr)
+        print(_STOPPED, file=sys.stderr)
         return 130
-    except torch.OutOfMemoryError as error:
-        print(f"error: {error} Remedy: smaller images (`data.init_args.downscale`).", file=sys.stderr)
-        return 2
-    except (ArgumentError, ValueError, TypeError, OSError, TrainingDiverged, MisconfigurationException) as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        print(f"error: {_sentence(error)}", file=sys.stderr)
-        return 2
     if cli.subcommand == "fit":
         for name in ("point_cloud.ply", "panels", "checkpoints"):
             path = cli.model.folder / name

@@ -11,10 +11,10 @@ import pytest
 import torch
 import yaml
 
+from gaussian_swaying.cli.errors import parser_sentence
 from gaussian_swaying.data.generated_capture import GeneratedCapture
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.simulation.config import main as simulate
-from gaussian_swaying.training import cli as training_cli
 from gaussian_swaying.training.cli import main, make_cli
 from gaussian_swaying.training.densification import PARAMETERS
 
@@ -145,7 +145,7 @@ def test_ctrl_c(capture, tmp_path, monkeypatch, capsys):
 
 def test_the_message_of_a_worker_is_one_sentence():
     text = 'Caught ValueError in DataLoader worker process 0.\nOriginal\n  File "x"\nValueError: The image is cut.\n'
-    assert training_cli._sentence(ValueError(text)) == "The image is cut."
+    assert parser_sentence(text) == "The image is cut."
 
 
 OWN = """
