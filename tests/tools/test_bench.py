@@ -6,6 +6,7 @@ import math
 import pytest
 from bench.cases import accuracy, pareto
 from bench.tables import accuracy as tables
+from bench.tables import pareto as sweep
 from bench.tables.rows import order
 
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -101,3 +102,16 @@ def test_the_observed_order():
     coarse, fine = ({"parameters": {"cells": n}, "result": {"error": 3.0 / n**2}} for n in (8, 12))
     assert order(coarse, fine) == pytest.approx(2.0)
     assert math.isfinite(order(coarse, fine))
+
+
+def test_what_a_longer_substep_costs():
+    """The median over pairs that are alike but for the CFL number; fixed substeps and float64 do not count."""
+
+    def row(size, cfl, wall, **more):
+        base = {"problem": "bar", "size": size, "variant": "total", "dtype": "float32", "cfl": cfl, "substep": None}
+        return base | {"error": 0.1, "wall_per_simulated_s": wall} | more
+
+    rows = [row(1, 0.4, 1.0), row(1, 0.8, 0.5), row(2, 0.4, 2.0), row(2, 0.8, 1.2), row(3, 0.4, 4.0), row(3, 0.8, 2.8)]
+    rows += [row(4, 0.4, 1.0), row(1, 0.8, 9.0, dtype="float64"), row(2, 0.8, 9.0, substep=1e-3)]
+    rows += [row(5, 0.4, 1.0), row(5, 0.8, 9.0, error=None)]
+    assert sweep.time_at({"rows": rows}, "0.8") == "0.60"

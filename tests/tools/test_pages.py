@@ -111,7 +111,8 @@ def test_a_table_within_a_sentence_is_refused():
 
 
 def test_only_what_is_between_the_comments_changes():
-    text = "It is <!-- begin: long_flag.damping long_flag damped -->7 /s<!-- end -->.  \n\n<!-- a note -->\n| x |\n"
+    text = "It is <!-- begin: long_flag.damping long_flag damped -->7 /s<!-- end -->.  \n\n"
+    text += "<!-- a note -->\n`<!-- begin: x -->`\n"
     filled = slots.fill("page.md", text, RECORDS)
     assert filled == text.replace("7 /s", "0.25 1/s")
     assert slots.fill("page.md", filled, RECORDS) == filled

@@ -12,7 +12,8 @@ A page is a file that a person edits. A table, or a number within a sentence, st
     A flag is <!-- begin: flags.distance flags_cuda ours 3 -->1.2 %<!-- end --> away from its reference.
 
 The words of the first comment are the name of the slot, the recorded file that it is made from, and what else the slot
-asks for. :func:`fill` puts the text between the comments anew and leaves all other text as it is.
+asks for. :func:`fill` puts the text between the comments anew and leaves all other text as it is. A comment in
+backquotes is text.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Row = dict[str, Any]
 Records = Mapping[str, Row]
 """What was recorded, by the name of its file without ``.json``."""
 
-_MARK = re.compile(r"<!-- (?:begin:\s*(?P<words>[^>]*?)|(?P<end>end)) -->")
+_MARK = re.compile(r"(?<!`)<!-- (?:begin:\s*(?P<words>[^>]*?)|(?P<end>end)) -->")
 
 
 class SlotError(ValueError):

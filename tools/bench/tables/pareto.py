@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import statistics
 from typing import Any
 
-from bench.cases.pareto import PROBLEMS, PROVEN_CFL, is_default, on_front, proven
+from bench.cases.pareto import DEFAULT, PROBLEMS, PROVEN_CFL, is_default, on_front, proven
 from bench.slots import table, value
 from bench.tables.markdown import grid, stack, yes_no
 
@@ -58,6 +59,20 @@ def default_on_front(result: Row) -> str:
     safe = [row for row in result["rows"] if proven(row)]
     good = sum(on_front(row, [other for other in safe if other["problem"] == row["problem"]]) for row in found)
     return f"{good} of {len(found)}"
+
+
+@value("pareto.time_at", "pareto_*")
+def time_at(result: Row, cfl: str) -> str:
+    """Time with another CFL number over that with the default: the median over runs that are alike otherwise."""
+    times: dict[Any, dict[float, float]] = {}
+    for row in result["rows"]:
+        if row["error"] and row["substep"] is None and row["dtype"] == DEFAULT["dtype"]:
+            alike = times.setdefault((row["problem"], row["size"], row["variant"]), {})
+            alike[row["cfl"]] = row["wall_per_simulated_s"]
+    ratios = [
+        own[float(cfl)] / own[DEFAULT["cfl"]] for own in times.values() if {float(cfl), DEFAULT["cfl"]} <= set(own)
+    ]
+    return f"{statistics.median(ratios):.2f}"
 
 
 @table(PAGE, "pareto.adaptive", "pareto_*")
