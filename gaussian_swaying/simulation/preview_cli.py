@@ -16,6 +16,7 @@ import numpy as np
 
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.cost import Cost, estimate_cost
@@ -143,6 +144,7 @@ def preview_config(options: argparse.Namespace) -> Preview:
 def _pipeline(arguments: list[str], text: str | None = None) -> tuple[SimulationPipeline, Any]:
     """The run of a configuration, given by options or as text, and its settings."""
     parser = build_parser()
+    check_config_files(arguments)
     try:
         with guessing(parser):
             settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
