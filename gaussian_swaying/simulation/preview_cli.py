@@ -17,6 +17,7 @@ import numpy as np
 
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.simulation.calibration import (
@@ -201,6 +202,7 @@ def preview_config(options: argparse.Namespace) -> Preview:
 def _pipeline(arguments: list[str], text: str | None = None) -> tuple[SimulationPipeline, Any]:
     """The run of a configuration, given by options or as text, and its settings."""
     parser = build_parser()
+    check_config_files(arguments)
     try:
         with guessing(parser):
             settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)

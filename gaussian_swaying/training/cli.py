@@ -22,6 +22,7 @@ import gaussian_swaying.training.densification
 import gaussian_swaying.training.losses  # noqa: F401
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
 
 _STOPPED = "Stopped; --ckpt_path with the last checkpoint continues."
@@ -120,6 +121,8 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainC
         ValueError: If a value is out of range or the data are bad.
         TrainingDiverged: If a loss or a Gaussian is not finite any more.
     """
+    limit_yaml()
+    check_config_files(sys.argv[1:] if arguments is None else arguments)
     return TrainCLI(
         SplatTrainer,
         LightningDataModule,
