@@ -387,6 +387,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.scene is None and options.config is None:
             raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
+        if options.capture is not None and options.config is not None:
+            raise ValueError("`--capture` is for guesses, and a configuration is shown as it is: leave out one of them.")
         if options.frames < 1:
             raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
         if not 64 <= options.height <= 4320:
