@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -136,6 +137,18 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True) -> TrainC
     )
 
 
+def next_step(folder: Path, data: object) -> str:
+    """The command that looks at a trained splat with the cameras of its photos.
+
+    Args:
+        folder: Folder of the training.
+        data: What it was trained on; its ``path`` is the folder of the photos.
+    """
+    words = ["python", "tools/preview.py", str(folder / "point_cloud.ply")]
+    path = getattr(data, "path", None)
+    return shlex.join(words if path is None else [*words, "--capture", str(path)])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and run.
 
@@ -173,4 +186,6 @@ def _train(arguments: Sequence[str] | None) -> int:
             path = cli.model.folder / name
             if path.exists():
                 print(f"wrote {path}")
+        if (cli.model.folder / "point_cloud.ply").exists():
+            print(f"next: {next_step(cli.model.folder, cli.datamodule)}")
     return 130 if cli.trainer.interrupted else 0
