@@ -15,6 +15,7 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.data.capture_camera import CaptureCamera
 from gaussian_swaying.mpm.boundary import RegionInFrame
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -84,6 +85,7 @@ def build_parser() -> ArgumentParser:
     """The parser of ``tools/sim.py``: one group of options per component, typos are errors."""
     from jsonargparse import ActionYesNo, ArgumentParser
 
+    limit_yaml()
     parser = ArgumentParser(
         prog="sim.py",
         exit_on_error=False,
@@ -174,10 +176,17 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
     Raises:
         ValueError: If a value is out of range; the message names the field.
     """
+    from jsonargparse import Namespace
+
     device = resolve_device(settings.device)
     for name in COMMAND_LINE_ONLY:
         if name in settings:
             raise ValueError(f"`{name}` is an option of the command line, not of a YAML: remove it and give --{name}.")
+    for name in ("scene", "material", "solver", "wind", "aero", "recorder"):
+        if not isinstance(settings[name], Namespace):
+            raise ValueError(
+                f"Expected `{name}` to hold fields, such as those that --help lists, but got {settings[name]!r}."
+            )
     if settings.frames < 1:
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
     parts = parser.instantiate(settings)
@@ -254,6 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[SimulationPipeline]) -> None:
     """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
+    check_config_files(arguments)
     with guessing(parser):
         settings = parser.parse_args(arguments)
     pipeline, recorder = build_pipeline(parser, settings)

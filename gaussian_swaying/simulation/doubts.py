@@ -23,7 +23,7 @@ _SWITCHES = {
 }
 
 
-def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, **changes: str) -> str:
+def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, **changes: str | list[str]) -> str:
     """The command line of ``tools/preview.py`` that gives these options, and some in place of theirs.
 
     Args:
@@ -56,7 +56,7 @@ def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Na
     if found.up.confidence == "low":
         lines.append("warning: the up axis is a weak guess; look at the picture, and give it:")
         for name, words in zip(found.up.options, ("as guessed", "the next best"), strict=False):
-            lines.append(f"  {preview_command(options, defaults, up=name)}   # {words}")
+            lines.append(f"  {preview_command(options, defaults, up=name.split())}   # {words}")
     if found.hold.confidence == "low":
         lines.append(
             f"warning: that it is held at the {found.hold.end} is a weak guess; look at the picture, and give it:"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from gaussian_swaying.gaussians.subdivision import subdivide
 from gaussian_swaying.gaussians.surface import smallest_axis_normal
 from gaussian_swaying.simulation.frame import SimFrame
 from gaussian_swaying.simulation.hold import HoldGuess, end_region, given_hold, guess_hold
+from gaussian_swaying.simulation.preview_capture import CapturedFrom, ShownObject, photo_azimuth, shown_object
 from gaussian_swaying.simulation.shape import FEWEST, bounds, quantile, rounded, sheet_normal
 from gaussian_swaying.simulation.up import UpGuess, given_up, guess_up
 
@@ -43,9 +44,10 @@ class RegionGuess:
         box: Lower and upper corner [scene units] of the region, or None for all of space.
         holes: Boxes within it that are left out, as corners.
         opacity_threshold: Smallest opacity that is simulated.
-        specks: Gaussians above the threshold that are not part of the object, the floor apart.
+        specks: Gaussians above the threshold that are not part of the object, floor and surroundings apart.
         loose: Those of them that the region does not leave out.
         reason: In words.
+        cuts: Further regions within it that are left out: what lies in and behind a wall.
     """
 
     simulated: Tensor
@@ -55,13 +57,15 @@ class RegionGuess:
     specks: int
     loose: int
     reason: str
+    cuts: tuple[Region, ...] = ()
 
     def region(self) -> Region | None:
         """The region as a run takes it; None for all of space."""
         if self.box is None:
             return None
         inside: Region = Box(*self.box)
-        return Not(Union([Not(inside), *(Box(*hole) for hole in self.holes)])) if self.holes else inside
+        out = [*(Box(*hole) for hole in self.holes), *self.cuts]
+        return Not(Union([Not(inside), *out])) if out else inside
 
 
 def visible_weight(cloud: GaussianCloud) -> Tensor:
@@ -112,7 +116,7 @@ class Suggestion:
         dx: Grid spacing [m].
         fill_spacing: Spacing of further points on large Gaussians [m], see :func:`suggest_fill`; None if not needed.
         sheet: Whether the object is a thin sheet.
-        azimuth: Azimuth of a camera that sees the broad side [degrees].
+        azimuth: Azimuth of a camera that sees the broad side, or what photos show [degrees].
         flow: Wind across the picture, or along a sheet from where it is held [m/s], z up.
         youngs_modulus: Young's modulus [Pa], a first guess; :mod:`~gaussian_swaying.simulation.calibration` finds a
             better one.
@@ -145,6 +149,7 @@ def suggest(
     region: tuple[Sequence[float], Sequence[float]] | None = None,
     longest_side: float = 1.0,
     speed: float = 6.0,
+    capture: CapturedFrom | None = None,
 ) -> Suggestion:
     """Guess a first configuration.
 
@@ -155,6 +160,7 @@ def suggest(
         region: Corners of the box to simulate [scene units]; guessed if None.
         longest_side: Length of the longest side of the object [m].
         speed: Speed of the wind [m/s].
+        capture: Where the photos of the splat were taken from, which tells up and object.
 
     Returns:
         The suggestion.
@@ -170,14 +176,25 @@ def suggest(
         )
     means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
     normals = smallest_axis_normal(cloud.quats, cloud.scales)
-    upward = guess_up(means, normals, weight) if up is None else given_up(up, means, normals, weight)
-    corner = bounds(means)
+    shown = None if capture is None or region is not None else shown_object(means, opacity, weight, capture)
+    if up is not None:
+        upward = given_up(up, means, normals, weight)
+    elif capture is not None:
+        upward = given_up(capture.up, means, normals, weight)
+        upward = replace(upward, confidence=capture.confidence, reasons=[capture.reason], options=capture.options)
+    else:
+        upward = guess_up(means, normals, weight)
+    if shown is not None:
+        upward = replace(upward, ground=shown.floor(upward.direction))
+    corner = bounds(means if shown is None else means[shown.mask])
     side = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
     if side <= 0:
         raise ValueError("All Gaussians of the splat lie at one point: there is no object to simulate.")
     if region is None:
-        cell = max(side / CELLS, 2 * particle_spacing(means))
-        chosen = suggest_region(means, opacity, weight, upward.ground, cell)
+        cell = max(side / CELLS, 2 * particle_spacing(means if shown is None else means[shown.mask]))
+        if shown is not None:  # what is left of a backdrop must not be taken for a part of the object
+            cell = 0.5 * cell
+        chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown)
     else:
         chosen = given_region(means, opacity, weight, *region)
     points, visible = means[chosen.simulated], weight[chosen.simulated]
@@ -187,11 +204,16 @@ def suggest(
     dx = suggest_spacing(longest_side, spacing)
     if hold is None:
         rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
-        held = guess_hold(points, visible, upward.direction, dx / frame.metres_per_unit, rest)
+        eyes = None if capture is None else capture.eyes
+        wall = None if shown is None else shown.wall(upward.direction)
+        held = guess_hold(points, visible, upward.direction, dx / frame.metres_per_unit, rest, eyes, wall)
     else:
         held = given_hold(hold, upward.direction)
     pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
-    azimuth = broad_side(metres)
+    azimuth, turn = broad_side(metres), 20.0  # the broad side, a little from the side
+    front = None if capture is None else photo_azimuth(capture, points.double().mean(0), frame.rotation)
+    if front is not None:
+        azimuth, turn = front, 0.0
     flow = _across_picture(azimuth, speed)
     flat = sheet_normal(points)
     if held.end == "side" and flat is not None:  # from the pole on, and a little onto the sheet
@@ -212,7 +234,7 @@ def suggest(
         dx=dx,
         fill_spacing=suggest_fill(cloud.select(chosen.simulated), frame.metres_per_unit, dx),
         sheet=flat is not None,
-        azimuth=round(azimuth + 20.0, 1),
+        azimuth=round(azimuth + turn, 1),
         flow=tuple(round(c, 2) + 0.0 for c in flow),
         youngs_modulus=SHELL_E if flat is None else CLOTH_E,
         thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
@@ -277,8 +299,10 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
     return label.unique(return_inverse=True)[1][of_point]
 
 
-def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tensor, cell: float) -> RegionGuess:
-    """The main object without floor and specks.
+def suggest_region(
+    points: Tensor, opacity: Tensor, weight: Tensor, ground: Tensor, cell: float, shown: ShownObject | None = None
+) -> RegionGuess:
+    """The main object without floor, surroundings and specks.
 
     The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks within its box are
     cut out by boxes of their own, the largest first.
@@ -289,6 +313,7 @@ def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tens
         weight: Visible area, shape (N,).
         ground: The floor, shape (N,).
         cell: What is farther apart than two such cells is not connected [scene units].
+        shown: What photos show, to which the object is confined; the part nearest to their common point counts most.
 
     Returns:
         The guess.
@@ -296,8 +321,9 @@ def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tens
     Raises:
         ValueError: If hardly any Gaussian is left.
     """
-    threshold = suggest_threshold(opacity, weight)
-    solid = (opacity >= threshold) & ~ground
+    among = torch.ones_like(opacity, dtype=torch.bool) if shown is None else shown.mask
+    threshold = suggest_threshold(opacity[among], weight[among])
+    solid = (opacity >= threshold) & ~ground & among
     index = solid.nonzero()[:, 0]
     if len(index) < FEWEST:
         raise ValueError(
@@ -305,14 +331,18 @@ def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tens
             "object: give another `--up`."
         )
     part = connected_parts(points[index], cell)
-    area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, weight[index].double())
+    counted = weight[index].double() if shown is None else weight[index].double() * shown.nearness(points[index])
+    area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, counted)
     main = int(area.argmax())
     chosen = torch.zeros_like(solid)
     chosen[index[part == main]] = True
     low, high = _padded(points[chosen], 0.5 * cell)
     if bool(ground.any()):  # the box must not reach into the floor again
         low, high = _without(low, high, points[chosen], points[ground])
-    box = Box(low, high)
+    cuts = () if shown is None else tuple(backdrop.behind for backdrop in shown.backdrops)
+    box: Region = Box(low, high)
+    if cuts:
+        box = Not(Union([Not(box), *cuts]))
     holes: list[tuple[list[float], list[float]]] = []
     stray = box.contains(points[index]) & (part != main)
     numbers, counts = part[stray].unique(return_counts=True)
@@ -322,22 +352,29 @@ def suggest_region(points: Tensor, opacity: Tensor, weight: Tensor, ground: Tens
         caught = Box(*hole).contains(points) & chosen
         if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # worth what it costs the object
             holes.append(hole)
-    guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), 0, "")
+    guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), 0, "", cuts)
     region = guess.region()
     assert region is not None
     simulated = region.contains(points) & (opacity >= threshold)
     loose = int((simulated & ~chosen).sum())
+    if shown is not None and loose:  # the grid is coarser than what tells the object from its surroundings
+        joined = connected_parts(points[simulated], 2 * cell)
+        loose = int((joined != joined.mode().values).sum())
     everything = bool(region.contains(points).all())
     words = [f"{int(chosen.sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
     if bool(ground.any()):
         words.append(f"a floor of {int(ground.sum()):,} lies below it")
+    if shown is not None:
+        words.append("the cameras look at it")
+        if shown.backdrops:
+            words.append("what lies in or behind a wall or floor is left out")
     if guess.specks:
         words.append(f"{guess.specks:,} float apart from it")
     words.append("the region is all of space" if everything else "the region is the box around it")
     if holes:
         words.append(f"without {len(holes)} boxes of specks")
     return RegionGuess(
-        simulated, None if everything else (low, high), holes, threshold, guess.specks, loose, "; ".join(words)
+        simulated, None if everything else (low, high), holes, threshold, guess.specks, loose, "; ".join(words), cuts
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.simulation.calibration import (
@@ -32,6 +33,7 @@ from gaussian_swaying.simulation.cost import Cost, estimate_cost
 from gaussian_swaying.simulation.doubts import doubts
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview_capture import captured_from
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
 from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
 from gaussian_swaying.simulation.starter import draft_yaml, kind, region_dict, starter_yaml
@@ -107,7 +109,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     cloud = read_gaussians(options.scene)
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
-    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind)
+    capture = None if options.capture is None else captured_from(options.capture)
+    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture)
     begin = time.perf_counter()
     draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
     startup = time.perf_counter() - begin
@@ -135,7 +138,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found)]
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
     report += _cost_lines(costs["starter"])
-    output, stem = Path("outputs"), Path(options.scene).stem
+    output, stem = Path("outputs"), splat_name(options.scene)
     report.append("")
     for name, what, where in (
         ("draft", "a first look", output / f"{stem}_draft"),
@@ -201,6 +204,7 @@ def preview_config(options: argparse.Namespace) -> Preview:
 def _pipeline(arguments: list[str], text: str | None = None) -> tuple[SimulationPipeline, Any]:
     """The run of a configuration, given by options or as text, and its settings."""
     parser = build_parser()
+    check_config_files(arguments)
     try:
         with guessing(parser):
             settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
@@ -217,6 +221,19 @@ def _parse_text(parser: Any, arguments: list[str], text: str) -> Any:
         path = Path(folder) / "starter.yaml"
         path.write_text(text, encoding="utf-8")
         return parser.parse_args(["--config", str(path), *arguments])
+
+
+def splat_name(path: str | Path) -> str:
+    """What a splat is called: its file, or the folder of a ``point_cloud.ply``, as trainings write it.
+
+    A folder ``iteration_30000`` and one called ``point_cloud``, as 3DGS makes them, are passed over.
+    """
+    file = Path(path)
+    if file.stem != "point_cloud":
+        return file.stem
+    folders = [part.name for part in file.resolve().parents]
+    passed = ("point_cloud", "iteration_")
+    return next((name for name in folders if name and not name.startswith(passed)), file.stem)
 
 
 def _up(values: Sequence[str]) -> list[float] | str:
@@ -447,11 +464,13 @@ def _preview(options: argparse.Namespace) -> None:
     """Look, report, write."""
     if options.scene is None and options.config is None:
         raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
+    if options.capture is not None and options.config is not None:
+        raise ValueError("`--capture` is for guesses, and a configuration is shown as it is: leave out one of them.")
     if options.frames < 1:
         raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
     if not 64 <= options.height <= 4320:
         raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
-    folder = Path(options.output or Path("outputs/preview") / Path(options.scene or options.config[-1]).stem)
+    folder = Path(options.output or Path("outputs/preview") / splat_name(options.scene or options.config[-1]))
     found = preview_scene(options, folder) if options.config is None else preview_config(options)
     print(found.report)
     for path in write(found, folder):

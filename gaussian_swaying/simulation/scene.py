@@ -418,7 +418,7 @@ class SimulatedScene(nn.Module):
         count = len(self.simulated)
         solid = torch.stack([self.simulated.new_full((), not law.plastic, dtype=torch.bool) for law in laws])
         own = solid[:1].expand(count) if index is None else solid[index[:count]]
-        return torch.cat([own, own[self.anchor]])
+        return torch.cat([own, own[self.anchor[:, 0]]])
 
     def _blend(self, values: Tensor) -> Tensor:
         """Values (C, K, ...) of what each carried Gaussian follows, as one, shape (C, ...)."""
