@@ -47,8 +47,10 @@ def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Pa
     """
     if only is None:
         for page in sorted({slot.page for slot in slots.SLOTS.values() if slot.page}):
-            text = (docs / page).read_text() if (docs / page).exists() else ""
-            slots.check_complete(page, text, records)
+            if (docs / page).exists():
+                slots.check_complete(page, (docs / page).read_text(), records)
+            elif missing := slots.wanted(page, records):
+                raise slots.SlotError(f"There is no {docs / page}, which has to show the slot `{missing[0]}`.")
     paths = sorted(docs.glob("*.md")) if only is None else [docs / only]
     texts = {path: path.read_text() for path in paths}
     return {path: slots.fill(path.name, text, records) for path, text in texts.items() if slots.used(text)}

@@ -265,7 +265,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", type=int, help="only the first frames")
     command.add_argument("--points", type=int, default=10_000, help="on the reference's surface")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
-    command.add_argument("--more", help="further options of tools/sim.py, in quotes")
+    command.add_argument("--more", help='further options of tools/sim.py: --more="--frames=25"')
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:

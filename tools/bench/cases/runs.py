@@ -81,7 +81,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py sim``."""
     command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
     command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")
-    command.add_argument("--more", help="further options of tools/sim.py, in quotes")
+    command.add_argument("--more", help='further options of tools/sim.py: --more="--frames=25"')
 
 
 def sim(options: argparse.Namespace) -> None:
