@@ -230,7 +230,8 @@ def measure_motion(
     points, flows = scene.points, wind.flows
     apply_setting(pipeline, setting, base)
     side = scene.size * scene.frame.metres_per_unit
-    motion = Motion(0.0, 1.0, 1.0)
+    motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
+    torch.set_num_threads(1)  # a few hundred particles: more threads would only wait for each other
     try:
         state = pipeline.start()
         for _ in range(max(1, round(seconds / pipeline.frame_dt))):
@@ -248,6 +249,7 @@ def measure_motion(
     except SimulationDiverged:
         return Motion(max(motion.share, STOP * min(sway, 1.0)), 0.0, 10.0, complete=False)
     finally:
+        torch.set_num_threads(threads)
         scene.points, wind.flows = points, flows
     return motion
 

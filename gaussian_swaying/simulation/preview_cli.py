@@ -7,7 +7,6 @@ import json
 import math
 import os
 import sys
-import time
 import warnings
 from argparse import ArgumentError
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ from gaussian_swaying.simulation.calibration import (
     measure_motion,
 )
 from gaussian_swaying.simulation.config import _one_sentence, build_parser, build_pipeline
-from gaussian_swaying.simulation.cost import Cost, estimate_cost
+from gaussian_swaying.simulation.cost import Cost, Stopwatch, estimate_cost
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
@@ -105,9 +104,9 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
     found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind)
-    begin = time.perf_counter()
+    begin = Stopwatch()
     draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
-    startup = time.perf_counter() - begin
+    startup = begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
     found = _calibrated(found, draft, options.sway)
@@ -287,6 +286,7 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "mass_kg": float(scene.points.mass.sum()),
         "area_m2": float(scene.patch_area.sum()),
         "filled": scene.filled,
+        "points": scene.points.count,
         "further": scene.on_surface - len(scene.simulated),
         "dx_m": pipeline.solver.dx,
         "formulation": pipeline.solver.formulation,
@@ -377,7 +377,7 @@ def _cost_lines(cost: Cost) -> list[str]:
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
         f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {_duration(cost.total_seconds)}",
+        f"  the run         about {_duration(cost.total_seconds)}, if nothing else runs",
     ]
 
 
