@@ -31,7 +31,7 @@ from gaussian_swaying.simulation.cost import Cost, Stopwatch, estimate_cost
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
-from gaussian_swaying.simulation.starter import draft_yaml, kind, region_dict, starter_yaml
+from gaussian_swaying.simulation.starter import draft_yaml, region_dict, starter_yaml
 
 
 @dataclass(frozen=True)
@@ -143,11 +143,10 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
 
 def _calibrated(found: Suggestion, draft: SimulationPipeline, sway: float) -> Suggestion:
     """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
-    how = kind(found)
-    if how is None or not any(found.flow):
+    if found.pin is None or not any(found.flow):
         return found
-    start = Setting(found.youngs_modulus, found.thickness)
-    best = calibrate(lambda tried: measure_motion(draft, tried, start, sway), start, found.longest_side, sway, how)
+    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
+    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
     apply_setting(draft, best.setting, start)
     return replace(
         found,
