@@ -117,13 +117,12 @@ def calibrate(
     while True:
         motion = measure(setting)
         tried.append((setting, motion))
-        hold = 1.05 * motion.strain  # what brings the stretch to its limit
+        hold, good = 1.05 * motion.strain, motion.complete and motion.strain <= 1  # brings the stretch to its limit
         if sway is not None:
-            hold = max(hold, (motion.share / sway) ** (1 / _response(tried)))
-        elif hold < 1.05:
-            break
+            miss = motion.share / sway
+            good = good and miss <= CLOSE and max(miss, hold) >= 1 / CLOSE
+            hold = max(hold, miss ** (1 / _response(tried)))
         following = adjusted(setting, hold, start, side, sway is None)
-        good = motion.complete and motion.strain <= 1 and 1 / CLOSE <= hold <= CLOSE
         if good or following == setting or len(tried) == MOST_RUNS:
             break
         setting = following
