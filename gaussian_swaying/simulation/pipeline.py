@@ -40,6 +40,7 @@ from gaussian_swaying.simulation.diagnostics import (
     measure,
 )
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
+from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.recorder import Recorder, check_camera_name, frame_folder
 from gaussian_swaying.simulation.scene import SimulatedScene
 from gaussian_swaying.simulation.seal import sha256
@@ -533,6 +534,9 @@ class SimulationPipeline(nn.Module):
         finally:
             with suppress(OSError):  # a terminal that has gone
                 bar.close()
+                if progress:
+                    for sentence in self.health(log[:done])[1]:
+                        print(f"warning: {sentence}", file=sys.stderr)
             summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log[:done], frames, walls, peak) | (settings or {})
             if recorder.images and "force" in recorder.renders:
@@ -549,6 +553,19 @@ class SimulationPipeline(nn.Module):
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
+
+    def health(self, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+        """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
+
+        Args:
+            log: Diagnostics of its frames.
+        """
+        scene, points = self.scene, self.scene.points
+        where = scene.frame.point_to_scene(points.position.double().cpu())
+        elastic = self.solver.laws.elastic_particles()
+        size = scene.size * scene.frame.metres_per_unit
+        found = extremes(log, where, size, None if elastic is None else elastic.cpu())
+        return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
 
     def _warm_up(self, recorder: Recorder, state: MPMState, frame: int) -> None:
         """Load and compile the kernels of a frame, of which nothing is kept."""
@@ -608,6 +625,7 @@ class SimulationPipeline(nn.Module):
         self, state: MPMState, log: list[dict[str, float]], frames: int, walls: _Walls, peak: _PeakMemory
     ) -> dict[str, Any]:
         moved = [entry["displacement_mean"] for entry in log]
+        found, sentences = self.health(log)
         energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
         return {
             "device": describe_device(self.device),
@@ -615,7 +633,7 @@ class SimulationPipeline(nn.Module):
             "seed": self.wind.seed,
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
-            "simulated_gaussians": len(self.scene.simulated),
+            "simulated_gaussians": len(self.scene.chosen),
             "surface_particles": self.scene.on_surface,
             "filled_particles": self.scene.filled,
             "mass_kg": float(self.solver.points.mass.sum()),
@@ -647,6 +665,8 @@ class SimulationPipeline(nn.Module):
             "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),
+            "extremes": found,
+            "warnings": sentences,
             "per_frame": log,
         }
 

@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import sys
-import time
 from argparse import ArgumentError
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,14 +28,14 @@ from gaussian_swaying.simulation.calibration import (
     measure_motion,
 )
 from gaussian_swaying.simulation.config import build_parser, build_pipeline
-from gaussian_swaying.simulation.cost import Cost, estimate_cost
+from gaussian_swaying.simulation.cost import Cost, Stopwatch, estimate_cost
 from gaussian_swaying.simulation.doubts import doubts
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_capture import captured_from
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
 from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
-from gaussian_swaying.simulation.starter import draft_yaml, kind, region_dict, starter_yaml
+from gaussian_swaying.simulation.starter import draft_yaml, region_dict, starter_yaml
 
 
 @dataclass(frozen=True)
@@ -111,9 +110,9 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture)
-    begin = time.perf_counter()
+    begin = Stopwatch()
     draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
-    startup = time.perf_counter() - begin
+    startup = begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
     found = _calibrated(found, draft, options.sway)
@@ -152,11 +151,10 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
 
 def _calibrated(found: Suggestion, draft: SimulationPipeline, sway: float) -> Suggestion:
     """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
-    how = kind(found)
-    if how is None or not any(found.flow):
+    if found.pin is None or not any(found.flow):
         return found
-    start = Setting(found.youngs_modulus, found.thickness)
-    best = calibrate(lambda tried: measure_motion(draft, tried, start, sway), start, found.longest_side, sway, how)
+    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
+    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
     apply_setting(draft, best.setting, start)
     return replace(
         found,
@@ -310,6 +308,7 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "mass_kg": float(scene.points.mass.sum()),
         "area_m2": float(scene.patch_area.sum()),
         "filled": scene.filled,
+        "points": scene.points.count,
         "further": scene.on_surface - len(scene.simulated),
         "dx_m": pipeline.solver.dx,
         "formulation": pipeline.solver.formulation,
@@ -393,7 +392,7 @@ def _cost_lines(cost: Cost) -> list[str]:
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
         f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {_duration(cost.total_seconds)}",
+        f"  the run         about {_duration(cost.total_seconds)}, if nothing else runs",
     ]
 
 

@@ -34,7 +34,7 @@ class Parts:
     """Which Gaussians are what, shape (N,) each.
 
     Attributes:
-        simulated: Material points.
+        simulated: Those that the region and the opacity choose.
         carried: Faint ones that follow them.
         pinned: Simulated ones that a condition holds.
         pushed: Simulated ones that an impulse pushes.
@@ -56,17 +56,21 @@ def classify(pipeline: SimulationPipeline) -> Parts:
     """
     scene = pipeline.scene
     simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
-    index = scene.simulated.cpu()
-    simulated[index], carried[scene.carried.cpu()] = True, True
+    index = scene.chosen.cpu()
+    carried[scene.carried.cpu()] = True
+    simulated[index], carried[index] = True, False
+    where = scene.frame.point_to_sim(scene.model.means.detach()[scene.chosen].double()).to(scene.points.position.dtype)
     names = []
     for boundary in conditions(pipeline):
-        mask = boundary.in_frame(scene.frame).particle_mask(scene.points.position)
+        moved = boundary.in_frame(scene.frame)
+        mask = moved.particle_mask(scene.points.position)
         name = type(boundary).__name__
         if mask is None:
             names.append(name)
             continue
-        own = mask.cpu()[: len(index)]
-        (pushed if boundary.held_share is None else pinned)[index[own]] = True
+        own = moved.particle_mask(where)
+        assert own is not None
+        (pushed if boundary.held_share is None else pinned)[index[own.cpu()]] = True
         names.append(f"{name}: {int(mask.sum()):,} particles")
     return Parts(simulated, carried, pinned, pushed, names)
 
