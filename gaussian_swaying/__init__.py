@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.data.generated_capture import GeneratedCapture
     from gaussian_swaying.data.initial_points import initial_points
     from gaussian_swaying.data.point_cloud import PointCloud
+    from gaussian_swaying.gaussians.compact import read_gaussians
     from gaussian_swaying.gaussians.export import export_cloud, write_usd
     from gaussian_swaying.gaussians.filling import InteriorFilling
     from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
@@ -82,6 +83,7 @@ _HOMES = {
     "data.generated_capture": ("GeneratedCapture",),
     "data.initial_points": ("initial_points",),
     "data.point_cloud": ("PointCloud",),
+    "gaussians.compact": ("read_gaussians",),
     "gaussians.export": ("export_cloud", "write_usd"),
     "gaussians.filling": ("InteriorFilling",),
     "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
@@ -216,6 +218,7 @@ __all__ = [
     "initial_points",
     "load_trajectory",
     "read_capture",
+    "read_gaussians",
     "read_ply",
     "write_ply",
     "write_usd",

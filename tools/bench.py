@@ -10,7 +10,8 @@
 ``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json
 ``python tools/bench.py gallery``    the paper's scenes; writes docs/results/gallery_<device>.json and pictures
 ``python tools/bench.py pages``      docs/benchmarks.md, validation.md, training.md, flag_benchmark.md and gallery.md
-``python tools/bench.py pictures``   the README's pictures from a finished run
+``python tools/bench.py pictures``   a strip of frames of a finished run
+``python tools/bench.py film``       the README's moving picture from finished runs
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from typing import Any
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
 
 import accuracy as accuracy_cases
+import films
 import flags as flag_cases
 import gallery as gallery_cases
 import pareto as pareto_cases
@@ -433,8 +435,18 @@ def _goal_row(goal: str, measured: str, reached: bool | None, stretch: str, stre
     return f"| {goal} | {measured} | {verdicts[0]} | {stretch} | {verdicts[1]} |"
 
 
+def film(options: argparse.Namespace) -> None:
+    """An animated WebP of finished runs side by side."""
+    start, stop, step = (int(number) for number in options.frames_shown.split(":"))
+    width, height = (int(number) for number in options.size.split("x"))
+    target = ROOT / "docs" / "pictures" / f"{options.name}.webp"
+    runs = [Path(run) for run in options.runs.split(",")]
+    films.film(runs, target, range(start, stop, step), (width, height), round(40 * step), options.quality)
+    print(f"wrote {target}, {target.stat().st_size:,} bytes")
+
+
 def pictures(options: argparse.Namespace) -> None:
-    """A strip of frames of a finished run, for the README."""
+    """A strip of frames of a finished run."""
     import imageio.v3 as iio
     import numpy as np
 
@@ -451,7 +463,7 @@ def main() -> None:
     """Parse and run one command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for function in (substep, speed, sim, accuracy, pareto, gradients, train, flags, gallery, pages, pictures):
+    for function in (substep, speed, sim, accuracy, pareto, gradients, train, flags, gallery, pages, pictures, film):
         command = commands.add_parser(function.__name__, help=function.__doc__)
         command.set_defaults(run_command=function)
         command.add_argument("--results", default=str(RESULTS), help="folder of the recorded JSON")
@@ -480,6 +492,12 @@ def main() -> None:
             command.add_argument("--name", required=True, help="name of the picture")
             command.add_argument("--frames_shown", default="0,20,40,60", help="frame numbers")
             command.add_argument("--columns", default="0,1", help="part of the width to keep, as shares")
+        if function is film:
+            command.add_argument("--runs", required=True, help="output folders of runs, a list with commas")
+            command.add_argument("--name", default="swaying", help="name of the picture")
+            command.add_argument("--frames_shown", default="0:75:2", help="first frame, the one after the last, step")
+            command.add_argument("--size", default="320x320", help="of each panel [pixels]")
+            command.add_argument("--quality", type=int, default=60, help="0 to 100")
     options = parser.parse_args()
     options.run_command(options)
 

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
 from gaussian_swaying.simulation.files import atomic
@@ -108,13 +109,22 @@ def format_of(path: str | os.PathLike[str]) -> str:
     raise ValueError(f"Cannot tell the format of {path}: let its name end in one of {endings}.")
 
 
-def convert(source: str | os.PathLike[str], target: str | os.PathLike[str], fps: float = 25.0) -> None:
-    """Write a 3DGS .ply, or the sequence of them that a run left in a folder, in the format of the target's name.
+def convert(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    fps: float = 25.0,
+    metres_per_unit: float = 1.0,
+    rotation: Tensor | None = None,
+) -> None:
+    """Write a splat, or the sequence of .ply that a run left in a folder, in the format of the target's name.
 
     Args:
-        source: A 3DGS .ply; for USD also a folder of them, whose frames come in the order of their names.
+        source: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads; for USD also a folder of
+            .ply, whose frames come in the order of their names.
         target: File to write, see :func:`format_of`.
         fps: Frames per second of a folder.
+        metres_per_unit: Length of a scene unit [m], which USD files declare.
+        rotation: Takes scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
 
     Raises:
         FileNotFoundError: If the source or the target's folder does not exist.
@@ -125,15 +135,19 @@ def convert(source: str | os.PathLike[str], target: str | os.PathLike[str], fps:
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{target} cannot be written because {target.parent} is not a folder; create it first.")
     if not source.is_dir():
-        export_cloud(target, read_ply(source), format)
+        cloud = read_gaussians(source)
+        if format == "usd":
+            write_usd(target, [cloud], fps, metres_per_unit=metres_per_unit, rotation=rotation)
+        else:
+            export_cloud(target, cloud, format)
         return
     files = sorted(source.glob("*.ply"))
     if format != "usd" or not files:
         what = "holds no .ply" if not files else f"is a folder of {len(files)} frames, which only USD can hold"
         raise ValueError(f"{source} {what}: give one .ply, or a folder of them and a target that ends in .usdc.")
-    film = UsdFilm(fps)
+    film = UsdFilm(fps, metres_per_unit, rotation)
     for frame, file in enumerate(files):
-        film.add(frame, usd_arrays(read_ply(file)))
+        film.add(frame, usd_arrays(read_gaussians(file)))
     film.save(target)
 
 

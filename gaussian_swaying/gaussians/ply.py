@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying.gaussians.ply_table import PlyHeader, read_element, read_header
 from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
 from gaussian_swaying.simulation.files import atomic
 
@@ -112,10 +113,12 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         UserWarning: Once, naming the properties that were ignored; once, if infinite opacity logits were replaced.
     """
     path = Path(path)
-    data = _read_vertices(path)
+    data = read_element(path, read_binary_header(path), "vertex")
     names = data.dtype.names or ()
     if "packed_position" in names:
-        raise ValueError(f"{path} is a compressed .ply; export it as an uncompressed 3DGS .ply.")
+        raise ValueError(
+            f"{path} is a compressed .ply; read it with `read_gaussians`, or export it as an uncompressed 3DGS .ply."
+        )
     for name in _REQUIRED:
         if name not in names:
             raise ValueError(f"{path} has no property `{name}`, so it is not a 3DGS file; export it from a 3DGS tool.")
@@ -131,8 +134,6 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     def columns(fields: tuple[str, ...]) -> np.ndarray:
         table = np.empty((len(data), len(fields)), dtype=np.float32)
         for index, field in enumerate(fields):
-            if data.dtype[field].hasobject:
-                raise ValueError(f"{path}: property `{field}` is a list; export it as one float per Gaussian.")
             with np.errstate(over="ignore"):
                 table[:, index] = data[field]
         for index, field in enumerate(fields):
@@ -142,17 +143,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
     opacities = _read_opacities(path, data)
     means, quats, scales = columns(_MEANS), columns(_QUATS), columns(_SCALES)
-    with np.errstate(over="ignore", under="ignore"):
-        size = np.exp(scales)
-    _reject(
-        path,
-        ((size == 0) | ~np.isfinite(size)).any(axis=1),
-        "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
-        "remove them or store the logarithm of the size",
-    )
-    with np.errstate(under="ignore"):
-        zero_quats = np.square(quats).sum(axis=1) == 0
-    _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
+    check_sizes_and_rotations(path, scales, quats)
     sh = columns(_DC)[:, None, :]
     if rest:
         sh = np.concatenate([sh, columns(rest).reshape(len(data), 3, -1).transpose(0, 2, 1)], axis=1)
@@ -204,31 +195,27 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
 
 
-def _read_vertices(path: Path) -> np.ndarray:
-    """The vertex table of a binary .ply file as a structured array, or an error that names what is wrong."""
-    from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
+def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:
+    """Raise ValueError if a logarithm of a size (N, 3) gives none, or a quaternion (N, 4) is zero."""
+    with np.errstate(over="ignore", under="ignore"):
+        size = np.exp(scales)
+    _reject(
+        path,
+        ((size == 0) | ~np.isfinite(size)).any(axis=1),
+        "property `scale_0`, `scale_1` or `scale_2` (a logarithm) gives a size of zero or infinity",
+        "remove them or store the logarithm of the size",
+    )
+    with np.errstate(under="ignore"):
+        zero_quats = np.square(quats).sum(axis=1) == 0
+    _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
 
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; check the path of the .ply file.")
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory; give the .ply file inside it, such as point_cloud.ply.")
-    with path.open("rb") as stream:
-        head = stream.read(256)
-    if not re.match(rb"ply\r?\n", head):
-        raise ValueError(f"{path} is not a .ply file (it does not start with `ply`); export the scene as .ply.")
-    if re.search(rb"^format ascii", head, re.MULTILINE):
+
+def read_binary_header(path: Path) -> PlyHeader:
+    """The header of a binary .ply file, as :func:`~gaussian_swaying.gaussians.ply_table.read_header`; no text."""
+    header = read_header(path)
+    if header.order == "":
         raise ValueError(f"{path} is an ASCII .ply (format ascii); export as binary.")
-    try:
-        ply = PlyData.read(str(path))
-    except PlyElementParseError as error:
-        raise ValueError(f"{path} is truncated: {error}; copy or export the file again.") from error
-    except (PlyHeaderParseError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} has a broken .ply header: {error}; export the file again.") from error
-    if "vertex" not in ply:
-        found = ", ".join(element.name for element in ply.elements) or "none"
-        raise ValueError(f"{path} has no element `vertex` (elements: {found}); export it from a 3DGS tool.")
-    data: np.ndarray = ply["vertex"].data
-    return data
+    return header
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,6 +89,23 @@ class SimFrame:
                 )
             scale = float(longest_side) / extent
         return cls((0.5 * (low + high)) @ rotation, rotation, scale)
+
+    @classmethod
+    def from_summary(cls, summary: Mapping[str, Any]) -> SimFrame:
+        """The frame of a run, from its ``summary.json``.
+
+        Raises:
+            ValueError: If the summary does not hold it.
+        """
+        try:
+            found = summary["sim_frame"]
+            origin, rotation = (torch.tensor(found[name], dtype=torch.float64) for name in ("origin", "rotation"))
+            metres = float(found["metres_per_unit"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError("it does not say where the scene lies (`sim_frame`): run the simulation again") from error
+        if origin.shape != (3,) or rotation.shape != (3, 3) or not metres > 0:
+            raise ValueError("its `sim_frame` is damaged: run the simulation again")
+        return cls(origin, rotation, metres)
 
     def point_to_sim(self, points: Tensor) -> Tensor:
         """Scene points (..., 3) to metres, z up. Computed in float64, so far-away scenes keep their detail."""

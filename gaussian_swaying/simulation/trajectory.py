@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._inputs import check_archive
 from gaussian_swaying.simulation.files import atomic, check_regular
 
 _MEMBER = re.compile(r"(position|F)_(\d{5})\.npy")
@@ -105,7 +106,7 @@ def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, T
     Raises:
         ValueError: If the file does not hold the frame.
     """
-    with np.load(path) as arrays:
+    with np.load(check_archive(path, "the run")) as arrays:
         name = f"{frame:05d}"
         if f"position_{name}" not in arrays:
             raise ValueError(f"{path} holds no frame {frame}: it has {len(arrays.files) // 2} frames.")

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shlex
 import sys
-from argparse import ArgumentError
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, TQDMProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -23,9 +21,12 @@ import gaussian_swaying.data.datamodule
 import gaussian_swaying.data.generated_datamodule
 import gaussian_swaying.training.densification
 import gaussian_swaying.training.losses  # noqa: F401
+from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.simulation.continuing import command
 from gaussian_swaying.simulation.files import atomic
-from gaussian_swaying.simulation.signals import exit_code, stop_signals
+from gaussian_swaying.simulation.signals import stop_signals
 from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.csv_log import CsvLog
 from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
@@ -110,7 +111,8 @@ class TrainCLI(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse, and refuse a checkpoint that cannot be read."""
-        super().parse_arguments(parser, args)
+        with guessing(parser):
+            super().parse_arguments(parser, args)
         command = self.config.get("subcommand")
         path = self.config.get(command, {}).get("ckpt_path") if command else None
         if path is not None and (Path(str(path)).suffix or os.path.lexists(path)):  # not best, last ...
@@ -150,6 +152,8 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         ValueError: If a value is out of range or the data are bad.
         TrainingDiverged: If a loss or a Gaussian is not finite any more.
     """
+    limit_yaml()
+    check_config_files(sys.argv[1:] if arguments is None else arguments)
     return TrainCLI(
         SplatTrainer,
         LightningDataModule,
@@ -164,13 +168,16 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
     )
 
 
-def _sentence(error: BaseException) -> str:
-    """The lines of a parser's message that name the value and the reason, or the last of a worker's traceback."""
-    if str(error).startswith("Caught "):
-        return str(error).strip().rpartition("Error: ")[2]
-    noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-    lines = [line.strip() for line in str(error).splitlines()]
-    return " ".join(line.removeprefix("- ") for line in lines if line and not line.startswith(noise))
+def next_step(folder: Path, data: object) -> str:
+    """The command that looks at a trained splat with the cameras of its photos.
+
+    Args:
+        folder: Folder of the training.
+        data: What it was trained on; its ``path`` is the folder of the photos.
+    """
+    words = ["python", "tools/preview.py", str(folder / "point_cloud.ply")]
+    path = getattr(data, "path", None)
+    return shlex.join(words if path is None else [*words, "--capture", str(path)])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -183,44 +190,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input or a training that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM, 129
         by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
-    silence_warnings()
-    silence_advertisements()
     run_folder = RunFolder()
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        with stop_signals():
-            cli = make_cli(arguments, run_folder=run_folder)
-    except (KeyboardInterrupt, SystemExit) as stop:
-        if isinstance(stop, SystemExit) and stop.code != 1:  # Lightning leaves with 1 after Ctrl-C
-            raise
-        with suppress(OSError):  # a terminal that has gone
-            print("Stopped.", file=sys.stderr)
-            _tell_how_to_continue(run_folder, given)
-        return exit_code(stop.__context__ if isinstance(stop, SystemExit) and stop.__context__ else stop)
-    except torch.OutOfMemoryError as error:
-        print(f"error: {error} Remedy: smaller images (`data.init_args.downscale`).", file=sys.stderr)
-        _tell_how_to_continue(run_folder, given)
-        return 2
-    except (ArgumentError, ValueError, TypeError, OSError, TrainingDiverged, MisconfigurationException) as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        print(f"error: {_sentence(error)}", file=sys.stderr)
-        _tell_how_to_continue(run_folder, given)
-        return 2
+        return run_command(
+            lambda: _train(arguments, run_folder),
+            memory="smaller images (`data.init_args.downscale`)",
+            expected=(TrainingDiverged, MisconfigurationException),
+            arguments=arguments,
+            advice=lambda _: _how_to_continue(run_folder, given),
+        )
     finally:
         run_folder.release()
+
+
+def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
+    """Parse and run, and say what was written."""
+    silence_warnings()
+    silence_advertisements()
+    try:
+        with stop_signals():
+            cli = make_cli(arguments, run_folder=run_folder)
+    except SystemExit as stop:
+        if stop.code != 1:
+            raise
+        cause = stop.__context__  # Lightning leaves with 1 after Ctrl-C
+        raise (cause if isinstance(cause, KeyboardInterrupt) else KeyboardInterrupt()) from None
     if cli.subcommand == "fit":
         for name in ("point_cloud.ply", "panels", "checkpoints"):
             path = cli.model.folder / name
             if path.exists():
                 print(f"wrote {path}")
+        if (cli.model.folder / "point_cloud.ply").exists():
+            print(f"next: {next_step(cli.model.folder, cli.datamodule)}")
     return 130 if cli.trainer.interrupted else 0
 
 
-def _tell_how_to_continue(run_folder: RunFolder, arguments: Sequence[str]) -> None:
-    """Name the last checkpoint of a training that ended early, and the command that continues it."""
+def _how_to_continue(run_folder: RunFolder, arguments: Sequence[str]) -> str | None:
+    """The last checkpoint of a training that ended early, and the command that continues it; None without one."""
     path = run_folder.newest_checkpoint()
-    if path is not None:
-        path = os.path.relpath(path) if Path(path).is_relative_to(Path.cwd()) else path
-        again = command(arguments, "--ckpt_path", path, without="--ckpt_path")
-        print(f"{path} is the last checkpoint; to go on:\n  {again}", file=sys.stderr)
+    if path is None:
+        return None
+    path = os.path.relpath(path) if Path(path).is_relative_to(Path.cwd()) else path
+    again = command(arguments, "--ckpt_path", path, without="--ckpt_path")
+    return f"{path} is the last checkpoint; to go on:\n  {again}"

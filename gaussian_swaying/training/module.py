@@ -18,7 +18,8 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
 from gaussian_swaying.rendering.base import SplatOutput, SplatRenderer, make_renderer
 from gaussian_swaying.rendering.camera import Camera
@@ -234,7 +235,7 @@ class SplatTrainer(lightning.LightningModule):
             check_positive("scene_scale", self.scene_scale)
         if self.model is None:
             if self.init_ply is not None:
-                cloud = read_ply(self.init_ply)
+                cloud = read_gaussians(self.init_ply)
                 wanted = (self.sh_degree + 1) ** 2
                 sh = cloud.sh[:, :wanted]
                 missing = sh.new_zeros(len(cloud), wanted - sh.shape[1], 3)

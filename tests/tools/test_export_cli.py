@@ -1,10 +1,13 @@
 """The command line of the converter."""
 
 import importlib.util
+import json
 from pathlib import Path
 
+import pytest
+
 from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.gaussians.ply import read_ply, write_ply
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,3 +30,84 @@ def test_a_file_and_a_sentence(tmp_path, capsys):
     assert error.startswith("error: ")
     assert "none.ply does not exist" in error
     assert error.count("\n") == 1
+
+
+def _run(folder, **changes):
+    """A folder as a run leaves it, whose scene has y down and units of half a metre."""
+    (folder / "ply").mkdir(parents=True)
+    for frame in range(2):
+        write_ply(folder / "ply" / f"{frame:05d}.ply", FlagScene(spacing=0.1).generate())
+    place = {"origin": [0, 0, 0], "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "metres_per_unit": 0.5}
+    (folder / "run.json").write_text("{}")
+    (folder / "summary.json").write_text(json.dumps({"sim_frame": place, "frame_dt_s": 0.1} | changes))
+    return folder
+
+
+def _declared(path):
+    """Frames per second, metres per unit and the direction within the scene that the stage shows as up."""
+    usd, geom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
+    stage = usd.Stage.Open(str(path))
+    assert geom.GetStageUpAxis(stage) == "Z"
+    matrix = geom.Xform(stage.GetPrimAtPath("/World")).GetLocalTransformation()
+    up = matrix.GetInverse().TransformDir((0.0, 0.0, 1.0))
+    return stage.GetFramesPerSecond(), geom.GetStageMetersPerUnit(stage), [round(float(v), 6) + 0.0 for v in up]
+
+
+def test_usd_takes_the_frame_of_the_run(tmp_path, capsys):
+    pytest.importorskip("pxr")
+    run = _run(tmp_path / "run")
+    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc")]) == 0
+    assert _declared(tmp_path / "film.usdc") == (10.0, 0.5, [0.0, -1.0, 0.0])
+    assert "1 scene unit = 0.5 m (from summary.json of the run)" in capsys.readouterr().out
+    assert _main()([str(run / "ply/00001.ply"), str(tmp_path / "one.usdc")]) == 0
+    assert _declared(tmp_path / "one.usdc") == (10.0, 0.5, [0.0, -1.0, 0.0])
+
+
+def test_usd_as_given(tmp_path, capsys):
+    pytest.importorskip("pxr")
+    run = _run(tmp_path / "run")
+    options = ["--up", "0", "2", "0", "--metres-per-unit", "3", "--fps", "5"]
+    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc"), *options]) == 0
+    assert _declared(tmp_path / "film.usdc") == (5.0, 3.0, [0.0, 1.0, 0.0])
+    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc"), "--metres-per-unit", "3"]) == 0
+    assert _declared(tmp_path / "film.usdc") == (10.0, 3.0, [0.0, -1.0, 0.0])
+    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
+    capsys.readouterr()
+    assert _main()([str(tmp_path / "flag.ply"), str(tmp_path / "flag.usdc")]) == 0
+    assert _declared(tmp_path / "flag.usdc") == (25.0, 1.0, [0.0, 0.0, 1.0])
+    assert "(by default)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["film.usdc", "--up", "0", "0", "0"], "zero"),
+        (["film.usdc", "--metres-per-unit", "-1"], "`--metres-per-unit` to be positive"),
+        (["film.usdc", "--fps", "nan"], "--fps"),
+        (["film.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are for USD files"),
+    ],
+)
+def test_bad_options(options, message, tmp_path, capsys):
+    run = _run(tmp_path / "run")
+    target = tmp_path / options[0]
+    assert _main()([str(run / "ply/00000.ply"), str(target), *options[1:]]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("changes", [{"sim_frame": None}, {"sim_frame": {"origin": [0]}}, {"frame_dt_s": 0}])
+def test_damaged_summary(changes, tmp_path, capsys):
+    run = _run(tmp_path / "run", **changes)
+    assert _main()([str(run / "ply"), str(tmp_path / "film.usdc")]) == 2
+    error = capsys.readouterr().err
+    assert "summary.json cannot be used" in error
+    assert "give --up, --metres-per-unit and --fps instead" in error
+
+
+def test_files_of_viewers_are_read_again(tmp_path):
+    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
+    for source, target in (("flag.ply", "a.compressed.ply"), ("a.compressed.ply", "b.splat"), ("b.splat", "c.ply")):
+        assert _main()([str(tmp_path / source), str(tmp_path / target)]) == 0
+    assert len(read_ply(tmp_path / "c.ply")) == 96

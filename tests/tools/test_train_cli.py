@@ -4,6 +4,7 @@ import csv
 import json
 import logging
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -16,13 +17,14 @@ import torch
 import yaml
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 
+from gaussian_swaying.cli.errors import parser_sentence
 from gaussian_swaying.data.generated_capture import GeneratedCapture
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.simulation.config import main as simulate
 from gaussian_swaying.simulation.lock import FolderLock
+from gaussian_swaying.simulation.preview_cli import main as preview
 from gaussian_swaying.simulation.seal import seal
 from gaussian_swaying.simulation.signals import StoppedBySignal
-from gaussian_swaying.training import cli as training_cli
 from gaussian_swaying.training.cli import main, make_cli
 from gaussian_swaying.training.densification import PARAMETERS
 from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
@@ -86,7 +88,16 @@ def test_the_quick_training(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
     start = make_cli(["validate", "--config", str(QUICK), *quiet]).trainer.callback_metrics
     assert main(["fit", "--config", str(QUICK), *quiet]) == 0
-    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in printed
+    command = re.search("^next: python tools/preview.py (.*)$", printed, re.MULTILINE)[1].split()
+    assert command == ["outputs/train/quick_cpu/point_cloud.ply", "--capture", "outputs/captures/flag_64"]
+    assert preview([*command, "--height", "96", "--device", "cpu", "--frames", "2"]) == 0
+    out = capsys.readouterr().out
+    starter = "outputs/preview/quick_cpu/starter.yaml"  # the folder of the training, not its point_cloud.ply
+    assert f"--config {starter} --output outputs/quick_cpu" in out
+    guessed = yaml.safe_load((tmp_path / starter).read_text())
+    assert guessed["scene"]["up"] == [0, 0, 1]  # the photos' cameras stand upright with z up
     folder = tmp_path / "outputs/train/quick_cpu"
     with (folder / "csv/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -97,16 +108,7 @@ def test_the_quick_training(tmp_path, monkeypatch, capsys):
     assert (folder / "panels/val_00_000200.png").stat().st_size > 0
     cloud = read_ply(folder / "point_cloud.ply")
     assert int(float(rows[-1]["val/gaussians"])) == len(cloud)
-    arguments = [
-        "--config",
-        str(ROOT / "configs/sim/hanging_object.yaml"),
-        "--scene.ply",
-        str(folder / "point_cloud.ply"),
-    ]
-    arguments += ["--frames", "2", "--device", "cpu", "--recorder.video", "false", "--scene.up", "[0, 0, 1]"]
-    region = {"class_path": "Box", "init_args": {"min": [None, None, 0.4], "max": [None, None, None]}}
-    pin = [{"class_path": "PinnedRegion", "init_args": {"region": region}}]
-    arguments += ["--solver.boundaries", json.dumps(pin), "--camera.init_args.width", "64", "--solver.dx", "0.1"]
+    arguments = ["--config", starter, "--device", "cpu", "--recorder.video", "false", "--camera.init_args.width", "64"]
     assert simulate([*arguments, "--camera.init_args.height", "36", "--output", str(tmp_path / "sim")]) == 0
     assert json.loads((tmp_path / "sim/summary.json").read_text())["frames"] == 2
 
@@ -323,7 +325,7 @@ def test_lightning_does_not_advertise(caplog):
 
 def test_the_message_of_a_worker_is_one_sentence():
     text = 'Caught ValueError in DataLoader worker process 0.\nOriginal\n  File "x"\nValueError: The image is cut.\n'
-    assert training_cli._sentence(ValueError(text)) == "The image is cut."
+    assert parser_sentence(text) == "The image is cut."
 
 
 OWN = """

@@ -1,0 +1,192 @@
+"""Splats in the small formats of web viewers: PlayCanvas' compressed .ply and antimatter15's .splat."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.gaussians.ply import GaussianCloud, check_sizes_and_rotations, read_binary_header, read_ply
+from gaussian_swaying.gaussians.ply_table import read_element, read_header
+from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+
+CHUNK = 256  # Gaussians that share a range of values in a compressed .ply
+_SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+
+def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
+    """Read a splat in any of the formats that are known: 3DGS .ply, compressed .ply or .splat.
+
+    A name that ends in ``.splat`` is read by :func:`read_splat`, anything else as a .ply, compressed or not by what it
+    holds.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The Gaussians as float32 tensors on the CPU.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file cannot be used; the message names the file, the field and the remedy.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".splat":
+        return read_splat(path)
+    fields = {name for element in read_header(path).elements for name, _ in element.fields}
+    return read_compressed_ply(path) if "packed_position" in fields else read_ply(path)
+
+
+def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
+    """Read a .splat file: 32 bytes a Gaussian, colours of degree 0.
+
+    Colours, opacities and quaternions have 8 bits; an opacity at the end of its range is taken half a step from it.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The Gaussians as float32 tensors on the CPU, without normals.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is empty or cut off, or a Gaussian has no finite centre, no size or no rotation.
+    """
+    path = check_regular(path, "the .splat file")
+    size = path.stat().st_size
+    if size == 0 or size % _SPLAT.itemsize:
+        raise ValueError(
+            f"{path} has {size} bytes, but a .splat file holds 32 for each Gaussian; copy or export it again."
+        )
+    rows = np.fromfile(path, dtype=_SPLAT)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = np.log(rows["sizes"])
+    quats = (rows["quats"].astype(np.float32) - 128) / 128
+    return _cloud(path, rows["means"], scales, quats, rows["rgba"] / np.float32(255))
+
+
+def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
+    """Read a compressed .ply, as SuperSplat and :func:`~gaussian_swaying.gaussians.export.export_cloud` write it.
+
+    Each chunk of 256 Gaussians has ranges for centres, sizes and, in newer files, colours; within them centres and
+    sizes have 11, 10 and 11 bits, colours and opacities 8. Quaternions store their three smaller components with 10
+    bits, harmonics 8 bits from -4 to 4.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The Gaussians as float32 tensors on the CPU, without normals.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is cut off or lacks something.
+    """
+    path = Path(path)
+    header = read_binary_header(path)
+    held = {element.name for element in header.elements}
+    vertices = read_element(path, header, "vertex")
+    count = len(vertices)
+    if count == 0:
+        raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
+    for name in _PACKED:
+        if name not in (vertices.dtype.names or ()):
+            raise ValueError(f"{path} has no property `{name}`, so it is no compressed .ply; export it again.")
+        if vertices.dtype[name].kind not in "iu":
+            raise ValueError(f"{path}: property `{name}` is not a whole number; export the file again.")
+    chunks: Any = read_element(path, header, "chunk") if "chunk" in held else np.empty(0)
+    if len(chunks) < -(-count // CHUNK):
+        raise ValueError(
+            f"{path} has {len(chunks)} chunks, too few for {count} Gaussians in chunks of {CHUNK}; export it again."
+        )
+    chunk_of = np.arange(count) // CHUNK
+
+    def within(share: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+        """Shares (N, 3) of the range of each Gaussian's chunk."""
+        for name in (f"{end}_{axis}" for end in ("min", "max") for axis in names):
+            if name not in chunks.dtype.names or chunks.dtype[name].kind != "f":
+                raise ValueError(f"{path} has no property `{name}` in its chunks; export it again.")
+        low, high = (
+            np.stack([chunks[f"{end}_{axis}"][chunk_of] for axis in names], -1).astype(np.float64)
+            for end in ("min", "max")
+        )
+        with np.errstate(invalid="ignore", over="ignore"):
+            return low + share * (high - low)
+
+    position, rotation, scale, color = (vertices[name].astype(np.int64) & 0xFFFFFFFF for name in _PACKED)
+    means = within(_three(position, (11, 10, 11)), ("x", "y", "z"))
+    scales = within(_three(scale, (11, 10, 11)), ("scale_x", "scale_y", "scale_z"))
+    rgba = np.stack([(color >> shift & 255) / 255 for shift in (24, 16, 8, 0)], -1)
+    if "min_r" in chunks.dtype.names:
+        rgba[:, :3] = within(rgba[:, :3], ("r", "g", "b"))
+    rest = _harmonics(path, read_element(path, header, "sh"), count) if "sh" in held else None
+    return _cloud(path, means, scales, _smallest_three(rotation), rgba, rest)
+
+
+def _three(packed: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:
+    """Three numbers in [0, 1] out of each whole number, the first in its highest bits; shape (N, 3)."""
+    shares, shift = [], sum(bits)
+    for width in bits:
+        shift -= width
+        shares.append((packed >> shift & (1 << width) - 1) / ((1 << width) - 1))
+    return np.stack(shares, -1)
+
+
+def _smallest_three(packed: np.ndarray) -> np.ndarray:
+    """Unit quaternions wxyz from the place of the largest component (2 bits) and the others (10 bits each)."""
+    small = (_three(packed, (10, 10, 10)) - 0.5) * np.sqrt(2)
+    largest = np.sqrt(np.clip(1 - np.square(small).sum(-1), 0, None))
+    place = packed >> 30 & 3
+    at = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])[place]  # 3 stands for the largest
+    quats: np.ndarray = np.take_along_axis(np.concatenate([small, largest[:, None]], -1), at, -1)
+    return quats
+
+
+def _harmonics(path: Path, rows: np.ndarray, count: int) -> np.ndarray:
+    """Harmonics beyond degree 0, shape (N, K - 1, 3), stored channel by channel."""
+    names = [f"f_rest_{index}" for index in range(len(rows.dtype.names or ()))]
+    if len(rows) != count or len(names) not in (9, 24, 45) or set(names) != set(rows.dtype.names or ()):
+        raise ValueError(
+            f"{path}: the element `sh` does not hold 9, 24 or 45 properties `f_rest_*` for each of {count} Gaussians; "
+            "export it again."
+        )
+    table = np.stack([rows[name] for name in names], -1).astype(np.float32)
+    values: np.ndarray = ((table + 0.5) / 256 - 0.5) * 8
+    return values.reshape(count, 3, -1).transpose(0, 2, 1)
+
+
+def _cloud(
+    path: Path,
+    means: np.ndarray,
+    scales: np.ndarray,
+    quats: np.ndarray,
+    rgba: np.ndarray,
+    rest: np.ndarray | None = None,
+) -> GaussianCloud:
+    """A cloud from colours and opacities (N, 4) as they are seen."""
+    half_a_step = 0.5 / 255
+    opacity = np.clip(rgba[:, 3].astype(np.float64), half_a_step, 1 - half_a_step)
+    base = (rgba[:, None, :3] - 0.5) / SH_DC
+    columns: dict[str, Any] = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": np.log(opacity / (1 - opacity)),
+        "sh": base if rest is None else np.concatenate([base, rest], 1),
+    }
+    with np.errstate(over="ignore"):
+        columns = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in columns.items()}
+    for name, value in columns.items():
+        bad = ~np.isfinite(value).reshape(len(value), -1).all(-1)
+        if name != "scales" and bad.any():
+            raise ValueError(
+                f"{path}: {name} of {int(bad.sum())} of {len(bad)} Gaussians are NaN or infinite, first at index "
+                f"{int(bad.argmax())}; remove them or export the scene again."
+            )
+    check_sizes_and_rotations(path, columns["scales"], columns["quats"])
+    return GaussianCloud(**{name: torch.from_numpy(value) for name, value in columns.items()})
