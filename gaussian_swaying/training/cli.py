@@ -195,10 +195,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run_command(
             lambda: _train(arguments, run_folder),
+            stopped="Stopped.",
             memory="smaller images (`data.init_args.downscale`)",
             expected=(TrainingDiverged, MisconfigurationException),
-            arguments=arguments,
-            advice=lambda _: _how_to_continue(run_folder, given),
+            arguments=given,
+            advice=lambda _: how_to_continue(run_folder, given),
         )
     finally:
         run_folder.release()
@@ -212,10 +213,10 @@ def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
         with stop_signals():
             cli = make_cli(arguments, run_folder=run_folder)
     except SystemExit as stop:
-        if stop.code != 1:
+        if stop.code != 1:  # Lightning leaves with 1 after Ctrl-C
             raise
-        cause = stop.__context__  # Lightning leaves with 1 after Ctrl-C
-        raise (cause if isinstance(cause, KeyboardInterrupt) else KeyboardInterrupt()) from None
+        raise (stop.__context__ if isinstance(stop.__context__, KeyboardInterrupt) else KeyboardInterrupt()) from None
+    run_folder.release()
     if cli.subcommand == "fit":
         for name in ("point_cloud.ply", "panels", "checkpoints"):
             path = cli.model.folder / name
@@ -226,8 +227,8 @@ def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
     return 130 if cli.trainer.interrupted else 0
 
 
-def _how_to_continue(run_folder: RunFolder, arguments: Sequence[str]) -> str | None:
-    """The last checkpoint of a training that ended early, and the command that continues it; None without one."""
+def how_to_continue(run_folder: RunFolder, arguments: Sequence[str]) -> str | None:
+    """A sentence that names the last checkpoint of a training that ended early, and the command that continues it."""
     path = run_folder.newest_checkpoint()
     if path is None:
         return None
