@@ -111,7 +111,7 @@ def preview_scene(options: argparse.Namespace, starter_path: Path) -> Preview:
     report += _cost_lines(cost)
     name = splat_name(options.scene)
     report += ["", f"next: python tools/sim.py --config {starter_path} --output {Path('outputs') / name}"]
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), text)
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), text)
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -388,7 +388,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.scene is None and options.config is None:
             raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
         if options.capture is not None and options.config is not None:
-            raise ValueError("`--capture` is for guesses, and a configuration is shown as it is: leave out one of them.")
+            raise ValueError("`--capture` is for guesses, but `--config` is shown as it is: leave out one of them.")
         if options.frames < 1:
             raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
         if not 64 <= options.height <= 4320:

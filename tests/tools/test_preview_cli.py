@@ -141,7 +141,7 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--frames", "0"], "`--frames`"),
         (splat, ["--height", "7"], "`--height`"),
         (splat, ["--config", str(typo)], "dxx"),
-        (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for guesses"),
+        (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for guesses, but"),
         (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
     ):
