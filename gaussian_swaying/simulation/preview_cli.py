@@ -146,7 +146,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         pictures = f"{_seconds_of(texts[name])}, {_duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  python tools/sim.py --config {folder / name}.yaml --output {where}")
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), texts)
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), texts)
 
 
 def _calibrated(found: Suggestion, draft: SimulationPipeline, sway: float) -> Suggestion:
@@ -464,7 +464,7 @@ def _preview(options: argparse.Namespace) -> None:
     if options.scene is None and options.config is None:
         raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
     if options.capture is not None and options.config is not None:
-        raise ValueError("`--capture` is for guesses, and a configuration is shown as it is: leave out one of them.")
+        raise ValueError("`--capture` is for guesses, but `--config` is shown as it is: leave out one of them.")
     if options.frames < 1:
         raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
     if not 64 <= options.height <= 4320:

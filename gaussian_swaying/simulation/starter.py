@@ -170,7 +170,8 @@ camera:
     fov_y: 40.0                 # degrees
     azimuth: {s.azimuth:<19.6g}# degrees about up; onto the broad side
     elevation: 8.0
-    radius: 1.9                 # times the longest side of what moves
+    radius: {s.camera_radius:<20.6g}# times the longest side of what moves; shows all of the object
+    target_offset: {json.dumps(list(s.camera_offset))}  # scene axes, likewise; from the centre of what moves
 
 recorder:
   trajectory: false             # positions of all particles in each frame

@@ -177,9 +177,18 @@ def test_origin_at_the_lower_end_and_longest_side_are_evidence():
     column = torch.rand(2000, 3) * torch.tensor([1.0, 4.0, 1.0]) + torch.tensor([3.0, -4.0, 3.0])  # y from -4 to 0
     found = up_of(splat(column, torch.full((2000, 3), -4.0)))
     assert found.direction == (0, -1, 0)
-    # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next
-    assert found.scores["-y"] == pytest.approx(3.25)
-    assert found.scores["+y"] == pytest.approx(2.0)
+    # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next, 0.5 for a base, which the top is too
+    assert found.scores["-y"] == pytest.approx(3.75)
+    assert found.scores["+y"] == pytest.approx(2.5)
+
+
+def test_a_base_tells_which_end_is_down():
+    """A cone, off the origin: it does not stand on its tip."""
+    height = torch.rand(3000, 1, generator=torch.Generator().manual_seed(0)).sqrt()
+    cone = torch.cat([0.6 * height * (torch.rand(3000, 2) - 0.5), 1 - height], -1) + 5
+    found = up_of(splat(cone, torch.full((3000, 3), -4.0)))
+    assert found.scores["+z"] - found.scores["-z"] == pytest.approx(0.75 + 1 + 0.5)
+    assert any("base" in reason for reason in found.reasons)
 
 
 @pytest.mark.parametrize("change", ["narrow", "table", "rough"])
