@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from argparse import ArgumentError
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from gaussian_swaying.simulation.cost import Cost, estimate_cost
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.starter import region_dict, starter_yaml
 
 
@@ -318,7 +318,7 @@ def _cost_lines(cost: Cost) -> list[str]:
     frame = cost.substeps * cost.substep_seconds
     picture = ""
     if cost.picture_seconds is not None:
-        picture = f" + {_duration(cost.picture_seconds)} for its pictures"
+        picture = f" + {duration(cost.picture_seconds)} for its pictures"
     return [
         "",
         f"cost on this machine ({cost.device})",
@@ -326,8 +326,8 @@ def _cost_lines(cost: Cost) -> list[str]:
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {_duration(cost.total_seconds)}",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
+        f"  the run         about {duration(cost.total_seconds)}",
     ]
 
 
@@ -347,16 +347,6 @@ def _why(confidence: str, reason: str) -> str:
 
 def _short(region: dict[str, Any]) -> str:
     return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)
-
-
-def _duration(seconds: float) -> str:
-    """A duration that people read: 12 ms, 3.4 s, 5 min, 2.1 h."""
-    if not math.isfinite(seconds):
-        return "unknown"
-    for unit, size, limit in (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0)):
-        if seconds < limit:
-            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 3600:.2g} h"
 
 
 # ---- the command
