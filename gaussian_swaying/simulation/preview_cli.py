@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from argparse import ArgumentError
 from collections.abc import Sequence
@@ -34,6 +33,7 @@ from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_capture import captured_from
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
 from gaussian_swaying.simulation.starter import draft_yaml, region_dict, starter_yaml
 
@@ -143,7 +143,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         ("draft", "a first look", output / f"{stem}_draft"),
         ("starter", "the starter", output / stem),
     ):
-        pictures = f"{_seconds_of(texts[name])}, {_duration(costs[name].total_seconds)} here"
+        pictures = f"{_seconds_of(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  python tools/sim.py --config {folder / name}.yaml --output {where}")
     return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), texts)
@@ -383,7 +383,7 @@ def _cost_lines(cost: Cost) -> list[str]:
     frame = cost.substeps * cost.substep_seconds
     picture = ""
     if cost.picture_seconds is not None:
-        picture = f" + {_duration(cost.picture_seconds)} for its pictures"
+        picture = f" + {duration(cost.picture_seconds)} for its pictures"
     return [
         "",
         f"cost on this machine ({cost.device})",
@@ -391,8 +391,8 @@ def _cost_lines(cost: Cost) -> list[str]:
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {_duration(cost.total_seconds)}, if nothing else runs",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
+        f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
 
 
@@ -424,16 +424,6 @@ def _why(confidence: str, reason: str) -> str:
 
 def _short(region: dict[str, Any]) -> str:
     return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)
-
-
-def _duration(seconds: float) -> str:
-    """A duration that people read: 12 ms, 3.4 s, 5 min, 2.1 h."""
-    if not math.isfinite(seconds):
-        return "unknown"
-    for unit, size, limit in (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0)):
-        if seconds < limit:
-            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 3600:.2g} h"
 
 
 # ---- the command

@@ -25,6 +25,7 @@ from gaussian_swaying.gaussians.surface import (
 )
 from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
 
 
@@ -228,6 +229,7 @@ class SimulatedScene(nn.Module):
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
         means = cloud.means[simulated]
+        check_extent(means, self.frame.metres_per_unit, dx, simulated)
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
