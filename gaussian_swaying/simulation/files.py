@@ -43,8 +43,12 @@ def kind_of(path: Path) -> str | None:
     """
     try:
         return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "special file")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return "link to nothing" if os.path.islink(path) else None
+    except OSError:
+        if not os.path.islink(path):
+            raise
+        return "link to itself"
 
 
 def check_regular(path: Path) -> None:

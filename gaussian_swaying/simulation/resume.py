@@ -22,8 +22,6 @@ def check_names(folder: Path, files: Iterable[str], folders: Iterable[str]) -> N
         files: Names of files in it.
         folders: Names of folders in it, whose entries are files.
     """
-    for name in files:
-        check_regular(folder / name)
     for name in folders:
         kind = kind_of(folder / name)
         if kind not in (None, "folder"):
@@ -31,6 +29,8 @@ def check_names(folder: Path, files: Iterable[str], folders: Iterable[str]) -> N
         for path in (folder / name).iterdir() if kind else ():
             if _FRAME.fullmatch(path.name):
                 check_regular(path)
+    for name in files:
+        check_regular(folder / name)
 
 
 def check_pictures(folder: Path, place: str, frames: int, video: str | None = None) -> list[str]:

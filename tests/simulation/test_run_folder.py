@@ -10,7 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from gaussian_swaying.simulation.files import remove_temporaries, temporary_name, write_json
+from gaussian_swaying.simulation.files import kind_of, remove_temporaries, temporary_name, write_json
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.trajectory import load_trajectory
 
@@ -182,6 +182,16 @@ def test_what_is_no_file_keeps_nobody_waiting(kind, run):
     shutil.rmtree(folder / "frames")
     (folder / "frames").write_text("hello")
     assert "frames to be a folder, but it is a file" in _refused(resume, folder)
+
+
+def test_what_a_path_is(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "nowhere").symlink_to(tmp_path / "nothing")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    kinds = {"file": "file", "link": "file", "nowhere": "link to nothing", "loop": "link to itself", "none": None}
+    kinds |= {".": "folder", "file/in": None}
+    assert {name: kind_of(tmp_path / name) for name in kinds} == kinds
 
 
 def test_numbers_that_json_does_not_have(tmp_path):
