@@ -130,7 +130,7 @@ def calibrate(
     return Calibration(best, motion, len(tried), describe(best, motion, sway))
 
 
-def adjusted(setting: Setting, hold: float, start: Setting, side: float, only_E: bool = False) -> Setting:  # noqa: N803
+def adjusted(setting: Setting, hold: float, start: Setting, side: float, only_E: bool = False) -> Setting:
     """A setting that holds ``hold`` times as much against the wind.
 
     Args:

@@ -13,7 +13,6 @@ from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.grouping import blend_weights, group_points
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
