@@ -10,6 +10,8 @@ from torch import Tensor
 
 SOUND = (0.5, 2.0)  # stretch beyond which material is no longer what anyone meant
 
+USUAL = 0.2  # largest displacement as a share of the size that still looks like wind
+
 
 def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elastic: Tensor | None) -> dict[str, Any]:
     """What moved most, and what was compressed and stretched most, over the frames of a run.
@@ -71,7 +73,8 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
     if moved is not None:
         said.append(f"What moved most moved by {_digits(moved['value'])} m, {moved['share']:.0%} of the size, "
                     f"{_place(moved)}.")  # fmt: skip
-    factor = min(max(2 * factor, 3.0), 10.0)
+    share = 0.0 if moved is None else moved["share"]
+    factor = min(max(2 * factor, share / USUAL, 3.0), 10.0)
     stiffer = f"raise `material.E` to about {E * factor:.0e} Pa"
     if thickness_matters:
         stiffer += f" or `material.thickness` to {factor:.0f} times"

@@ -180,8 +180,10 @@ def preview_config(options: argparse.Namespace) -> Preview:
     arguments = [*(item for file in options.config for item in ("--config", file)), "--device", options.device]
     if options.scene is not None:
         arguments += ["--scene.ply", options.scene]
+    begin = Stopwatch()
     pipeline, settings = _pipeline(arguments)
-    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images)
+    startup = begin.quiet
+    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images, startup_seconds=startup)
     cloud = pipeline.scene.model.to_cloud().to("cpu")
     data: dict[str, Any] = {
         "config": options.config,

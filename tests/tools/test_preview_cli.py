@@ -69,11 +69,11 @@ def test_starter_runs_unchanged(splat, tmp_path, capsys):
 
 def test_more_sway_is_softer(tmp_path):
     """A post of a few large patches, held at its foot."""
-    means = torch.rand(900, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.15, 0.1, 1.0])
-    scales = torch.tensor([0.03, 0.03, 0.003]).log().expand(900, 3)
-    quats = torch.randn(900, 4, generator=torch.Generator().manual_seed(1))
+    means = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 0.2, 1.0])
+    scales = torch.tensor([0.05, 0.05, 0.005]).log().expand(200, 3)
+    quats = torch.randn(200, 4, generator=torch.Generator().manual_seed(1))
     path = tmp_path / "post.ply"
-    write_ply(path, GaussianCloud(means, quats, scales, torch.full((900,), 3.0), torch.zeros(900, 1, 3)))
+    write_ply(path, GaussianCloud(means, quats, scales, torch.full((200,), 3.0), torch.zeros(200, 1, 3)))
     hold, motions = [], []
     for sway in ("0.04", "0.16"):
         out = tmp_path / sway
