@@ -187,7 +187,10 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
         return None
     which = ((high - height) / length * slices).long().clamp(max=slices - 1)
     parts = [points[which == k] for k in range(slices)]
-    wide = [width(part, up) if len(part) else 0.0 for part in parts]
+    across = plane_axes(up)  # of a plate one of the two widths is next to nothing
+    wide = [
+        max(quantile(part @ a, 0.97) - quantile(part @ a, 0.03) for a in across) if len(part) else 0.0 for part in parts
+    ]
     limit = min(0.04 * length, 0.25 * max(wide))
     thin = [bool(len(part)) and value < limit for part, value in zip(parts, wide, strict=True)]
     start = next((k for k in range(4) if thin[k]), None)

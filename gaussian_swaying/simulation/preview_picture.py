@@ -318,7 +318,7 @@ def _legend(
     """What the colours mean, below the views."""
     flow = mean_flow(pipeline).tolist()
     entries = [
-        (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians; coordinates in scene units"),
+        (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
         (PINNED, f"held: {int(parts.pinned.sum()):,} Gaussians"),
         (WIND, f"wind {[round(v, 2) for v in flow]} m/s (z up), before gusts"),
         (NORMAL, "normals, turned to the eye"),

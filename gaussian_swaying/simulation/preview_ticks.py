@@ -88,7 +88,7 @@ def draw_ticks(
         if not edges:
             continue
         way = edges[0][0][1] - edges[0][0][0]
-        upright = bool(way[1].abs() > way[0].abs())
+        upright = bool(way[1].abs() > 2 * way[0].abs())
         ends, end, depth_of = max(edges, key=lambda edge: float(edge[0][:, 0 if upright else 1].mean()))
         length = float((ends[1] - ends[0]).norm())
         facing = focal * (high[axis] - low[axis]) / depth_of  # its length, were it across the line of sight
