@@ -20,7 +20,7 @@ from torch import Tensor
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import UniformGust, WindField
-from gaussian_swaying.mpm.materials import Sand
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 from gaussian_swaying.simulation.config import build_parser, build_pipeline

@@ -23,7 +23,8 @@ from gaussian_swaying.gaussians.surface import (
     deform_all,
     limit_stretch,
 )
-from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.frame import SimFrame
 

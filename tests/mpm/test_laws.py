@@ -1,26 +1,26 @@
 """Materials as modules: what they call, return maps on deformation gradients, bounds on the stiffness."""
 
 import math
+from importlib import import_module
+from pkgutil import iter_modules
 
 import pytest
 import torch
 
-from gaussian_swaying.mpm import constitutive, linalg, materials
-from gaussian_swaying.mpm.constitutive import lame_parameters
+from gaussian_swaying.mpm import laws, linalg
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.linalg import spectrum
-from gaussian_swaying.mpm.materials import (
-    ConstitutiveLaw,
-    FixedCorotated,
-    Fluid,
-    Foam,
-    Metal,
-    NeoHookean,
-    Plasticine,
-    Sand,
-    Snow,
-    SpringNetwork,
-    StVKHencky,
-)
 
 LAWS = {
     "fixed corotated": FixedCorotated(),
@@ -79,7 +79,8 @@ def test_elastic_laws_need_no_eigenvectors(monkeypatch):
     def fail(*args, **kwargs):
         raise AssertionError("called")
 
-    for module in (linalg, constitutive, materials):
+    files = [import_module(f"{laws.__name__}.{found.name}") for found in iter_modules(laws.__path__)]
+    for module in (linalg, *files):
         for name in ("spectrum", "symmetric_eigen", "from_principal", "_singular_vectors", "_jacobi"):
             monkeypatch.setattr(module, name, fail, raising=False)
     F = _gradients().requires_grad_()
