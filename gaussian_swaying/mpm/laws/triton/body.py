@@ -142,10 +142,12 @@ def kirchhoff(F, mu, lam, internal, row, dt, LAWS: tl.constexpr, FLOW: tl.conste
     Returns the elastic F and the internal variable after plastic flow (with FLOW; else as given), and the stress.
     """
     n: tl.constexpr = len(LAWS.principals)
+    if LAWS.spectral:
+        u, a, v = svd3(F)
+    # what is read here need not be held in registers during the decomposition
     which = tl.load(row).to(tl.int32)
     p = _coefficients(row)
     if LAWS.spectral:
-        u, a, v = svd3(F)
         if FLOW and len(LAWS.flows) > 0:
             flow = tl.load(row + 1).to(tl.int32)
             a, internal = _flow(a, mu, lam, internal, flow, p, dt, LAWS)
