@@ -29,7 +29,9 @@ class Cost:
         substeps: Substeps in a frame.
         substep_seconds: Time that one of them takes [s].
         simulation_seconds: Time that the frames take without their pictures [s].
-        picture_seconds: Time that the pictures of a frame take, one from each camera [s]; None if there are none.
+        picture_seconds: Time that the pictures of a frame take, one from each camera, with their files and their part
+            of the video [s]; None if there are none.
+        startup_seconds: Time to read the splat and prepare the scene [s]; 0 if it is not known.
     """
 
     device: str
@@ -43,15 +45,18 @@ class Cost:
     substep_seconds: float
     simulation_seconds: float
     picture_seconds: float | None
+    startup_seconds: float = 0.0
 
     @property
     def total_seconds(self) -> float:
         """Time of the whole run [s]."""
-        return self.simulation_seconds + self.frames * (self.picture_seconds or 0.0)
+        return self.startup_seconds + self.simulation_seconds + self.frames * (self.picture_seconds or 0.0)
 
 
 @torch.inference_mode()
-def estimate_cost(pipeline: SimulationPipeline, frames: int, tries: int = 3, picture: bool = True) -> Cost:
+def estimate_cost(
+    pipeline: SimulationPipeline, frames: int, tries: int = 3, picture: bool = True, startup_seconds: float = 0.0
+) -> Cost:
     """Start a run, and measure a few substeps of its first frame and a picture.
 
     Args:
@@ -88,6 +93,7 @@ def estimate_cost(pipeline: SimulationPipeline, frames: int, tries: int = 3, pic
         substep_seconds=seconds,
         simulation_seconds=seconds * steps * max(frames - 1, 0),
         picture_seconds=drawn,
+        startup_seconds=startup_seconds,
     )
 
 

@@ -29,6 +29,8 @@ from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_rendere
 from gaussian_swaying.rendering.camera import Camera
 from gaussian_swaying.rendering.camera_path import CameraPath
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation import signals
+from gaussian_swaying.simulation.checkpoint import check_state, unreadable
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     SimulationDiverged,
@@ -40,6 +42,7 @@ from gaussian_swaying.simulation.diagnostics import (
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.recorder import Recorder, check_camera_name, frame_folder
 from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.seal import sha256
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
@@ -94,6 +97,8 @@ class SimulationPipeline(nn.Module):
         self.editor = SceneEditor(scene, edits)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
         self._most_substeps = sys.maxsize
+        self.files: list[Path] = []  # what the last run wrote
+        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self.idle = self.aero.idle  # asked once, as it makes the host wait
         self._force_end = self.force_scale()  # likewise
         self._tearing: TearingGauge | None = None
@@ -424,22 +429,65 @@ class SimulationPipeline(nn.Module):
         for frame in range(frames):
             self.check_camera(frame)
         state = self.start()  # what is refused is refused before anything is written
-        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt, tuple(self.cameras))
+        splat = self._splat()
+
+        def check(checkpoint: dict[str, Any]) -> None:
+            self._check_checkpoint(checkpoint, state, Path(output), frames, splat)
+
+        self.resumable = None
+        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt, tuple(self.cameras), check)
+        try:
+            return self._run(recorder, frames, config, settings, progress, state, checkpoint, splat)
+        finally:
+            if recorder.checkpoint_frame is not None:
+                self.resumable = (recorder.folder / "checkpoint.pt", recorder.checkpoint_frame)
+            recorder.release()
+
+    def _splat(self) -> str | None:
+        """Checksum of the splat's file, which tells it from another one of the same name."""
+        path = self.scene.source
+        return None if path is None else sha256(Path(path))
+
+    def _check_checkpoint(
+        self, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
+    ) -> None:
+        """Raise ValueError unless the run can go on from a checkpoint as if it had never stopped."""
+        held = checkpoint["state"].get("position")
+        if checkpoint.get("splat") != splat:
+            raise ValueError(
+                f"The splat {self.scene.source} is not the one that the run in {output} began with, its content has "
+                "changed: put that file back, or start again without --resume."
+            )
+        if isinstance(held, Tensor) and held.ndim == 2 and len(held) != self.scene.points.count:
+            raise ValueError(
+                f"The checkpoint in {output} holds {len(held)} particles, but the scene has "
+                f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
+            )
+        try:
+            check_state(checkpoint, start, self.frame_dt, self.solver.max_nodes, bool(self.editor.edits))
+        except (ValueError, TypeError, KeyError, RuntimeError) as error:
+            raise unreadable(output / "checkpoint.pt", error) from error
+        if checkpoint["frame"] >= frames:
+            raise ValueError(
+                f"The run in {output} has {checkpoint['frame'] + 1} frames already, and `frames` asks for {frames}: "
+                "ask for more, or leave out --resume."
+            )
+
+    def _run(
+        self,
+        recorder: Recorder,
+        frames: int,
+        config: str,
+        settings: dict[str, Any] | None,
+        progress: bool,
+        state: MPMState,
+        checkpoint: dict[str, Any] | None,
+        splat: str | None,
+    ) -> dict[str, Any]:
         first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
         if checkpoint is not None:
-            state = MPMState.from_state_dict(checkpoint["state"], self.device)
-            if state.position.shape != self.scene.points.position.shape:
-                raise ValueError(
-                    f"The checkpoint in {output} holds {len(state.position)} particles, but the scene has "
-                    f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
-                )
-            state = self._edit_due(state, resumed=True)
+            state = self._edit_due(MPMState.from_state_dict(checkpoint["state"], self.device), resumed=True)
             first, log = checkpoint["frame"] + 1, checkpoint["log"]
-            if first > frames:
-                raise ValueError(
-                    f"The run in {output} has {first} frames already, and `frames` asks for {frames}: ask for more, or "
-                    "leave out --resume."
-                )
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
         bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
@@ -465,6 +513,7 @@ class SimulationPipeline(nn.Module):
                                 "log": log,
                                 "config": config,
                                 "wall_s": walls.read(),
+                                "splat": splat,
                             }
                         )
                 done = frame + 1
@@ -475,14 +524,15 @@ class SimulationPipeline(nn.Module):
         except SimulationDiverged as error:
             status, reason = "diverged", str(error)
             raise
-        except KeyboardInterrupt:
-            status, reason = "interrupted", "stopped by the user"
+        except KeyboardInterrupt as stop:
+            status, reason = "interrupted", signals.reason(stop)
             raise
         except Exception as error:
             status, reason = "failed", str(error)
             raise
         finally:
-            bar.close()
+            with suppress(OSError):  # a terminal that has gone
+                bar.close()
             summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log[:done], frames, walls, peak) | (settings or {})
             if recorder.images and "force" in recorder.renders:
@@ -491,7 +541,7 @@ class SimulationPipeline(nn.Module):
             self.files = []
             try:
                 with walls("writing"):
-                    self.files = recorder.close(done, summary)
+                    self.files = recorder.close(done, summary, release=False)
             except OSError as error:
                 if status == "complete":
                     raise

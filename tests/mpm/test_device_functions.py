@@ -320,9 +320,9 @@ class OwnLaw(NeoHookean):
     """It may have another stress than the law that it is made from."""
 
 
-def test_every_law_of_the_package_has_a_twin():
-    """A new one must be added to the list of this file, which the tests above go through."""
-    assert {type(law) for law in LAWS} == set(laws.LAWS.values())
+def test_every_twin_of_the_package_is_compared():
+    """Each is in the list of this file, which the tests above go through."""
+    assert {type(law) for law in LAWS} == {law for law in laws.LAWS.values() if law.twin is not None}
     for law in LAWS:
         assert (twin_of(law).flow is not None) == law.plastic
     assert twin_of(OwnLaw()) is None

@@ -1,7 +1,9 @@
 """Materials as modules: what they call, return maps on deformation gradients, bounds on the stiffness."""
 
 import math
+import re
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 
 import pytest
@@ -57,6 +59,24 @@ def test_attributes():
     values = [law.internal for law in LAWS.values()]
     assert values == [None, None, None, None, None, 0.0, 0.0, None, 0.0, 1.0, None]
     assert all(isinstance(law, ConstitutiveLaw) for law in LAWS.values())
+
+
+def test_a_law_is_one_file():
+    """Each file of the folder but those that all share has one law, and no file of device functions is left over."""
+    files = {found.name for found in iter_modules(laws.__path__) if not found.ispkg} - {"law", "shared"}
+    assert {law.__module__.rsplit(".", 1)[1] for law in laws.LAWS.values()} == files
+    assert len(laws.LAWS) == len(files)
+    assert {type(law) for law in LAWS.values()} == set(laws.LAWS.values())  # a new one must be tested here
+    twins = {found.name for found in iter_modules([f"{path}/triton" for path in laws.__path__])}
+    assert {law.twin.rsplit(".", 1)[1] for law in laws.LAWS.values()} == twins - {"body", "shared", "twin"}
+
+
+def test_the_documented_laws_are_those_that_there_are():
+    page = (Path(__file__).parents[2] / "docs" / "configuration.md").read_text()
+    (row,) = (line for line in page.splitlines() if line.startswith("| `material.law`"))
+    elastic, flowing = (set(re.findall("`([A-Z][A-Za-z]+)`", part)) for part in row.split("flowing"))
+    assert elastic == {name for name, law in laws.LAWS.items() if not law.plastic}
+    assert flowing == {name for name, law in laws.LAWS.items() if law.plastic}
 
 
 @pytest.mark.parametrize("name", list(LAWS))

@@ -8,30 +8,22 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from gaussian_swaying.simulation.lean import LEAN, SHELL_E
 
 from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
-from gaussian_swaying.simulation.lean import LEAN, SHELL_E
+from gaussian_swaying.simulation.hold import PIN_DEPTH, end_region
 from gaussian_swaying.simulation.preview import (
     CELLS,
-    CONVENTION,
     KEPT_AREA,
     MAX_BOXES,
-    PIN_DEPTH,
-    SHEET,
-    bounds,
     broad_side,
     connected_parts,
-    end_region,
-    floor_mask,
     gaussian_statistics,
     given_region,
-    guess_hold,
-    guess_up,
     particle_spacing,
-    sheet_normal,
     suggest,
     suggest_fill,
     suggest_region,
@@ -39,7 +31,9 @@ from gaussian_swaying.simulation.preview import (
     suggest_threshold,
     visible_weight,
 )
+from gaussian_swaying.simulation.shape import SHEET, bounds, sheet_normal
 from gaussian_swaying.simulation.starter import starter_yaml
+from gaussian_swaying.simulation.up import CONVENTION, floor_mask, guess_up
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
@@ -272,25 +266,6 @@ def test_a_long_chain_is_one_part():
 
 
 # ---- pins
-
-
-def _cone(upside_down):
-    height = torch.rand(3000, 1) ** 0.5
-    radius = torch.cat([0.3 * height * (torch.rand(3000, 2) - 0.5), height], -1)
-    return radius if not upside_down else radius * torch.tensor([1, 1, -1.0])
-
-
-def test_thin_end_is_held():
-    weight = torch.ones(3000)
-    stalk = guess_hold(_cone(False), weight, (0, 0, 1), ground=False)
-    assert (stalk.end, stalk.direction, stalk.confidence) == ("bottom", (0, 0, -1), "medium")
-    lamp = guess_hold(_cone(True), weight, (0, 0, 1), ground=False)
-    assert (lamp.end, lamp.direction, lamp.confidence) == ("top", (0, 0, 1), "low")
-    assert guess_hold(_cone(True), weight, (0, 0, 1), ground=True).end == "bottom"  # a cone on a floor
-    column = torch.rand(3000, 3)
-    assert guess_hold(column, weight, (0, 0, 1), ground=False).confidence == "low"
-    curtain = torch.rand(3000, 3) * torch.tensor([1, 0.01, 1]) + 5
-    assert guess_hold(curtain, weight, (0, 0, 1), ground=False).end == "top"
 
 
 def test_end_region_of_a_tilted_axis_holds_that_end():

@@ -141,6 +141,8 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--frames", "0"], "`--frames`"),
         (splat, ["--height", "7"], "`--height`"),
         (splat, ["--config", str(typo)], "dxx"),
+        (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for guesses"),
+        (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
     ):
         check_refused(scene, tmp_path, capsys, *options, words=words)

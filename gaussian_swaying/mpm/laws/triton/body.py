@@ -147,14 +147,13 @@ def kirchhoff(F, mu, lam, internal, row, dt, LAWS: tl.constexpr, FLOW: tl.conste
     # what is read here need not be held in registers during the decomposition
     which = tl.load(row).to(tl.int32)
     p = _coefficients(row)
-    if LAWS.spectral:
-        if FLOW and len(LAWS.flows) > 0:
-            flow = tl.load(row + 1).to(tl.int32)
-            a, internal = _flow(a, mu, lam, internal, flow, p, dt, LAWS)
-            if LAWS.all_flow:
-                F = scaled_product(u, a, v)
-            else:
-                F = where9(flow >= 0, scaled_product(u, a, v), F)
+    if FLOW and len(LAWS.flows) > 0:
+        flow = tl.load(row + 1).to(tl.int32)
+        a, internal = _flow(a, mu, lam, internal, flow, p, dt, LAWS)
+        if LAWS.all_flow:
+            F = scaled_product(u, a, v)
+        else:
+            F = where9(flow >= 0, scaled_product(u, a, v), F)
     if n > 0:
         y = _principal(a, mu, lam, internal, which, p, LAWS)
         stress = scaled_product(u, (y[0] * a[0], y[1] * a[1], y[2] * a[2]), u)
