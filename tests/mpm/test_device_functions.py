@@ -354,6 +354,15 @@ def test_a_twin_needs_a_stress():
     Twin(kirchhoff=function, flow=function)
 
 
+@pytest.mark.parametrize("name", ["no_such_module", "gaussian_swaying.mpm.laws.shared"])
+def test_a_twin_that_is_not_there(name):
+    class Lost(Sand):
+        twin = name
+
+    with pytest.raises(ValueError, match=f"`twin` of Lost to be a module that holds a `TWIN`.*'{name}' is not"):
+        twin_of(Lost())
+
+
 def test_a_table_row_has_room_for_four_numbers():
     class Many(Sand):
         twin = Sand.twin

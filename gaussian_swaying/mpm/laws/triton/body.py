@@ -87,15 +87,6 @@ def _coefficients(row):
 
 
 @triton.jit
-def _which(row, column, COUNT: tl.constexpr):
-    """Which of COUNT functions holds for a particle; what is read is not needed where there is but one."""
-    if COUNT > 1:
-        return tl.load(row + column).to(tl.int32)
-    else:
-        return 0
-
-
-@triton.jit
 def _principal(a, mu, lam, internal, which, p, LAWS: tl.constexpr):
     """Principal first Piola-Kirchhoff stresses; any value for a law that has another stress."""
     y = LAWS.principals[0](a, mu, lam, internal, p)

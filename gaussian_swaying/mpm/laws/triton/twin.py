@@ -48,8 +48,20 @@ class Twin:
 
 
 def twin_of(law: ConstitutiveLaw) -> Twin | None:
-    """The twin of a law, or None for one that runs in torch only."""
-    return None if law.twin is None else import_module(law.twin).TWIN
+    """The twin of a law, or None for one that runs in torch only.
+
+    Raises:
+        ValueError: If the module that the law names cannot be imported or has no ``TWIN``.
+    """
+    if law.twin is None:
+        return None
+    try:
+        return import_module(law.twin).TWIN
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"Expected `twin` of {type(law).__name__} to be a module that holds a `TWIN`, or None for a law that runs "
+            f"in torch only, but {law.twin!r} is not: {error}."
+        ) from error
 
 
 def shared(laws: Iterable[ConstitutiveLaw], name: str) -> Any:
