@@ -107,6 +107,7 @@ class FusedSolver(ABC):
         force: Tensor | None = None,
         drag: Tensor | None = None,
         looks: Sequence[int] = (),
+        watch: Callable[[int], None] | None = None,
     ) -> tuple[MPMState, Tensor]:
         """Advance by ``steps`` substeps of ``dt`` [s], in wind or with a force that stays (see ``MPMSolver.step``).
 
@@ -118,6 +119,7 @@ class FusedSolver(ABC):
             force: Force [N], shape (..., P, 3), or None.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: After which substeps to look at the speed of waves, if ``watches``.
+            watch: Told how many substeps have been handed to the GPU, each time the buffers are full.
 
         Returns:
             The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
@@ -128,6 +130,8 @@ class FusedSolver(ABC):
                 part = min(steps - first, MAX_STEPS)
                 marks = [look - first for look in looks if first < look <= first + part]
                 state = self._advance(state, dt, part, load, force, drag, marks)
+                if watch is not None:
+                    watch(first + part)
             return state, self.speed[0] / self.solver.dx
 
     def _advance(

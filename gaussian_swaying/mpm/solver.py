@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.fused import FusedSolver
 
 ForceFunction = Callable[[MPMState], Tensor | tuple[Tensor, Tensor | None]]
+WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
 
 
@@ -497,6 +498,7 @@ class MPMSolver(nn.Module):
         steps: int,
         force_fn: ForceFunction | WindLoad | None = None,
         checkpoint: int = 0,
+        watch: WatchFunction | None = None,
     ) -> MPMState:
         """Advance by several substeps.
 
@@ -512,6 +514,7 @@ class MPMSolver(nn.Module):
             checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
                 in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
                 ``force_fn`` must then give the same force each time it sees the same state.
+            watch: Told now and then how many substeps are done, or under way on a GPU; not with ``checkpoint``.
 
         Returns:
             The state ``steps * dt`` later.
@@ -520,7 +523,7 @@ class MPMSolver(nn.Module):
         if force_fn is None or load is not None:
             fused = self.fused(*_tensors(state), *([] if load is None else load.tensors()))
             if fused is not None:
-                return fused.rollout(state, dt, steps, load)[0]
+                return fused.rollout(state, dt, steps, load, watch=watch)[0]
         winds = None if load is None else load.winds(state.time, dt, steps)
 
         def force_at(state: MPMState, k: int) -> tuple[Tensor | None, Tensor | None]:
@@ -533,6 +536,8 @@ class MPMSolver(nn.Module):
         def advance(state: MPMState, first: int, count: int) -> MPMState:
             for k in range(first, first + count):
                 state = self.step(state, dt, *force_at(state, k))
+                if watch is not None and checkpoint <= 0:
+                    watch(k + 1)
             return state
 
         if checkpoint <= 0 or not torch.is_grad_enabled():
@@ -553,6 +558,7 @@ class MPMSolver(nn.Module):
         steps: int,
         force_fn: ForceFunction | WindLoad | None = None,
         looks: int = 8,
+        watch: WatchFunction | None = None,
     ) -> tuple[MPMState, Tensor]:
         """Advance by several substeps and look at the Courant number on the way, as material may stiffen and slacken.
 
@@ -562,6 +568,7 @@ class MPMSolver(nn.Module):
             steps: Number of substeps.
             force_fn: As in :meth:`rollout`.
             looks: How often to look, evenly, the last time at the end.
+            watch: As in :meth:`rollout`.
 
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
@@ -571,11 +578,12 @@ class MPMSolver(nn.Module):
         if (force_fn is None or load is not None) and self.stiffness_damping == 0:
             fused = self.fused(*_tensors(state), *([] if load is None else load.tensors()))
             if fused is not None and fused.watches:
-                state, cells = fused.rollout(state, dt, steps, load, looks=marks)
+                state, cells = fused.rollout(state, dt, steps, load, looks=marks, watch=watch)
                 return state, dt * cells
         seen = []
         for first, last in pairwise([0, *marks]):
-            state = self.rollout(state, dt, last - first, force_fn)
+            part = None if watch is None else partial(_told, watch, first)
+            state = self.rollout(state, dt, last - first, force_fn, watch=part)
             seen.append(self.cfl_number(state, dt))
         return state, torch.stack(seen).amax()
 
@@ -766,6 +774,10 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
+
+
+def _told(watch: WatchFunction, before: int, done: int) -> None:
+    watch(before + done)
 
 
 def _conditions(modules: nn.ModuleList) -> list[Boundary]:

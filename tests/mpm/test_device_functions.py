@@ -26,7 +26,7 @@ from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
-from gaussian_swaying.mpm.laws.triton.twin import Twin, shared, twin_of
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin, shared, twin_of
 from gaussian_swaying.mpm.linalg_triton import polar_rotation, svd3
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
@@ -350,8 +350,8 @@ def test_a_twin_needs_a_stress():
     function = object()
     for given in ({}, {"flow": function}, {"kirchhoff": function}, {"pk1": function}):
         with pytest.raises(ValueError, match="give `principal`, or `kirchhoff` and"):
-            Twin(**given)
-    Twin(kirchhoff=function, flow=function)
+            LawTwin(**given)
+    LawTwin(kirchhoff=function, flow=function)
 
 
 @pytest.mark.parametrize("name", ["no_such_module", "gaussian_swaying.mpm.laws.shared"])

@@ -66,7 +66,7 @@ TWIN = """
 import triton
 import triton.language as tl
 
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import matmul, transpose
 
 
@@ -88,7 +88,7 @@ def kirchhoff(F, mu, lam, internal, p):
     return matmul(pk1(F, mu, lam, internal, p), transpose(F))
 
 
-TWIN = Twin(pk1=pk1, kirchhoff=kirchhoff)
+TWIN = LawTwin(pk1=pk1, kirchhoff=kirchhoff)
 """
 
 

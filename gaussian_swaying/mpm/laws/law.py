@@ -23,7 +23,7 @@ class ConstitutiveLaw(nn.Module, ABC):
         plastic: Whether there is a return map. The deformation gradient is then only the elastic part of the
             deformation since rest, which needs the ``updated`` formulation.
         internal: Initial value of the one internal variable of each particle, or None if there is none.
-        twin: Module with the law's device functions, a :class:`~gaussian_swaying.mpm.laws.twin.Twin` named ``TWIN``,
+        twin: Module with the law's device functions, a :class:`~gaussian_swaying.mpm.laws.twin.LawTwin` named ``TWIN``,
             which is imported where kernels run; None for a law that runs in torch only. A subclass does not inherit it,
             as it may change the law.
     """

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
 
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import (
     axpy9,
     cofactor,
@@ -63,4 +63,4 @@ def wave(F, mu, lam):
     return 2 * mu + lam * largest(area, 1.0)
 
 
-TWIN = Twin(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave)
+TWIN = LawTwin(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave)

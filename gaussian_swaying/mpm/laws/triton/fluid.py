@@ -5,7 +5,7 @@ import triton.language as tl
 
 from gaussian_swaying.mpm.laws.fluid import FLUID_LIMIT
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import cofactor
 
 FLUID_FLOOR = tl.constexpr(FLUID_LIMIT)
@@ -33,4 +33,4 @@ def flow(a, mu, lam, internal, p, dt):
     return (root, root, root), internal
 
 
-TWIN = Twin(kirchhoff=kirchhoff, flow=flow)
+TWIN = LawTwin(kirchhoff=kirchhoff, flow=flow)

@@ -11,7 +11,7 @@ from gaussian_swaying.mpm.laws.triton.shared import (
     share_above,
     spectral_modulus,
 )
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import dot3, svd3
 
 
@@ -80,4 +80,4 @@ def wave(F, mu, lam):
     return hencky_wave_modulus(a, mu, lam)
 
 
-TWIN = Twin(principal=principal, energy=energy, wave=wave)
+TWIN = LawTwin(principal=principal, energy=energy, wave=wave)

@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import axpy9, cofactor, matmul, transpose
 
 
@@ -22,4 +22,4 @@ def kirchhoff(F, mu, lam, internal, p):
     return matmul(pk1(F, mu, lam, internal, p), transpose(F))
 
 
-TWIN = Twin(pk1=pk1, kirchhoff=kirchhoff)
+TWIN = LawTwin(pk1=pk1, kirchhoff=kirchhoff)

@@ -5,7 +5,7 @@ import triton.language as tl
 
 from gaussian_swaying.mpm.laws.triton.hencky import energy, principal, wave
 from gaussian_swaying.mpm.laws.triton.shared import drawn_back, log, split_strain
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import where3
 
 
@@ -30,4 +30,4 @@ def flow(a, mu, lam, internal, p, dt):
     return new, internal + corrected * change
 
 
-TWIN = Twin(principal=principal, flow=flow, energy=energy, wave=wave)
+TWIN = LawTwin(principal=principal, flow=flow, energy=energy, wave=wave)

@@ -5,7 +5,7 @@ import triton.language as tl
 
 from gaussian_swaying.mpm.laws.snow import SNOW_RANGE
 from gaussian_swaying.mpm.laws.triton.fixed_corotated import corotated_stress
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import clamp
 
 SNOW_LOW = tl.constexpr(SNOW_RANGE[0])
@@ -29,4 +29,4 @@ def flow(a, mu, lam, internal, p, dt):
     return kept, clamp(internal * lost, SNOW_LOW, SNOW_HIGH)
 
 
-TWIN = Twin(principal=principal, flow=flow)
+TWIN = LawTwin(principal=principal, flow=flow)

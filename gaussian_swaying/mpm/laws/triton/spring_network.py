@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.mpm.laws.triton.shared import EPSILON, LOG_FLOOR, share_above, spectral_modulus
-from gaussian_swaying.mpm.laws.triton.twin import Twin
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 from gaussian_swaying.mpm.linalg_triton import dot3, svd3
 
 
@@ -140,4 +140,4 @@ def wave(F, mu, lam):
     return network_wave_modulus(a, mu, lam)
 
 
-TWIN = Twin(principal=principal, energy=energy, wave=wave)
+TWIN = LawTwin(principal=principal, energy=energy, wave=wave)

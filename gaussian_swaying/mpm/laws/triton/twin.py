@@ -11,7 +11,7 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
 
 @dataclass(frozen=True)
-class Twin:
+class LawTwin:
     """Device functions of a law: Triton functions of one particle per lane, or None where it has none.
 
     A matrix is a tuple of nine values, row by row; stretches and principal stresses are tuples of three; ``p`` are the
@@ -47,7 +47,7 @@ class Twin:
             )
 
 
-def twin_of(law: ConstitutiveLaw) -> Twin | None:
+def twin_of(law: ConstitutiveLaw) -> LawTwin | None:
     """The twin of a law, or None for one that runs in torch only.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The flag benchmark of ``bench.py flags``: train, simulate, compare with Blender's cloth, and make the page."""
+"""The flag benchmark of ``bench.py flags``: train, simulate, and compare with Blender's cloth."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from flag_reference import PATTERNS as REFERENCES
 
+from bench.record import ROOT
 from gaussian_swaying.metrics.compare import compare_run
 
-ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts, which find each other in their own folder
+
+from flag_reference import PATTERNS as REFERENCES
+
 BENCH = ROOT / "configs" / "bench"
 Row = dict[str, Any]
 
@@ -89,19 +92,6 @@ VARIANTS: dict[str, Variant] = {
 """All rows, by name."""
 
 _TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
-
-PAPER = {
-    "PhysGaussian": {1: (19.75, 0.0215), 2: (21.96, 0.0054), 3: (14.44, 0.0263)},
-    "Gaussian Swaying": {1: (21.44, 0.0178), 2: (22.26, 0.0052), 3: (18.60, 0.0066)},
-}
-"""PSNR [dB] and Chamfer distance of the paper's first table: of other data, so of another scale."""
-
-PAPER_ABLATION = {
-    "no flow randomisation": (17.93, 0.0070),
-    "no shading": (18.38, 0.0069),
-    "no surface modelling": (14.80, 0.0277),
-}
-"""The same of its third table, for pattern 3."""
 
 
 def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None) -> list[str]:
@@ -266,7 +256,7 @@ def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py flags``."""
-    command.add_argument("--dataset", required=True, help="folder that tools/make_flag_dataset.py wrote")
+    command.add_argument("--dataset", required=True, help="folder that tools/datasets/make_flag_dataset.py wrote")
     command.add_argument("--rows", default=",".join(VARIANTS), help="a list with commas")
     command.add_argument("--patterns", default="1,2,3", help="a list with commas")
     command.add_argument("--splats", default="outputs/flags", help="folder of the trained splats; `made` for splats "
@@ -287,7 +277,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     for pattern in patterns:
         if not (Path(options.dataset) / f"pattern{pattern}" / "cloth.npz").exists():
             raise SystemExit(
-                f"{options.dataset} has no pattern{pattern}/cloth.npz: make it with tools/make_flag_dataset.py"
+                f"{options.dataset} has no pattern{pattern}/cloth.npz: make it with tools/datasets/make_flag_dataset.py"
             )
     result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
     result["more"] = options.more or ""
@@ -326,216 +316,3 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
             if figure(pattern, Path(options.dataset) / f"pattern{pattern}", runs, target):
                 result.setdefault("figures", {})[str(pattern)] = target.name
                 save(result)
-
-
-# ---- the page
-
-
-def _chamfer(row: Row | None) -> str:
-    if row is None:
-        return "-"
-    if row.get("failed"):
-        return "failed"
-    if row["status"] != "complete":
-        return f"stopped at frame {row['frames']}"
-    value = row.get("chamfer_share")
-    torn = f" ({row['torn_particles']} torn)" if row["torn_particles"] else ""
-    return "-" if value is None else f"{100 * value:.2f} %{torn}"
-
-
-def _psnr(row: Row | None) -> str:
-    value = None if row is None else row.get("mean", {}).get("psnr_db")
-    return "-" if value is None else f"{value:.2f}"
-
-
-_GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB and share of the distance, against PhysGaussian's way
-_OTHER = {  # variants of the reference that are other flags, or on a mesh too coarse to count
-    "half the cells": "on half as many cells along a side",
-    "hardly bending": "on that mesh, with a fiftieth of its bending stiffness",
-    "self-contact": "on that mesh, keeping away from itself",
-}
-_SHARE = 0.03  # of the longer side, that Chamfer distances are to stay within
-
-
-def _complete(rows: Row, name: str, pattern: int) -> Row | None:
-    row = rows.get(name, {}).get(str(pattern))
-    return row if row and row.get("status") == "complete" and "chamfer_share" in row else None
-
-
-def goals(result: Row) -> list[tuple[str, str, bool]]:
-    """What was to be reached, what was measured, and whether it is."""
-    rows, found = result["rows"], []
-    for pattern in PATTERNS:
-        ours = _complete(rows, "ours", pattern)
-        if ours is None:
-            continue
-        share = ours["chamfer_share"]
-        doubt = {n: v for n, v in result.get("uncertainty", {}).get(str(pattern), {}).items() if n not in _OTHER}
-        known = f" (reference itself: {100 * max(v['chamfer'] for v in doubt.values()):.2f} %)" if doubt else ""
-        found.append(
-            (
-                f"pattern {pattern}: Chamfer distance within {100 * _SHARE:g} % of the longer side",
-                f"{100 * share:.2f} %{known}",
-                share <= _SHARE,
-            )
-        )
-        decibels, factor = _GAIN[pattern]
-        other = _complete(rows, "particle", pattern)
-        if other is not None:
-            ratio = share / other["chamfer_share"]
-            goal = f"pattern {pattern}: Chamfer distance {factor:g} times that of PhysGaussian's way"
-            found.append((goal, f"{ratio:.2f} times", ratio <= factor))
-            if "psnr_db" in ours["mean"] and "psnr_db" in other["mean"]:
-                gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
-                goal = f"pattern {pattern}: PSNR {decibels:+g} dB against PhysGaussian's way"
-                found.append((goal, f"{gain:+.2f} dB", gain >= decibels))
-        other = _complete(rows, "no_surface", pattern)
-        if other is not None:
-            ratio = other["chamfer_share"] / share
-            goal = f"pattern {pattern}: without surface modelling at least twice the Chamfer distance"
-            found.append((goal, f"{ratio:.2f} times", ratio >= 2))
-        other = _complete(rows, "no_shading", pattern)
-        if other is not None and "psnr_db" in ours["mean"]:
-            gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
-            found.append((f"pattern {pattern}: without shading a lower PSNR", f"{-gain:+.2f} dB", gain > 0))
-    return found
-
-
-def pattern_lines(rows: Row, pattern: int) -> list[str]:
-    """When a flag leaves its reference, and what moves it nearer or farther."""
-    ours = _complete(rows, "ours", pattern)
-    if ours is None:
-        return []
-    distances = [value for value in ours.get("chamfer_per_frame_m", []) if value is not None]
-    longer = ours["mean"]["chamfer_m"] / ours["chamfer_share"]
-    third = len(distances) // 3
-    lines = []
-    if third:
-        parts = [distances[:third], distances[third : 2 * third], distances[2 * third :]]
-        told = ", ".join(f"{100 * sum(part) / len(part) / longer:.2f} %" for part in parts)
-        lines.append(f"- pattern {pattern}, distance in the three thirds of the run: {told}")
-    changes = {
-        VARIANTS[name].title: row["chamfer_share"] - ours["chamfer_share"]
-        for name in rows
-        if name not in ("ours", "particle", "no_surface") and (row := _complete(rows, name, pattern))
-    }
-    if changes:
-        order = sorted(changes, key=lambda name: changes[name])
-        told = "; ".join(f"{name} {100 * changes[name]:+.2f}" for name in order)
-        lines.append(f"- pattern {pattern}, change of the distance [% of the longer side] by one thing: {told}")
-    return lines
-
-
-_ABOUT = """\
-## What differs from the reference, and why
-
-**Both sides at rest.** Two things were found by setting the first ten frames of both sides beside each other, and
-mended: Blender's diagonals do not push (see [flag_dataset.md](flag_dataset.md)), and splats made in code had a ripple
-where the reference has none. Neither shows in a hanging panel or in a picture at rest. Before, whatever one changed
-in pattern 2, damping, bending or the grid, moved it by percents in either direction.
-
-**Pattern 1** falls past its pole and crumples against it. In which folds it then hangs is settled by small things at
-rest: in the reference by a ripple of 3 mm; a trained splat is uneven by a millimetre or two itself, and a coarse grid
-has no room for folds. PhysGaussian's way, which hangs as a narrow strip at the same place, is hardly farther away: a
-distance between surfaces sees little of folds, a picture does. Neither side keeps the cloth away from itself; a
-reference that does so hangs in other folds. A flag of one colour is trained as few large Gaussians, which blur folds:
-`densification.split_at` makes them small late in the training. The few dark dots are Gaussians whose normals training
-left wrong.
-
-**Pattern 2** has its free corner at the upwind end, where wind and weight are nearly in balance, and the wind comes
-at 11 degrees from its plane: a degree is 9 % of the pressure. With splats made in code ours stays near the reference.
-Training leaves normals that are wrong by less than a degree over larger parts of the flag, which lets the corner
-swing out: turning the same Gaussians to the reference's normals at rest, and nothing else, takes away more than half
-of the distance (its row above). Normals of planes through neighbouring centres were tried and are not good enough
-either: the trained surface itself is uneven by that much. With it falls what is measured against it, the distance
-without surface modelling among others.
-
-**Pattern 3** is ruled by bending: the reference with a fiftieth of its bending stiffness (below) and ours with a
-single layer of points are about as far from it as each other. With three layers ours follows the reference closely. A
-trained splat ends a little short of the edge that is held, so the grid is held over one row of nodes more. The b of
-the size loss matters little, since the loss is a mean and most Gaussians are small; making the large ones small late
-in the training matters more. Gusts that the reference does not have cost what one would expect.
-
-The law of the stretching (`SpringNetwork`, which the reference's lattice is, against fixed corotated) matters as soon
-as cloth stretches by tens of per cent, which it does beside its pins. The formulation `updated` keeps parts of a
-sheet that meet a cell apart: where none meet it is as near as `total`, and pattern 1, which folds up, ends elsewhere.
-It tore in none of these runs.
-""".splitlines()
-
-
-def _uncertainty_lines(recorded: list[Row]) -> list[str]:
-    """How far the reference is from itself, from the first record that says so."""
-    result = next((r for r in recorded if r.get("uncertainty")), None)
-    if result is None:
-        return []
-    lines = ["", "## How far the reference is from itself", "", "Solved otherwise; the same measure.", ""]
-    for pattern, found in sorted(result.get("uncertainty", {}).items()):
-        shown = [
-            f"{name} ({v['cells']} cells, {v['quality']} steps, {v['frames_compared']} frames) "
-            f"{100 * v['chamfer']:.2f} %"
-            for name, v in found.items()
-            if name not in _OTHER
-        ]
-        lines.append(f"- pattern {pattern}: {', '.join(shown)}")
-        told = [f"{what} {100 * found[name]['chamfer']:.2f} %" for name, what in _OTHER.items() if name in found]
-        lines += [f"- pattern {pattern}, {'; '.join(told)}"] if told else []
-    return [*lines, ""]
-
-
-def page(recorded: list[Row]) -> list[str]:
-    """docs/flag_benchmark.md."""
-    lines = [
-        "# The flag benchmark",
-        "",
-        "Made by `python tools/bench.py flags` and `pages` from `docs/results/flags_*.json`. The reference is",
-        "Blender's cloth solver, which shares nothing with this package; how it was made, what is matched and what",
-        "cannot be is in [flag_dataset.md](flag_dataset.md). Chamfer distances are the average of both directions,",
-        "mean over frames, as a share of the flag's longer side.",
-        "",
-    ]
-    for result in sorted(recorded, key=lambda r: "CPU" in r["device"]):  # GPUs first
-        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-        lines += [f"## Splats {result['splats']}, on {result['device']}", "", f"{stack}; seed {result['seed']}."]
-        lines += [f"Further options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
-        lines += [result["note"]] if result.get("note") else []
-        lines += [""]
-        rows = result["rows"]
-        head = "| | " + " | ".join(f"pattern {p}: Chamfer | PSNR [dB]" for p in PATTERNS) + " |"
-        lines += [head, "|---" * 7 + "|"]
-        for name, variant in VARIANTS.items():
-            if name not in rows:
-                continue
-            cells = [f(rows[name].get(str(p))) for p in PATTERNS for f in (_chamfer, _psnr)]
-            lines.append(f"| {variant.title} | " + " | ".join(cells) + " |")
-        lines += ["", "| goal | measured | reached |", "|---|---|---|"]
-        lines += [f"| {goal} | {value} | {'yes' if ok else 'no'} |" for goal, value, ok in goals(result)]
-        told = [line for pattern in PATTERNS for line in pattern_lines(rows, pattern)]
-        lines += ["", "Where ours differs, and what one change at a time does:", "", *told] if told else []
-        for pattern, name in sorted(result.get("figures", {}).items()):
-            lines += ["", f"![Pattern {pattern} at five times](pictures/{name})"]
-        lines += ["", "### Time and memory", "", "| | particles | substeps | time a frame [ms] | device memory [GiB] |"]
-        lines += ["|---|---|---|---|---|"]
-        for name in ("ours", "particle"):
-            for pattern, row in sorted(rows.get(name, {}).items()):
-                if "substeps" in row:
-                    memory = row["device_memory_bytes"]
-                    on_device = "-" if memory is None else f"{memory / 2**30:.2f}"
-                    lines.append(
-                        f"| {VARIANTS[name].title}, pattern {pattern} | {row['particles']:,} | {row['substeps']:,} | "
-                        f"{row['ms_per_frame']:.1f} | {on_device} |"
-                    )
-        lines += [""]
-    lines += [*_ABOUT, *_uncertainty_lines(recorded)]
-    lines += [
-        "## The paper's numbers",
-        "",
-        "Of other flags, other cameras and an unpublished protocol, so not to be compared in absolute terms.",
-        "",
-        "| | " + " | ".join(f"pattern {p}: PSNR [dB] | Chamfer" for p in PATTERNS) + " |",
-        "|---" * 7 + "|",
-    ]
-    for name, values in PAPER.items():
-        lines.append(f"| {name} | " + " | ".join(f"{values[p][0]:.2f} | {values[p][1]:.4f}" for p in PATTERNS) + " |")
-    for name, (psnr, chamfer) in PAPER_ABLATION.items():
-        lines.append(f"| {name} | - | - | - | - | {psnr:.2f} | {chamfer:.4f} |")
-    return [*lines, ""]

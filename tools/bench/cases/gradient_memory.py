@@ -1,6 +1,6 @@
 """Memory and time of the gradient through one long rollout of a flag; ``bench.py gradients`` runs it as a process.
 
-``python tools/gradient_memory.py total 500 22``   formulation, substeps, checkpoint (0: none)
+``python tools/bench/cases/gradient_memory.py total 500 22``   formulation, substeps, checkpoint (0: none)
 """
 
 import dataclasses

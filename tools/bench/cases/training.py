@@ -6,7 +6,6 @@ import argparse
 import itertools
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -30,7 +29,7 @@ from gaussian_swaying.training.module import LearningRates, means_rate
 from gaussian_swaying.training.panels import panel
 from gaussian_swaying.validation.surface_quality import surface_quality
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[3]
 Row = dict[str, Any]
 
 SECTIONS = ("pair", "variants", "flag")
@@ -370,163 +369,6 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
         if "variants" in wanted:
             jobs = [(name, options.capture, options.steps, None) for name in options.variants.split(",")]
             run_apart(jobs, folder, options.at_once, keep("variants"))
-
-
-# ---- the page
-
-
-def _median(rows: list[Row], key: str) -> float:
-    return statistics.median(row[key] for row in rows)
-
-
-def goals(result: Row) -> list[tuple[str, str, bool]]:
-    """What was to be reached, what was measured, and whether it is."""
-    found: list[tuple[str, str, bool]] = []
-    pair = result.get("pair", {})
-    if pair.get("bare") and pair.get("lightning"):
-        bare, ours = (_median(pair[name], "psnr_db") for name in ("bare", "lightning"))
-        ratio = _median(pair["lightning"], "seconds") / _median(pair["bare"], "seconds")
-        memory = max(row["memory_bytes"] for row in pair["lightning"]) / 2**30
-        found += [
-            ("capture: test PSNR within 0.1 dB of the bare loop", f"{ours - bare:+.2f} dB", ours >= bare - 0.1),
-            ("capture: at most 1.10 times the time of the bare loop", f"{ratio:.2f} times", ratio <= 1.1),
-            ("capture: GPU memory within 1 GiB", f"{memory:.2f} GiB", memory <= 1.0),
-        ]
-        variants = {n: row["psnr_db"] for n, row in result.get("variants", {}).items() if "failed" not in row}
-        if variants:
-            name = max(variants, key=lambda n: variants[n])
-            better = f"{variants[name] - bare:+.2f} dB ({FOX_VARIANTS[name][0]})"
-            found.append(("capture: beat the bare loop's PSNR", better, variants[name] > bare))
-    row = result.get("flag", {}).get("flag:settled", result.get("flag", {}).get("flag:size"))
-    if row and "failed" not in row:
-        found += [
-            (
-                f"flag, all losses: {row['steps']:,} images within 300 s",
-                f"{row['seconds']:.0f} s ({row.get('runs_per_device', 1)} on the device)",
-                row["seconds"] <= 300,
-            ),
-            ("flag, all losses: PSNR of 35 dB", f"{row['psnr_db']:.1f} dB", row["psnr_db"] >= 35),
-            (
-                "flag, all losses: median angle between patch and true normal within 5°",
-                f"{row['angle_median_deg']:.1f}°",
-                row["angle_median_deg"] <= 5,
-            ),
-        ]
-    return found
-
-
-_ABOUT_THE_PAIR = """\
-Both do the same arithmetic on the same images in the same order; sums on a GPU come in no fixed order, so no two runs
-end alike, and the runs of one side differ among themselves by as much as the goal allows. Lightning takes a fixed
-time on the host for each image, with its hooks, its optimiser wrapper and what a training is watched with, while a
-picture of this size keeps the GPU busy for little longer than its launches take. What brought it down so far: a
-random stream of its own in place of seeding every step, losses that reach the host one step late, images as bytes in
-page-locked memory, cameras kept on the device, a progress bar drawn every twentieth image, images moved without a
-search through their fields, pictures put together from gsplat's functions without the inversion of the camera's matrix,
-for which the host waits in the middle of a step. The two pairs are of two runs; pairs that other work of the same
-machine ran beside were left out."""
-
-
-def page(recorded: list[Row]) -> list[str]:
-    """docs/training.md."""
-    lines = [
-        "# Training",
-        "",
-        "Made by `python tools/bench.py train` and `pages` from `docs/results/train_*.json`. PSNR and SSIM are means",
-        "over the held-out views, every eighth.",
-        "",
-    ]
-    for result in recorded:
-        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-        lines += [f"## {result['device']}", "", f"{stack}; seed {result['seed']}.", ""]
-        if found := goals(result):
-            lines += ["| goal | measured | reached |", "|---|---|---|"]
-            lines += [f"| {goal} | {value} | {'yes' if reached else 'no'} |" for goal, value, reached in found]
-            lines += [""]
-        if result.get("pair"):
-            lines += [*_ABOUT_THE_PAIR.splitlines(), ""]
-        lines += _capture_lines(result) + _flag_lines(result)
-    return lines
-
-
-def _capture_lines(result: Row) -> list[str]:
-    rows = [
-        (f"{name}, run {k + 1}", row) for name, rows in result.get("pair", {}).items() for k, row in enumerate(rows)
-    ]
-    rows += [(FOX_VARIANTS[name][0], row) for name, row in result.get("variants", {}).items()]
-    if not rows:
-        return []
-    lines = ["### A capture of photos", ""]
-    lines += [
-        "`bare` is a plain loop over gsplat with the same start, schedule and photometric loss, with the images on"
-    ]
-    lines += [
-        "the GPU; `lightning` is `tools/train.py` without surface losses. The runs below them change one thing each;"
-    ]
-    lines += ["several ran at once, in another run, so their times are not comparable.", ""]
-    lines += [
-        "| run | PSNR [dB] | SSIM | Gaussians | seconds | GPU memory [GiB] | at once |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, row in rows:
-        if "failed" in row:
-            lines.append(f"| {name} | failed | | | | | |")
-            continue
-        memory = "-" if row["memory_bytes"] is None else f"{row['memory_bytes'] / 2**30:.2f}"
-        lines.append(
-            f"| {name} | {row['psnr_db']:.2f} | {row['ssim']:.3f} | {row['gaussians']:,} | {row['seconds']:.1f} | "
-            f"{memory} | {row.get('runs_per_device', 1)} |"
-        )
-    return [*lines, "", *_what_helped(result)]
-
-
-def _what_helped(result: Row) -> list[str]:
-    """The variants in the order of what they gain over the bare loop, beside how far its own runs differ."""
-    bare = [row["psnr_db"] for row in result.get("pair", {}).get("bare", [])]
-    gains = {
-        FOX_VARIANTS[name][0]: row["psnr_db"] - statistics.mean(bare)
-        for name, row in result.get("variants", {}).items()
-        if bare and "failed" not in row
-    }
-    if not gains:
-        return []
-    told = [f"{gains[name]:+.2f} dB {name}" for name in sorted(gains, key=lambda name: -gains[name])]
-    spread = max(bare) - min(bare)
-    lines = ["Against the mean of the bare loop's runs, which differ by", f"{spread:.2f} dB among themselves:", ""]
-    return [*lines, *(f"- {line}" for line in told), ""]
-
-
-def _flag_lines(result: Row) -> list[str]:
-    found = {name.removeprefix("flag:"): row for name, row in result.get("flag", {}).items()}
-    found = {name: row for name, row in found.items() if "failed" not in row}
-    if not found:
-        return []
-    lines = ["### A flag whose surface is known: what the surface losses buy", ""]
-    lines += [
-        "Share of Gaussians with S1/S2 up to 1.1, of opacities outside [0.1, 0.9], and with S1 up to b; shape,",
-        "angle, distance and area are those of Gaussians with an opacity of 0.1 or more, which a simulation takes.",
-        "",
-    ]
-    lines += [
-        "| losses | round | decided | small | angle to true normal: median, 90 % [°] | distance: median, 90 % [mm] | "
-        "area `paper` | area `coverage` | PSNR [dB] | Gaussians | seconds |",
-        "|" + "---|" * 11,
-    ]
-    for name, (title, _) in FLAG_ROWS.items():
-        if name in found:
-            row = found[name]
-            lines.append(
-                f"| {title} | {100 * row['round_share']:.1f} % | {100 * row['decided_share']:.1f} % | "
-                f"{100 * row['small_share']:.1f} % | {row['angle_median_deg']:.1f}, {row['angle_p90_deg']:.1f} | "
-                f"{1e3 * row['distance_median_m']:.2f}, {1e3 * row['distance_p90_m']:.2f} | "
-                f"{row['area_paper_ratio']:.2f} | {row['area_coverage_ratio']:.2f} | {row['psnr_db']:.2f} | "
-                f"{row['gaussians']:,} | {row['seconds']:.0f} |"
-            )
-    lines += ["", "Photo, render, normals and areas (dark is small), from a held-out view:", ""]
-    for name, (title, _) in FLAG_ROWS.items():
-        if name in found:
-            lines += [f"![{title}](pictures/training_flag_{name}.png)", "", f"*{title}*", ""]
-    return lines
 
 
 def main() -> None:

@@ -1,9 +1,9 @@
 """Make the flag benchmark: the motion of three flags by Blender's cloth solver, photographs of them, and a video.
 
-``python tools/make_flag_dataset.py --preview``            all three, small, in two minutes on two cores
-``python tools/make_flag_dataset.py --pattern 2``          one, at full size
-``python tools/make_flag_dataset.py --check``              measures how Blender's settings relate to SI units
-``python tools/make_flag_dataset.py --uncertainty``        how far each motion is from the same flag solved otherwise
+``python tools/datasets/make_flag_dataset.py --preview``      all three, small, in two minutes on two cores
+``python tools/datasets/make_flag_dataset.py --pattern 2``    one, at full size
+``python tools/datasets/make_flag_dataset.py --check``        measures how Blender's settings relate to SI units
+``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from the same flag solved otherwise
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 

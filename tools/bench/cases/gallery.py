@@ -12,9 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flags import what_failed
+from bench.cases.flags import what_failed
+from bench.record import ROOT
+from bench.slots import table, value
 
-ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs" / "sim"
 Row = dict[str, Any]
 
@@ -120,55 +121,43 @@ def whole(row: Row) -> bool:
     return bool(complete and share is not None and LEAST <= share <= MOST)
 
 
-_ABOUT = """\
-Pattern 1 of the flags is held at one edge and in no wind: it falls past its pole, which is further than half its size.
-
-The two solids are the paper's experiment: with wind on the surface alone the body is drawn out, as its inside lags
-behind; with wind on all Gaussians, those within too, it is carried off as a whole. The last scene is an edit while
-loading: the sand bear becomes white foam (`configs/sim/variants/sand_to_foam.yaml`).
-""".splitlines()
+@value("gallery.least", "gallery_*", together=True)
+def least(_: list[Row]) -> str:
+    """Least mean displacement of what moves visibly."""
+    return f"{100 * LEAST:g} %"
 
 
-def page(recorded: list[Row]) -> list[str]:
-    """docs/gallery.md."""
-    lines = [
-        "# Gallery",
-        "",
-        "Made by `python tools/bench.py gallery` and `pages` from `docs/results/gallery_*.json`: the scenes of the",
-        "paper, each a file of `configs/sim/`, on splats made in code (the captures are not public; `--scene.ply`",
-        "takes them). Whole: all frames, no particle lost, and the mean displacement of the surface",
-        f"between {100 * LEAST:g} % and {100 * MOST:g} % of the object's size.",
-        "",
+@value("gallery.most", "gallery_*", together=True)
+def most(_: list[Row]) -> str:
+    """Largest mean displacement of what stays in place."""
+    return f"{100 * MOST:g} %"
+
+
+@table("gallery.md", "gallery.scenes", "gallery_*")
+def scenes(result: Row) -> list[str]:
+    """Time, memory and motion of each scene."""
+    stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
+    lines = [f"{result['device']}; {stack}; seed {result['seed']}.", ""]
+    lines += [
+        "| scene | particles | formulation | frames | substeps a frame | time a frame [ms] | process [s] | "
+        "host memory [GiB] | device memory [GiB] | displacement / size | whole |",
+        "|" + "---|" * 11,
     ]
-    for result in recorded:
-        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-        lines += [f"## {result['device']}", "", f"{stack}; seed {result['seed']}.", ""]
-        lines += [
-            "| scene | particles | formulation | frames | substeps a frame | time a frame [ms] | process [s] | "
-            "host memory [GiB] | device memory [GiB] | displacement / size | whole |",
-            "|" + "---|" * 11,
-        ]
-        for name, title in SCENES.items():
-            if name not in result["scenes"]:
-                continue
-            row = result["scenes"][name]
-            if "failed" in row:
-                lines.append(f"| {title} | failed | " + "| " * 8 + "| no |")
-                continue
-            wall = sum(row["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering"))
-            memory = row["peak_memory_bytes"]
-            on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
-            moved = row["displacement_share"]
-            lines.append(
-                f"| {title}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
-                f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
-                f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
-                f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
-            )
-        lines += [""]
-    lines += _ABOUT
     for name, title in SCENES.items():
-        rows = [result["scenes"][name] for result in recorded if name in result["scenes"]]
-        if any("failed" not in row for row in rows):
-            lines += [f"### {title}", "", f"![Five frames of {title}](pictures/gallery_{name}.png)", ""]
+        if name not in result["scenes"]:
+            continue
+        row = result["scenes"][name]
+        if "failed" in row:
+            lines.append(f"| {title} | failed | " + "| " * 8 + "| no |")
+            continue
+        wall = sum(row["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering"))
+        memory = row["peak_memory_bytes"]
+        on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
+        moved = row["displacement_share"]
+        lines.append(
+            f"| {title}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
+            f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
+            f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
+            f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
+        )
     return lines

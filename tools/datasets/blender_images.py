@@ -1,4 +1,4 @@
-"""Photographs of a sheet by Blender's path tracer: what ``tools/make_flag_dataset.py`` asks for pictures.
+"""Photographs of a sheet by Blender's path tracer: what ``tools/datasets/make_flag_dataset.py`` asks for pictures.
 
 ``bpy`` is imported when a studio is opened.
 """

@@ -1,4 +1,4 @@
-"""Blender's cloth solver in SI units: what ``tools/make_flag_dataset.py`` asks it, and the relations it is asked with.
+"""Blender's cloth solver in SI units: what ``make_flag_dataset.py`` asks it, and the relations it is asked with.
 
 This is the only file that runs the solver; ``bpy`` is imported when a cloth is solved. The relations between
 Blender's settings and SI units are measured (``make_flag_dataset.py --check`` measures them again), since Blender
