@@ -23,7 +23,8 @@ from gaussian_swaying.gaussians.surface import (
     deform_all,
     limit_deformed,
 )
-from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
@@ -61,8 +62,8 @@ class Material:
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it).
-        law: Constitutive law, for example ``Sand``; fixed corotated elasticity if null. All but ``FixedCorotated``,
-            ``NeoHookean``, ``SpringNetwork`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
+        law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
+            elasticity if null. Those that flow need ``solver.formulation: updated``.
         regions: Parts made of something else; later entries win.
     """
 

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from gaussian_swaying.mpm.materials import Sand
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.simulation.health import advice, extremes, particle_of_extremes
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material

@@ -10,7 +10,7 @@ from torch import Tensor
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import UniformGust, WindField
-from gaussian_swaying.mpm.materials import Sand
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 
 CUBE = GridSpec(0.01, (0, 0, 0), (100, 100, 100))

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from bench import record
-from gaussian_swaying.mpm.materials import Sand
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.validation import bars, beams, flags, granular, plates, surfaces, vortex
 from gaussian_swaying.validation.settings import Settings
 

@@ -1,26 +1,28 @@
 """Materials as modules: what they call, return maps on deformation gradients, bounds on the stiffness."""
 
 import math
+import re
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
 
 import pytest
 import torch
 
-from gaussian_swaying.mpm import constitutive, linalg, materials
-from gaussian_swaying.mpm.constitutive import lame_parameters
+from gaussian_swaying.mpm import laws, linalg
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.linalg import spectrum
-from gaussian_swaying.mpm.materials import (
-    ConstitutiveLaw,
-    FixedCorotated,
-    Fluid,
-    Foam,
-    Metal,
-    NeoHookean,
-    Plasticine,
-    Sand,
-    Snow,
-    SpringNetwork,
-    StVKHencky,
-)
 
 LAWS = {
     "fixed corotated": FixedCorotated(),
@@ -59,6 +61,24 @@ def test_attributes():
     assert all(isinstance(law, ConstitutiveLaw) for law in LAWS.values())
 
 
+def test_a_law_is_one_file():
+    """Each file of the folder but those that all share has one law, and no file of device functions is left over."""
+    files = {found.name for found in iter_modules(laws.__path__) if not found.ispkg} - {"law", "shared"}
+    assert {law.__module__.rsplit(".", 1)[1] for law in laws.LAWS.values()} == files
+    assert len(laws.LAWS) == len(files)
+    assert {type(law) for law in LAWS.values()} == set(laws.LAWS.values())  # a new one must be tested here
+    twins = {found.name for found in iter_modules([f"{path}/triton" for path in laws.__path__])}
+    assert {law.twin.rsplit(".", 1)[1] for law in laws.LAWS.values()} == twins - {"body", "shared", "twin"}
+
+
+def test_the_documented_laws_are_those_that_there_are():
+    page = (Path(__file__).parents[2] / "docs" / "configuration.md").read_text()
+    (row,) = (line for line in page.splitlines() if line.startswith("| `material.law`"))
+    elastic, flowing = (set(re.findall("`([A-Z][A-Za-z]+)`", part)) for part in row.split("flowing"))
+    assert elastic == {name for name, law in laws.LAWS.items() if not law.plastic}
+    assert flowing == {name for name, law in laws.LAWS.items() if law.plastic}
+
+
 @pytest.mark.parametrize("name", list(LAWS))
 def test_stress_is_the_derivative_of_the_energy(name):
     law = LAWS[name]
@@ -79,7 +99,8 @@ def test_elastic_laws_need_no_eigenvectors(monkeypatch):
     def fail(*args, **kwargs):
         raise AssertionError("called")
 
-    for module in (linalg, constitutive, materials):
+    files = [import_module(f"{laws.__name__}.{found.name}") for found in iter_modules(laws.__path__)]
+    for module in (linalg, *files):
         for name in ("spectrum", "symmetric_eigen", "from_principal", "_singular_vectors", "_jacobi"):
             monkeypatch.setattr(module, name, fail, raising=False)
     F = _gradients().requires_grad_()
