@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import UniformGust, WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.materials import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
@@ -265,13 +265,13 @@ def waves(position: Tensor) -> Tensor:
     return torch.stack([zero, zero, torch.sin(2 * math.pi * x) * torch.cos(2 * math.pi * y)], dim=-1)
 
 
-def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> WindLoad:
+def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> WindForce:
     """Wind on every particle of a sheet, or of many."""
     slope = 0.027 * torch.cos(9 * points.position[..., 0])
     normal = torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)
     device = points.position.device
     area = (points.volume / 0.01).contiguous()
-    return WindLoad(AeroForce().to(device), winds, torch.nn.functional.normalize(normal, dim=-1), area)
+    return WindForce(AeroForce().to(device), winds, torch.nn.functional.normalize(normal, dim=-1), area)
 
 
 def wind(number: int, gusts: bool, device: torch.device) -> WindField:
@@ -331,7 +331,7 @@ def _double(state: MPMState) -> MPMState:
     return state.replace(**{k: v.double() for k, v in single.items()})
 
 
-def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load: WindLoad | None) -> Row:
+def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load: WindForce | None) -> Row:
     """Largest difference from the same rollout by the torch path in float64.
 
     Positions relative to the largest displacement since the start, velocities to the largest velocity.
@@ -339,7 +339,7 @@ def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load
     exact = MPMSolver(dx=solver.dx, formulation=solver.formulation, transfer="torch")
     exact.init_state(solver.points.map(Tensor.double))
     if load is not None:
-        load = WindLoad(load.aero, load.wind, load.normal.double(), load.area.double())
+        load = WindForce(load.aero, load.wind, load.normal.double(), load.area.double())
     true = exact.rollout(_double(start), DT, steps, load)
     position = (end.position - true.position).abs().amax() / (true.position - start.position).abs().amax()
     velocity = (end.velocity - true.velocity).abs().amax() / true.velocity.abs().amax()
@@ -385,7 +385,7 @@ def bench_rollout(plan: Plan, asked: int, formulation: str, device: torch.device
     return row
 
 
-def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindLoad | None, device: torch.device) -> Row:
+def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindForce | None, device: torch.device) -> Row:
     """Time of a substep with ``transfer: torch``."""
     few = plan.torch_steps
     return timed(lambda: solver.rollout(state, DT, few, load), device, 3, 2, 1 / few) | {"substeps": few}
@@ -411,7 +411,7 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
 
     single, at_rest = start(one)
     patches = wind_load(one, winds[0])
-    loads = [WindLoad(patches.aero, w, patches.normal, patches.area) for w in winds]
+    loads = [WindForce(patches.aero, w, patches.normal, patches.area) for w in winds]
 
     def in_turn() -> None:
         results["apart"] = [single.rollout(at_rest, DT, steps, own).position for own in loads]
@@ -593,7 +593,7 @@ def page(results: list[tuple[str, Row]], pictures: Path) -> list[str]:
     lines = [
         "## Speed of substeps, batches and frames",
         "",
-        "Rollouts with `WindLoad`, as a user starts them: the time of a substep is that of a whole rollout, with",
+        "Rollouts with `WindForce`, as a user starts them: the time of a substep is that of a whole rollout, with",
         "sorting, wind and the fields of the particles at its end, by the number of its substeps. The slope between it",
         "and a longer one leaves out what a rollout costs once. The sheet starts with waves of 1 m/s; `updated` has a",
         "grid of 100³ nodes. Torch: the same with `transfer: torch`. Memory: the peak of torch's allocator. Error: the",

@@ -69,10 +69,10 @@ def estimate_cost(pipeline: SimulationPipeline, frames: int, tries: int = 3, pic
     solver = pipeline.solver
     state = pipeline.start()
     steps = max(solver.substeps(state, pipeline.frame_dt), pipeline._drag_substeps(state))
-    load = None if pipeline.idle else pipeline.load
+    forces = pipeline.forces
     dt = pipeline.frame_dt / steps
-    solver.rollout(state, dt, 1, load)
-    seconds = _seconds(pipeline, lambda: solver.rollout(state, dt, tries, load)) / tries
+    solver.rollout(state, dt, 1, forces)
+    seconds = _seconds(pipeline, lambda: solver.rollout(state, dt, tries, forces)) / tries
     drawn = None
     if picture:  # the further cameras are taken to be as large as the first
         drawn = _seconds(pipeline, lambda: pipeline.render(state, 0)) * (1 + len(pipeline.cameras))
