@@ -12,8 +12,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from gaussian_swaying.aero.force import AeroForce, aero_force
-    from gaussian_swaying.aero.load import WindLoad
-    from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
+    from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
+    from gaussian_swaying.aero.wind_force import WindForce
     from gaussian_swaying.data.capture import Capture, View, read_capture
     from gaussian_swaying.data.capture_camera import CaptureCamera
     from gaussian_swaying.data.datamodule import CaptureDataModule
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         SequentialRelease,
         VelocityBox,
     )
+    from gaussian_swaying.mpm.forces import Force
     from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
     from gaussian_swaying.mpm.laws.fluid import Fluid
     from gaussian_swaying.mpm.laws.foam import Foam
@@ -73,8 +74,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "aero.force": ("AeroForce", "aero_force"),
-    "aero.load": ("WindLoad",),
-    "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "UniformGust", "WindField"),
+    "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "SpatialWind", "UniformGust", "WindField"),
+    "aero.wind_force": ("WindForce",),
     "data.capture": ("Capture", "View", "read_capture"),
     "data.capture_camera": ("CaptureCamera",),
     "data.datamodule": ("CaptureDataModule",),
@@ -100,6 +101,7 @@ _HOMES = {
         "SequentialRelease",
         "VelocityBox",
     ),
+    "mpm.forces": ("Force",),
     "mpm.laws.fixed_corotated": ("FixedCorotated",),
     "mpm.laws.fluid": ("Fluid",),
     "mpm.laws.foam": ("Foam",),
@@ -154,6 +156,7 @@ __all__ = [
     "FlowKey",
     "Fluid",
     "Foam",
+    "Force",
     "FrechetVideoDistance",
     "GaussianCloud",
     "GaussianGust",
@@ -193,6 +196,7 @@ __all__ = [
     "SimulationPipeline",
     "SineSway",
     "Snow",
+    "SpatialWind",
     "Sphere",
     "SplatTrainer",
     "SpringNetwork",
@@ -205,7 +209,7 @@ __all__ = [
     "VelocityBox",
     "View",
     "WindField",
-    "WindLoad",
+    "WindForce",
     "aero_force",
     "chamfer_distance",
     "compare_run",

@@ -19,7 +19,6 @@ Rows of node arrays: in ``total`` displacement and velocity, each in four column
 import triton
 import triton.language as tl
 
-from gaussian_swaying.aero.force_triton import aero_force, deform_patch
 from gaussian_swaying.mpm.damping_triton import kelvin_voigt_pk1
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff, pk1
 from gaussian_swaying.mpm.linalg_triton import (
@@ -205,26 +204,23 @@ def _store9(pointer, stride, index, value, mask):
 
 
 @triton.jit
-def _wind_force(
-    F, velocity, index, mask, scene, patch, count, winds, scenes, step, coefficients,
-    PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
+def _twin_force(
+    TWIN: tl.constexpr, OPTIONS: tl.constexpr, F, velocity, index, mask, scene, values, count, vectors, scenes, step,
+    numbers,
 ):  # fmt: skip
-    """Force of the wind on the patches of some particles and their resistance [kg/s]."""
-    rest = _load3(patch, count, index, mask)
-    area = tl.load(patch + 3 * count + index, mask, 0.0)
-    normal, area = deform_patch(F, rest, area, tl.load(coefficients + 4))
-    row = winds + (step * scenes + scene) * 3
-    relative = (
-        tl.load(row) - velocity[0],
-        tl.load(row + 1) - velocity[1],
-        tl.load(row + 2) - velocity[2],
-    )
-    drag = tl.load(coefficients)
-    friction = tl.load(coefficients + 1)
-    lift = tl.load(coefficients + 2)
-    half_density = tl.load(coefficients + 3)
-    force, speed = aero_force(relative, normal, area, drag, friction, lift, half_density, PROJECTED, LIFT, UNIT)
-    return force, half_density * area * (drag + friction + tl.abs(lift)) * speed
+    """Force of a ``forces.Twin`` on some particles [N] and their resistance [kg/s]."""
+    first = _load3(values, count, index, mask)
+    last = tl.load(values + 3 * count + index, mask, 0.0)
+    vector = vectors + (step * scenes + scene) * 3
+    return TWIN(F, velocity, (first[0], first[1], first[2], last), vector, numbers, OPTIONS)
+
+
+@triton.jit
+def _add_given(force, resistance, force_in, where, mask):
+    """Add the force and the resistance in the rows of ``force_in``."""
+    more = _load3(force_in, 1, where * 4, mask)
+    resistance += tl.load(force_in + where * 4 + 3, mask, 0.0)
+    return (force[0] + more[0], force[1] + more[1], force[2] + more[2]), resistance
 
 
 @triton.jit
@@ -252,21 +248,21 @@ def _account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, 
 
 @triton.jit(do_not_specialize=VARIES)
 def total_particles(
-    fraction, material, law, law_table, patch, force_in, load, order, count,
+    fraction, material, law, law_table, values, force_in, load, order, count,
     cell_start, cell_node, cell_scene, cells,
     fields, partial,
-    schedule, winds, scenes, coefficients, first_step, step_offset,
+    schedule, vectors, scenes, numbers, first_step, step_offset,
     sx, sy, inverse_dx, viscous_time,
-    LAWS: tl.constexpr, MULTI: tl.constexpr, WIND: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr,
-    VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
-    PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, FORCE: tl.constexpr,
+    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
     CELLS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
-    Lanes without a particle have no volume, area or mass, so they add nothing. A step of index zero of a rollout takes
-    what came before it from row 0 of the schedule.
+    Lanes without a particle have no volume, values of a twin or mass, so they add nothing. A step of index zero of a
+    rollout takes what came before it from row 0 of the schedule.
     """
+    LOADED: tl.constexpr = (TWIN is not None) or FORCE
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
@@ -295,7 +291,7 @@ def total_particles(
         if VISCOUS:
             u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
             v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-        elif WIND or FORCE:
+        elif LOADED:
             u, F, v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
         else:
             u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
@@ -311,15 +307,14 @@ def total_particles(
         zero = volume * 0
         value = (zero, zero, zero)
         resistance = zero
-        if WIND:
-            value, resistance = _wind_force(
-                F, v, index, mask, scene, patch, count, winds, scenes, step, coefficients, PROJECTED, LIFT, UNIT
+        if TWIN is not None:
+            value, resistance = _twin_force(
+                TWIN, OPTIONS, F, v, index, mask, scene, values, count, vectors, scenes, step, numbers
             )
         if FORCE:
             where = tl.load(order + index, mask, 0)
-            value = _load3(force_in, 1, where * 4, mask)
-            resistance = tl.load(force_in + where * 4 + 3, mask, 0.0)
-        if WIND or FORCE:
+            value, resistance = _add_given(value, resistance, force_in, where, mask)
+        if LOADED:
             _account(value, resistance, v, kick, before, IMPLICIT, load, count, index, mask)
         if POSITION:
             mass = tl.load(material + 3 * count + index, mask, 0.0)
@@ -496,18 +491,18 @@ def _locate(x, dx, o, n):
 @triton.jit(do_not_specialize=VARIES)
 def updated_particles(
     moving, order, load, count,
-    momentum, velocity, schedule, winds, scenes, coefficients, first_step, step_offset, law_table, force_in,
+    momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
     ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size,
-    LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, WIND: tl.constexpr, FORCE: tl.constexpr,
-    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr,
-    PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
+    LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr,
+    FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr,
     GATHER: tl.constexpr, SCATTER: tl.constexpr,
 ):  # fmt: skip
     """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
 
     Rows of ``moving``: position 0, F 3, velocity 12, affine 15, lost 24, internal 25, mass 26, volume 27, mu 28,
-    lam 29, law 30, normal 31, area 34, and total F 35 where a law is plastic.
+    lam 29, law 30, the four values of a twin 31, and total F 35 where a law is plastic.
     """
+    LOADED: tl.constexpr = (TWIN is not None) or FORCE
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
@@ -572,15 +567,14 @@ def updated_particles(
     force = (zero, zero, zero)
     resistance = zero
     if SCATTER:
-        if WIND:
-            force, resistance = _wind_force(
-                F_total, v, index, mask, scene, moving + 31 * count, count, winds, scenes, step, coefficients,
-                PROJECTED, LIFT, UNIT,
+        if TWIN is not None:
+            force, resistance = _twin_force(
+                TWIN, OPTIONS, F_total, v, index, mask, scene, moving + 31 * count, count, vectors, scenes, step,
+                numbers,
             )  # fmt: skip
         if FORCE:
-            force = _load3(force_in, 1, where * 4, mask)
-            resistance = tl.load(force_in + where * 4 + 3, mask, 0.0)
-    if WIND or FORCE:
+            force, resistance = _add_given(force, resistance, force_in, where, mask)
+    if LOADED:
         _account(force, resistance, v, kick, before, IMPLICIT, load, count, index, mask)
     if SCATTER:
         mass = tl.load(moving + 26 * count + index, mask, 0.0)

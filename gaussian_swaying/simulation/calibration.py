@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
@@ -201,6 +202,7 @@ def apply_setting(pipeline: SimulationPipeline, setting: Setting, base: Setting)
         volume=points.volume * thicker,
         youngs_modulus=points.youngs_modulus * (setting.E / base.E),
     )
+    assert isinstance(wind, WindField)  # that of the configuration that the preview writes
     wind.flows = wind.flows * (setting.wind / base.wind)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.simulation.pipeline import SimulationPipeline, describe_device
 
@@ -77,16 +78,16 @@ def estimate_cost(
     """
     solver = pipeline.solver
     state = pipeline.start()
-    steps = max(solver.substeps(state, pipeline.frame_dt), _drag_substeps(pipeline, frames))
-    load = None if pipeline.idle else pipeline.load
+    steps = max(solver.substeps(state, pipeline.frame_dt), _drag_substeps(pipeline, state, frames))
+    forces = pipeline.forces
     dt = pipeline.frame_dt / steps
     if pipeline.device.type == "cuda":  # kernels are compiled and graphs recorded in the first frames
         state, _ = pipeline.advance(state)
         state, _ = pipeline.advance(state)
         seconds = _seconds(pipeline, lambda: pipeline.advance(state)) / steps
     else:
-        solver.rollout(state, dt, 1, load)
-        seconds = min(_seconds(pipeline, lambda: solver.rollout(state, dt, 1, load)) for _ in range(tries))
+        solver.rollout(state, dt, 1, forces)
+        seconds = min(_seconds(pipeline, lambda: solver.rollout(state, dt, 1, forces)) for _ in range(tries))
     drawn = None
     if picture:  # the further cameras are taken to be as large as the first
         pipeline.render(state, 0)
@@ -108,12 +109,12 @@ def estimate_cost(
     )
 
 
-def _drag_substeps(pipeline: SimulationPipeline, frames: int) -> int:
+def _drag_substeps(pipeline: SimulationPipeline, state: MPMState, frames: int) -> int:
     """Substeps of a frame that explicit drag asks for at rest, on average over the wind of the run."""
     if pipeline.idle or pipeline.aero.drag_step == "semi_implicit":
         return 1
-    time = torch.zeros((), dtype=torch.float64, device=pipeline.device)
-    speed = torch.linalg.vector_norm(pipeline.load.winds(time, pipeline.frame_dt, frames), dim=-1)
+    winds = pipeline.wind_force.samples(state, pipeline.frame_dt, frames)
+    speed = torch.linalg.vector_norm(winds, dim=-1).reshape(frames, -1).amax(1)
     area, mass = pipeline.scene.patch_area, pipeline.solver.points.mass
     rates = [float(pipeline.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values]
     return math.ceil(statistics.mean(rates) * pipeline.frame_dt)

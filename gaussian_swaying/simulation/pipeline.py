@@ -17,10 +17,11 @@ from torch import Tensor, nn
 import gaussian_swaying
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.load import WindLoad
-from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
+from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering import passes
@@ -61,7 +62,7 @@ class SimulationPipeline(nn.Module):
     Args:
         scene: Gaussians, material points and patches.
         solver: Moves the material; its boundaries are given in scene units.
-        wind: Air velocity over time.
+        wind: Air velocity over time, the same everywhere or not.
         aero: Force of the wind on patches.
         shader: Colours from normals and light; None leaves the colours of the splat.
         camera: Where each frame is seen from.
@@ -77,7 +78,7 @@ class SimulationPipeline(nn.Module):
         self,
         scene: SimulatedScene,
         solver: MPMSolver,
-        wind: WindField,
+        wind: WindField | SpatialWind,
         aero: AeroForce,
         shader: Shader | None,
         camera: CameraPath,
@@ -105,11 +106,11 @@ class SimulationPipeline(nn.Module):
         self._progress: RunProgress | None = None
         self.files: list[Path] = []  # what the last run wrote
         self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
+        self._wind_force: list[WindForce] = []  # in a list, as it is no part of the module's state
+        self._wind_parts: tuple[object, ...] = ()
         self.idle = self.aero.idle  # asked once, as it makes the host wait
         self._force_end = self.force_scale()  # likewise
         self._tearing: TearingGauge | None = None
-        self._load: WindLoad | None = None
-        self._load_parts: tuple[object, ...] = ()
 
     @property
     def device(self) -> torch.device:
@@ -201,12 +202,17 @@ class SimulationPipeline(nn.Module):
         return state if resumed else edited
 
     @property
-    def load(self) -> WindLoad:
+    def wind_force(self) -> WindForce:
         """The wind on the patches of the scene."""
         parts = (self.aero, self.wind, self.scene.patch_normal, self.scene.patch_area)
-        if self._load is None or any(a is not b for a, b in zip(parts, self._load_parts, strict=True)):
-            self._load, self._load_parts = WindLoad(*parts), parts
-        return self._load
+        if not self._wind_force or any(a is not b for a, b in zip(parts, self._wind_parts, strict=True)):
+            self._wind_force, self._wind_parts = [WindForce(*parts)], parts
+        return self._wind_force[0]
+
+    @property
+    def forces(self) -> list[Force]:
+        """What pushes the particles besides gravity: the wind, unless it has no effect."""
+        return [] if self.idle else [self.wind_force]
 
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
         """Advance by one frame.
@@ -267,15 +273,15 @@ class SimulationPipeline(nn.Module):
 
     def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
         """The state some substeps later, and the largest Courant number on the way."""
-        load, progress = None if self.idle else self.load, self._progress
+        progress = self._progress
         watch = None if progress is None else lambda done: progress.substep(done, steps)
-        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, load, CFL_SAMPLES, watch)
+        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch)
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
         if self.idle:
             return 1
-        winds = self.load.winds(state.time, self.frame_dt / 4, 5)
+        winds = self.wind_force.samples(state, self.frame_dt / 4, 5)
         wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
         fastest = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
@@ -357,15 +363,22 @@ class SimulationPipeline(nn.Module):
         if self.idle:
             return torch.zeros_like(area)
         normal, _ = deform_patch(state.F_total, self.scene.patch_normal, area)
-        wind = self.load.winds(state.time, 0.0, 1)[0]
+        wind = self.wind_force.air(state.time, state.position)
         force = self.aero(wind, state.velocity, normal, torch.ones_like(area))
         return torch.where(area > 0, torch.linalg.vector_norm(force, dim=-1), 0.0)
 
     def force_scale(self) -> float:
         """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
-        speed = float(torch.linalg.vector_norm(self.wind.flows, dim=-1).amax())
+        speed = float(torch.linalg.vector_norm(self.flows(), dim=-1).amax())
         coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).abs().sum())
         return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
+
+    def flows(self) -> Tensor:
+        """Flows of the wind without gusts [m/s], shape (K, 3); of one that depends on the place, at the particles."""
+        if isinstance(self.wind, WindField):
+            return self.wind.flows
+        position = self.scene.points.position
+        return self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
 
     def draw_normals(self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera") -> Tensor:
         """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3).

@@ -291,7 +291,7 @@ def _draw_wind(draw: ImageDraw, pipeline: SimulationPipeline, camera: Camera) ->
 
 def mean_flow(pipeline: SimulationPipeline) -> Tensor:
     """Flow without its modulations [m/s], z up, shape (3,), float64; the strongest entry of a schedule."""
-    flows = pipeline.wind.mean_flow(pipeline.wind.times).detach().cpu().double().reshape(-1, 3)
+    flows = pipeline.flows().detach().cpu().double().reshape(-1, 3)
     return flows[int(flows.norm(dim=-1).argmax())]
 
 

@@ -159,7 +159,7 @@ def inclined_layer(
             for _ in range(count):
                 now = tilt * (3 * state.time / seconds).clamp(max=1.0).to(tilt)
                 direction = torch.stack([now.sin(), torch.zeros_like(now), -now.cos()], dim=-1)
-                state = solver.step(state, frame / count, weight * direction[:, None])
+                state = solver.step(state, frame / count, force=weight * direction[:, None])
                 state = state.replace(position=state.position * across)
             taken += count
             speeds.append(state.velocity[..., 0].mean(-1))

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import UniformGust, WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 
@@ -45,13 +45,13 @@ def waves(position: Tensor) -> Tensor:
     return torch.stack([zero, zero, torch.sin(2 * math.pi * x) * torch.cos(2 * math.pi * y)], dim=-1)
 
 
-def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> WindLoad:
+def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> WindForce:
     """Wind on every particle of a sheet, or of many."""
     slope = 0.027 * torch.cos(9 * points.position[..., 0])
     normal = torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)
     device = points.position.device
     area = (points.volume / 0.01).contiguous()
-    return WindLoad(AeroForce().to(device), winds, torch.nn.functional.normalize(normal, dim=-1), area)
+    return WindForce(AeroForce().to(device), winds, torch.nn.functional.normalize(normal, dim=-1), area)
 
 
 def wind(number: int, gusts: bool, device: torch.device) -> WindField:

@@ -18,7 +18,7 @@ from torch import Tensor
 from bench import record
 from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
 from bench.problems import CUBE, block, fewest_bytes, nodes_in_reach, sheet, waves, wind, wind_load
-from gaussian_swaying.aero.load import WindLoad
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.config import build_parser, build_pipeline
@@ -114,7 +114,7 @@ def _double(state: MPMState) -> MPMState:
     return state.replace(**{k: v.double() for k, v in single.items()})
 
 
-def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load: WindLoad | None) -> Row:
+def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load: WindForce | None) -> Row:
     """Largest difference from the same rollout by the torch path in float64.
 
     Positions relative to the largest displacement since the start, velocities to the largest velocity.
@@ -122,7 +122,7 @@ def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load
     exact = MPMSolver(dx=solver.dx, formulation=solver.formulation, transfer="torch")
     exact.init_state(solver.points.map(Tensor.double))
     if load is not None:
-        load = WindLoad(load.aero, load.wind, load.normal.double(), load.area.double())
+        load = WindForce(load.aero, load.wind, load.normal.double(), load.area.double())
     true = exact.rollout(_double(start), DT, steps, load)
     position = (end.position - true.position).abs().amax() / (true.position - start.position).abs().amax()
     velocity = (end.velocity - true.velocity).abs().amax() / true.velocity.abs().amax()
@@ -168,7 +168,7 @@ def bench_rollout(plan: Plan, asked: int, formulation: str, device: torch.device
     return row
 
 
-def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindLoad | None, device: torch.device) -> Row:
+def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindForce | None, device: torch.device) -> Row:
     """Time of a substep with ``transfer: torch``."""
     few = plan.torch_steps
     return timed(lambda: solver.rollout(state, DT, few, load), device, 3, 2, 1 / few) | {"substeps": few}
@@ -194,7 +194,7 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
 
     single, at_rest = start(one)
     patches = wind_load(one, winds[0])
-    loads = [WindLoad(patches.aero, w, patches.normal, patches.area) for w in winds]
+    loads = [WindForce(patches.aero, w, patches.normal, patches.area) for w in winds]
 
     def in_turn() -> None:
         results["apart"] = [single.rollout(at_rest, DT, steps, own).position for own in loads]

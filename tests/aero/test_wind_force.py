@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.surface import deform_patch
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -26,7 +26,7 @@ def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
     solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch")
     velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
     state = solver.init_state(points, velocity)
-    return solver, solver.rollout(state, DT, 2), WindLoad(AeroForce(**settings), wind, normal, area)
+    return solver, solver.rollout(state, DT, 2), WindForce(AeroForce(**settings), wind, normal, area)
 
 
 def test_winds_are_those_of_the_start_of_each_substep():
@@ -68,7 +68,7 @@ def test_force_is_that_on_the_deformed_patches(drag_step):
 def test_the_area_of_what_has_flowed_is_capped(drag_step):
     """Shear without end: the normal turns, the force stays that on so many times the area at rest."""
     _, state, free = _setting(drag_step=drag_step)
-    load = WindLoad(AeroForce(drag_step=drag_step, max_area_ratio=1.5), GUSTS, free.normal, free.area)
+    load = WindForce(AeroForce(drag_step=drag_step, max_area_ratio=1.5), GUSTS, free.normal, free.area)
     wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
     F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
     F[:10, 0, 1] = 3e4
@@ -89,7 +89,7 @@ def test_the_area_of_what_has_flowed_is_capped(drag_step):
 def test_gradients_through_a_capped_area_are_finite():
     """Also where the patch stands exactly at the cap; in F only the direction of the normal is left above it."""
     _, state, free = _setting()
-    load = WindLoad(AeroForce(max_area_ratio=1.0), GUSTS, free.normal, free.area)
+    load = WindForce(AeroForce(max_area_ratio=1.0), GUSTS, free.normal, free.area)
     F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
     F[:10, 0, 1] = 3e4
     F.requires_grad_()
@@ -112,7 +112,7 @@ def test_a_rollout_in_the_wind_is_the_one_with_its_forces(formulation, drag_step
     step = state
     for _ in range(5):
         force, drag = load(step)
-        step = solver.step(step, DT, force, drag)
+        step = solver.step(step, DT, force=force, drag=drag)
     called = solver.rollout(state, DT, 5, lambda s: load(s))
     calm = solver.rollout(state, DT, 5)
     for other in (step, called):
@@ -168,13 +168,13 @@ def test_a_copy_leaves_the_graph_behind():
 def test_shapes_are_checked():
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
     with pytest.raises(ValueError, match="normal"):
-        WindLoad(AeroForce(), GUSTS, torch.zeros(4), torch.ones(4))
+        WindForce(AeroForce(), GUSTS, torch.zeros(4), torch.ones(4))
     with pytest.raises(ValueError, match="area"):
-        WindLoad(AeroForce(), GUSTS, up, torch.ones(3))
+        WindForce(AeroForce(), GUSTS, up, torch.ones(3))
     with pytest.raises(ValueError, match=r"one `wind` for each of the \(2,\) scenes, but got 3"):
-        WindLoad(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
+        WindForce(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
     with pytest.raises(ValueError, match=r"one `wind` for each of the \(\) scenes, but got 1"):
-        WindLoad(AeroForce(), [GUSTS], up, torch.ones(4))
+        WindForce(AeroForce(), [GUSTS], up, torch.ones(4))
 
 
 @pytest.mark.gpu
@@ -190,7 +190,7 @@ def test_a_recorded_wind_blows_as_the_plain_one(scenes):
     first = wind[0] if scenes else wind
     shape = (*((scenes,) if scenes else ()), 5, 3)
     normal = torch.nn.functional.normalize(torch.ones(shape, device="cuda"), dim=-1)
-    load = WindLoad(AeroForce().cuda(), wind, normal, torch.ones(shape[:-1], device="cuda"))
+    load = WindForce(AeroForce().cuda(), wind, normal, torch.ones(shape[:-1], device="cuda"))
     changes = [
         lambda: None,
         lambda: None,
@@ -222,7 +222,7 @@ def test_a_wind_that_cannot_be_recorded_is_asked_each_time():
 
     wind = WindField([1.0, 0.0, 0.0], modulations=[Waiting()]).cuda()
     normal = torch.tensor([[1.0, 0.0, 0.0]], device="cuda")
-    load = WindLoad(AeroForce().cuda(), wind, normal, torch.ones(1, device="cuda"))
+    load = WindForce(AeroForce().cuda(), wind, normal, torch.ones(1, device="cuda"))
     for time in (0.0, 0.5, 2.0, 0.5):
         found = load.winds(torch.full((), time, dtype=torch.float64, device="cuda"), 1e-3, 4)
         assert found[0, 0] == (2.0 if time > 1 else 1.0)
