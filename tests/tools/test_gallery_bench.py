@@ -55,7 +55,7 @@ def test_whole_means_all_of_it(gallery):
     }
     row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview"}
     result = {"device": "CPU", "versions": {}, "seed": 0, "scenes": {"ficus": row, "sand": {"failed": "x"}}}
-    text = "\n".join(gallery.scenes(result))
+    text = "\n".join(gallery.page([result]))
     shown = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
     assert shown in text
     assert "| Sand | failed" in text

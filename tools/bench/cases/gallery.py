@@ -133,31 +133,39 @@ def most(_: list[Row]) -> str:
     return f"{100 * MOST:g} %"
 
 
+def page(recorded: list[Row]) -> list[str]:
+    """Time, memory and motion of each scene, one table for each record."""
+    lines = []
+    for result in recorded:
+        stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
+        lines += [f"{result['device']}; {stack}; seed {result['seed']}.", ""]
+        lines += [
+            "| scene | particles | formulation | frames | substeps a frame | time a frame [ms] | process [s] | "
+            "host memory [GiB] | device memory [GiB] | displacement / size | whole |",
+            "|" + "---|" * 11,
+        ]
+        for name, title in SCENES.items():
+            if name not in result["scenes"]:
+                continue
+            row = result["scenes"][name]
+            if "failed" in row:
+                lines.append(f"| {title} | failed | " + "| " * 8 + "| no |")
+                continue
+            wall = sum(row["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering"))
+            memory = row["peak_memory_bytes"]
+            on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
+            moved = row["displacement_share"]
+            lines.append(
+                f"| {title}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
+                f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
+                f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
+                f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
+            )
+        lines += [""]
+    return lines
+
+
 @table("gallery.md", "gallery.scenes", "gallery_*")
 def scenes(result: Row) -> list[str]:
-    """Time, memory and motion of each scene."""
-    stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-    lines = [f"{result['device']}; {stack}; seed {result['seed']}.", ""]
-    lines += [
-        "| scene | particles | formulation | frames | substeps a frame | time a frame [ms] | process [s] | "
-        "host memory [GiB] | device memory [GiB] | displacement / size | whole |",
-        "|" + "---|" * 11,
-    ]
-    for name, title in SCENES.items():
-        if name not in result["scenes"]:
-            continue
-        row = result["scenes"][name]
-        if "failed" in row:
-            lines.append(f"| {title} | failed | " + "| " * 8 + "| no |")
-            continue
-        wall = sum(row["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering"))
-        memory = row["peak_memory_bytes"]
-        on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
-        moved = row["displacement_share"]
-        lines.append(
-            f"| {title}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
-            f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
-            f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
-            f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
-        )
-    return lines
+    """The table of one record."""
+    return page([result])
