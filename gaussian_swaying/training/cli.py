@@ -169,7 +169,7 @@ def _train(arguments: Sequence[str] | None) -> int:
         print(_STOPPED, file=sys.stderr)
         return 130
     if cli.subcommand == "fit":
-        for name in ("point_cloud.ply", "panels", "checkpoints"):
+        for name in ("point_cloud.ply", "panels", "checkpoints", "csv", "tensorboard"):
             path = cli.model.folder / name
             if path.exists():
                 print(f"wrote {path}")

@@ -13,11 +13,10 @@ from small import SMALL
 
 NUMBERS = ("0", "-1", "1e-30", "1e-9", "1e-3", "0.4999999", "1e3", "1e6", "1e9", "1e12", "1e30", "1e300", "nan", "inf")
 NUMBERS += ("-inf", "1000000000", "60000", "9223372036854775808", "9" * 400, "-0.0", "1e-320")
-CLASSES = (  # numbers of parts that are no options of their own
+CLASSES = (  # numbers of parts that are no options of their own; not the spacing, as a million Gaussians take 2 GB
     "camera.init_args.width", "camera.init_args.height", "camera.init_args.radius", "camera.init_args.fov_y",
-    "camera.init_args.elevation", "scene.generator.init_args.spacing", "shader.init_args.ambient",
+    "camera.init_args.elevation", "shader.init_args.ambient",
 )  # fmt: skip
-HEAVY = ("scene.generator.init_args.spacing",)  # asks for as many Gaussians as there is memory
 
 
 @functools.cache

@@ -87,6 +87,8 @@ def try_case(case: Case, commands: dict[str, Command], limit: float = TIME) -> V
         os.close(reading)
         memory = ended[2].ru_maxrss * 1024 - before
         kind = killed or _kind(ended[1], said)
+        if kind == "no sentence" and case.command == "spoilt" and not said.strip():
+            kind = "refused"  # its standard error is what was spoilt
         if kind == "hang" and "left in this frame" in said:
             kind = "slow, but told"
         if kind in GOOD and memory > allowed:

@@ -76,7 +76,9 @@ def test_the_quick_training(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
     start = make_cli(["validate", "--config", str(QUICK), *quiet]).trainer.callback_metrics
     assert main(["fit", "--config", str(QUICK), *quiet]) == 0
-    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in printed
+    assert "wrote outputs/train/quick_cpu/csv" in printed
     folder = tmp_path / "outputs/train/quick_cpu"
     with (folder / "csv/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
