@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,6 +68,9 @@ def read_header(path: str | os.PathLike[str]) -> PlyHeader:
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no regular file, has a broken header, or is too short for its rows.
+
+    Warns:
+        UserWarning: If it is longer than its rows.
     """
     path = check_regular(path, "the .ply file")
     with path.open("rb") as stream:
@@ -146,6 +150,13 @@ def _check_size(path: Path, header: PlyHeader) -> None:
         raise ValueError(
             f"{path} is truncated: its header announces {rows}, at least {needed:,} bytes, but {size:,} follow; copy "
             "or export the file again."
+        )
+    if header.order and size > needed and not any(element.lists for element in header.elements):
+        warnings.warn(
+            f"{path}: {size - needed:,} bytes follow that its header does not tell of, so its numbers may be shifted; "
+            "export the file again if they look odd.",
+            UserWarning,
+            stacklevel=4,
         )
 
 

@@ -287,5 +287,6 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
             "material fell apart numerically: use `solver.formulation: total`, or a coarser `solver.dx`.",
             file=sys.stderr,
         )
-    for file in pipeline.files:
+    beside = [folder / name for name in ("diagnostics.csv", "checkpoint.pt", "config.yaml")]
+    for file in [*pipeline.files, *(file for file in beside if file.exists())]:
         print(f"wrote {file}")

@@ -218,7 +218,7 @@ def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
         raise (stop.__context__ if isinstance(stop.__context__, KeyboardInterrupt) else KeyboardInterrupt()) from None
     run_folder.release()
     if cli.subcommand == "fit":
-        for name in ("point_cloud.ply", "panels", "checkpoints"):
+        for name in ("point_cloud.ply", "panels", "checkpoints", "csv", "tensorboard"):
             path = cli.model.folder / name
             if path.exists():
                 print(f"wrote {path}")

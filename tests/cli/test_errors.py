@@ -186,3 +186,17 @@ def test_options_of_argparse_with_dashes():
     parser.add_argument("--longest-side")
     with pytest.raises(ArgumentError, match=r"did you mean --longest-side\?"), guessing(parser):
         raise ArgumentError(None, "unrecognized arguments: --longest-sid 3")
+
+
+def test_the_page_tells_how_to_complete(tmp_path):
+    """The lines of the page, in bash, give the options of the command."""
+    page = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
+    line = next(line for line in page.splitlines() if line.startswith("complete "))
+    line = line.replace("python tools/sim.py", f"{sys.executable} {ROOT / 'tools/sim.py'}")
+    script = (
+        f'{line}\ncomplete -p sim.py\ncompgen -W "$(complete -p sim.py | sed "s/.*-W \'//; s/\' sim.py//")" -- --wind.'
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert "--wind.flow" in done.stdout.split()
+    assert "--wind.modulations" in done.stdout.split()

@@ -370,3 +370,12 @@ def test_only_the_element_of_the_gaussians_is_read(tmp_path):
     again = read_ply(tmp_path / "more.ply")
     assert torch.equal(again.means, cloud.means)
     assert torch.equal(again.opacities, cloud.opacities)
+
+
+def test_a_file_that_is_longer_than_its_header_says_is_warned_of(tmp_path):
+    """As where a line of the header was lost, and every number is another's."""
+    write_ply(tmp_path / "flag.ply", _cloud())
+    with (tmp_path / "flag.ply").open("ab") as file:
+        file.write(bytes(28))
+    with pytest.warns(UserWarning, match="28 bytes follow that its header does not tell of"):
+        assert len(read_ply(tmp_path / "flag.ply")) == 7

@@ -62,7 +62,7 @@ def test_a_run(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "96 of 96 Gaussians simulated on cpu" in out
     assert "1 scene unit = 1 m" in out
-    for name in ("video.mp4", "trajectory.npz", "summary.json", "frames"):
+    for name in ("video.mp4", "trajectory.npz", "summary.json", "frames", "diagnostics.csv", "checkpoint.pt"):
         assert f"wrote {tmp_path / 'run' / name}\n" in out
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["config"] == [str(FLAG)]

@@ -90,6 +90,7 @@ def test_the_quick_training(tmp_path, monkeypatch, capsys):
     assert main(["fit", "--config", str(QUICK), *quiet]) == 0
     printed = capsys.readouterr().out
     assert "wrote outputs/train/quick_cpu/point_cloud.ply" in printed
+    assert "wrote outputs/train/quick_cpu/csv" in printed
     command = re.search("^next: python tools/preview.py (.*)$", printed, re.MULTILINE)[1].split()
     assert command == ["outputs/train/quick_cpu/point_cloud.ply", "--capture", "outputs/captures/flag_64"]
     assert preview([*command, "--height", "96", "--device", "cpu", "--frames", "2"]) == 0
