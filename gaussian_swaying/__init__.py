@@ -12,8 +12,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from gaussian_swaying.aero.force import AeroForce, aero_force
-    from gaussian_swaying.aero.load import WindLoad
-    from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, UniformGust, WindField
+    from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
+    from gaussian_swaying.aero.wind_force import WindForce
     from gaussian_swaying.data.capture import Capture, View, read_capture
     from gaussian_swaying.data.capture_camera import CaptureCamera
     from gaussian_swaying.data.datamodule import CaptureDataModule
@@ -39,19 +39,18 @@ if TYPE_CHECKING:
         SequentialRelease,
         VelocityBox,
     )
-    from gaussian_swaying.mpm.materials import (
-        ConstitutiveLaw,
-        FixedCorotated,
-        Fluid,
-        Foam,
-        Metal,
-        NeoHookean,
-        Plasticine,
-        Sand,
-        Snow,
-        SpringNetwork,
-        StVKHencky,
-    )
+    from gaussian_swaying.mpm.forces import Force
+    from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+    from gaussian_swaying.mpm.laws.fluid import Fluid
+    from gaussian_swaying.mpm.laws.foam import Foam
+    from gaussian_swaying.mpm.laws.hencky import StVKHencky
+    from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+    from gaussian_swaying.mpm.laws.metal import Metal
+    from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+    from gaussian_swaying.mpm.laws.plasticine import Plasticine
+    from gaussian_swaying.mpm.laws.sand import Sand
+    from gaussian_swaying.mpm.laws.snow import Snow
+    from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
     from gaussian_swaying.mpm.solver import MPMSolver
     from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
     from gaussian_swaying.rendering.camera import Camera
@@ -75,8 +74,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "aero.force": ("AeroForce", "aero_force"),
-    "aero.load": ("WindLoad",),
-    "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "UniformGust", "WindField"),
+    "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "SpatialWind", "UniformGust", "WindField"),
+    "aero.wind_force": ("WindForce",),
     "data.capture": ("Capture", "View", "read_capture"),
     "data.capture_camera": ("CaptureCamera",),
     "data.datamodule": ("CaptureDataModule",),
@@ -102,19 +101,18 @@ _HOMES = {
         "SequentialRelease",
         "VelocityBox",
     ),
-    "mpm.materials": (
-        "ConstitutiveLaw",
-        "FixedCorotated",
-        "Fluid",
-        "Foam",
-        "Metal",
-        "NeoHookean",
-        "Plasticine",
-        "Sand",
-        "Snow",
-        "SpringNetwork",
-        "StVKHencky",
-    ),
+    "mpm.forces": ("Force",),
+    "mpm.laws.fixed_corotated": ("FixedCorotated",),
+    "mpm.laws.fluid": ("Fluid",),
+    "mpm.laws.foam": ("Foam",),
+    "mpm.laws.hencky": ("StVKHencky",),
+    "mpm.laws.law": ("ConstitutiveLaw",),
+    "mpm.laws.metal": ("Metal",),
+    "mpm.laws.neo_hookean": ("NeoHookean",),
+    "mpm.laws.plasticine": ("Plasticine",),
+    "mpm.laws.sand": ("Sand",),
+    "mpm.laws.snow": ("Snow",),
+    "mpm.laws.spring_network": ("SpringNetwork",),
     "mpm.solver": ("MPMSolver",),
     "mpm.state": ("GridSpec", "MPMState", "MaterialPoints"),
     "rendering.camera": ("Camera",),
@@ -158,6 +156,7 @@ __all__ = [
     "FlowKey",
     "Fluid",
     "Foam",
+    "Force",
     "FrechetVideoDistance",
     "GaussianCloud",
     "GaussianGust",
@@ -197,6 +196,7 @@ __all__ = [
     "SimulationPipeline",
     "SineSway",
     "Snow",
+    "SpatialWind",
     "Sphere",
     "SplatTrainer",
     "SpringNetwork",
@@ -209,7 +209,7 @@ __all__ = [
     "VelocityBox",
     "View",
     "WindField",
-    "WindLoad",
+    "WindForce",
     "aero_force",
     "chamfer_distance",
     "compare_run",

@@ -176,8 +176,8 @@ class Repeater:
             if "captur" not in str(error):  # it is no matter of recording
                 raise
             raise RuntimeError(
-                f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` of the boundary that makes "
-                "the host wait to False, or `transfer` to torch."
+                f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` of the boundary or force "
+                "that makes the host wait to False, or `transfer` to torch."
             ) from error
 
     def forget(self, key: Hashable | None = None) -> None:

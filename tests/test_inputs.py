@@ -69,7 +69,7 @@ def test_an_archive_that_swells_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"2,147,483,647 bytes, far more than its size"):
         check_archive(bad, "the run")
     bad.write_bytes(b"PK not quite")
-    with pytest.raises(ValueError, match="no .npz, or not whole"):
+    with pytest.raises(ValueError, match=r"no .npz, or not whole"):
         check_archive(bad, "the run")
 
 

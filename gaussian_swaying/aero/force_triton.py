@@ -1,4 +1,4 @@
-"""The force of the wind as a Triton function, for the fused substep; the definition is ``aero.force.aero_force``."""
+"""The force of the wind as a Triton function, for the fused substep; the definition is ``aero.wind_force``."""
 
 import triton
 import triton.language as tl
@@ -59,3 +59,30 @@ def aero_force(
         scale * (pressure * n[2] + shear * tz + lifting * side[2]),
     )
     return force, speed
+
+
+@triton.jit
+def wind_force(F, velocity, patch, wind, numbers, OPTIONS: tl.constexpr):
+    """The twin of ``WindForce``: force on patches (normal and area at rest) and their resistance [kg/s].
+
+    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: law projected, lift in
+    the plane of flow and normal, unit tangent.
+    """
+    normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], tl.load(numbers + 4))
+    relative = (
+        tl.load(wind) - velocity[0],
+        tl.load(wind + 1) - velocity[1],
+        tl.load(wind + 2) - velocity[2],
+    )
+    drag = tl.load(numbers)
+    friction = tl.load(numbers + 1)
+    lift = tl.load(numbers + 2)
+    half_density = tl.load(numbers + 3)
+    force, speed = aero_force(
+        relative, normal, area, drag, friction, lift, half_density, OPTIONS[0], OPTIONS[1], OPTIONS[2]
+    )
+    if OPTIONS[3]:
+        resistance = half_density * area * (drag + friction + tl.abs(lift)) * speed
+    else:
+        resistance = area * 0
+    return force, resistance

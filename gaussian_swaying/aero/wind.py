@@ -159,6 +159,26 @@ class FlowKey:
     flow: list[float]
 
 
+class SpatialWind(Recordable, nn.Module, ABC):
+    """Base of winds that depend on the place: a jet, a boundary layer, a gust that travels.
+
+    A wind of your own is a subclass with a ``forward``; where that can be recorded in a CUDA graph (see ``Force``) it
+    says ``recordable = True``.
+    """
+
+    @abstractmethod
+    def forward(self, time: Tensor, position: Tensor) -> Tensor:
+        """Air velocity at some places.
+
+        Args:
+            time: Time [s], scalar float64 tensor.
+            position: Places [m], z up, shape (..., P, 3).
+
+        Returns:
+            Velocity [m/s], broadcastable to (..., P, 3).
+        """
+
+
 class WindField(nn.Module):
     """Air velocity over time, the same everywhere in the scene.
 

@@ -54,7 +54,7 @@ def check_yaml(text: str) -> str:
         if isinstance(event, yaml.AliasEvent):
             if any(event.anchor == part.anchor for part in begun):
                 raise ValueError(f"A configuration must not hold itself: remove the alias *{event.anchor}.")
-            values += sizes.get(event.anchor, 1)
+            values += sizes.get(event.anchor or "", 1)
         elif isinstance(event, yaml.ScalarEvent):
             values += 1
             digits = event.value.lstrip("+-") if event.implicit[0] else ""

@@ -20,7 +20,7 @@ def group_points(points: Tensor, weight: Tensor, side: float, preferred: int | N
         preferred: In a cube that holds some of the first ``preferred`` points, one of these is chosen; all if None.
 
     Returns:
-        Indices of the chosen points, ascending, shape (M,); and for each point which of these stands for it, shape (N,).
+        Indices of the chosen points, ascending, shape (M,); and for each point which of these stands for it, (N,).
 
     Raises:
         ValueError: If a shape is not the one above or ``side`` is not positive.

@@ -121,8 +121,8 @@ def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> 
     for element in header.elements:
         if element.lists:
             raise ValueError(
-                f"{path}: property `{element.lists[0]}` is a list (element `{element.name}`); export it as one float per "
-                "Gaussian, without faces before them."
+                f"{path}: property `{element.lists[0]}` is a list (element `{element.name}`); export it as one float "
+                "per Gaussian, without faces before them."
             )
         if element.name == name:
             kinds = np.dtype([(field, f"{header.order}{kind}") for field, kind in element.fields])

@@ -17,16 +17,17 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._graphs import Repeater, fingerprint
-from gaussian_swaying.aero.load import RECORDED, WindLoad
 from gaussian_swaying.mpm import transfer_triton as kernels
 from gaussian_swaying.mpm.boundary import PinnedRegion
-from gaussian_swaying.mpm.materials_triton import PLASTIC_KINDS, energy_kind, law_row
+from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, TWIN_VALUES, Force, Twin, added, divide, split
+from gaussian_swaying.mpm.laws.triton.body import BodyLaws
+from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.solver import MPMSolver
 
-MAX_STEPS = RECORDED
+MAX_STEPS = MOST_STEPS
 """Substeps whose schedule the buffers hold; longer rollouts are run in parts."""
 
 RESORT = 32
@@ -48,7 +49,7 @@ def unsupported(solver: MPMSolver) -> str | None:
     if solver.deterministic and not solver.total_lagrangian:
         return "in the updated formulation its sums have no fixed order, as `deterministic` asks for"
     for law in points.laws:
-        if law_row(law) is None:
+        if twin_of(law) is None:
             return f"the law {type(law).__name__} has no fused form"
     return None
 
@@ -72,29 +73,29 @@ class FusedSolver(ABC):
         self.particles = points.count
         self.count = points.mass.numel()
         self.scenes = self.count // max(self.particles, 1)
-        rows = [law_row(law) for law in points.laws]
-        table = [[float(row[0]), *row[1]] for row in rows if row is not None]
-        self.law_table = torch.tensor(table, device=self.device)
-        self.kinds = 0
-        for row in table:
-            self.kinds |= int(row[0])
+        self.laws = BodyLaws(points.laws)
+        self.law_table = torch.tensor(self.laws.table, device=self.device)
         self.law = torch.zeros(self.count, dtype=torch.int32, device=self.device)
         if points.law_index is not None:
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.schedule = torch.zeros(MAX_STEPS + 2, kernels.SCHEDULE, device=self.device)
-        self.winds = torch.zeros(MAX_STEPS, self.scenes, 3, device=self.device)
-        self.coefficients = torch.zeros(5, device=self.device)
+        self.vectors = torch.zeros(MAX_STEPS, self.scenes, 3, device=self.device)
+        self.numbers = torch.zeros(TWIN_NUMBERS, device=self.device)
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
-        self.energy_kind = energy_kind(points.laws)
-        self.watches = self.energy_kind > 0
+        self.wave = shared(points.laws, "wave")
+        self.watches = self.wave is not None
         """Whether rollouts can look at the speed of waves."""
         self.speed = torch.zeros(1, device=self.device)
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in solver.gravity]
-        self._patch_of: list[tuple[Tensor, int | None]] = []
+        self._values_of: list[tuple[Tensor, int | None]] = []
+        self.asked: tuple[Force, ...] = ()
+        """The forces of the present rollout that are asked in torch, in every substep."""
+        self._resist: tuple[object, bool] = ((), False)
+        self._seen: dict[str, Tensor] = {}
         self.repeater = Repeater(self.device)
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
@@ -106,42 +107,60 @@ class FusedSolver(ABC):
         state: MPMState,
         dt: float,
         steps: int,
-        load: WindLoad | None = None,
+        forces: Sequence[Force] = (),
         force: Tensor | None = None,
         drag: Tensor | None = None,
         looks: Sequence[int] = (),
+        watch: Callable[[int], None] | None = None,
     ) -> tuple[MPMState, Tensor]:
-        """Advance by ``steps`` substeps of ``dt`` [s], in wind or with a force that stays (see ``MPMSolver.step``).
+        """Advance by ``steps`` substeps of ``dt`` [s], with some forces or one that stays (see ``MPMSolver.step``).
 
         Args:
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            load: The wind, or None.
-            force: Force [N], shape (..., P, 3), or None.
+            forces: Forces of which all but the first with a twin are recordable.
+            force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: After which substeps to look at the speed of waves, if ``watches``.
+            watch: Told how many substeps have been handed to the GPU, each time the buffers are full.
 
         Returns:
             The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
         """
         with _at_home(self.speed):
             self.speed.zero_()
+            fused, self.asked = divide(forces)
+            twin = None if fused is None else fused.twin()
+            if twin is not None:
+                self._take_twin(twin)
+            options: dict[str, Any] = {
+                "LAWS": self.laws,
+                "MULTI": len(self.law_table) > 1,
+                "VISCOUS": self.solver.stiffness_damping > 0,
+                "TWIN": None if twin is None else twin.function,
+                "OPTIONS": None if twin is None else twin.options,
+                "FORCE": len(self.asked) > 0 or force is not None or drag is not None,
+                "IMPLICIT": drag is not None or (twin is not None and twin.implicit) or self._resists(state),
+            }
+            if options["FORCE"]:
+                if len(self.force_in) < self.count:  # the first time that it is needed
+                    self.force_in = torch.zeros(self.count, 4, device=self.device)
+                self.force_in.zero_()
+                self._fill(force, drag)
             for first in range(0, steps, MAX_STEPS):
                 part = min(steps - first, MAX_STEPS)
                 marks = [look - first for look in looks if first < look <= first + part]
-                state = self._advance(state, dt, part, load, force, drag, marks)
+                before = state.work
+                state = self._advance(state, dt, part, twin, options, marks)
+                if force is None and not forces:  # a drag alone does no work that counts
+                    state = state.replace(work=before)
+                if watch is not None:
+                    watch(first + part)
             return state, self.speed[0] / self.solver.dx
 
     def _advance(
-        self,
-        state: MPMState,
-        dt: float,
-        steps: int,
-        load: WindLoad | None,
-        force: Tensor | None,
-        drag: Tensor | None,
-        looks: list[int],
+        self, state: MPMState, dt: float, steps: int, twin: Twin | None, options: dict[str, Any], looks: list[int]
     ) -> MPMState:
         """As many substeps as the buffers hold."""
         solver = self.solver
@@ -152,52 +171,69 @@ class FusedSolver(ABC):
         self.first_step.zero_()
         self.time.copy_(state.time)
         self.dt.fill_(dt)
-        loaded = load is not None or force is not None or drag is not None
-        options: dict[str, Any] = {
-            "KINDS": self.kinds,
-            "MULTI": len(self.law_table) > 1,
-            "VISCOUS": solver.stiffness_damping > 0,
-            "WIND": load is not None,
-            "FORCE": force is not None or drag is not None,
-            "IMPLICIT": drag is not None,
-            "PROJECTED": False,
-            "LIFT": False,
-            "UNIT": False,
-        }
-        if load is not None:
-            self._take_wind(load, load.winds(self.time, self.dt, steps))
-            options["IMPLICIT"] = load.aero.drag_step == "semi_implicit"
-            options["PROJECTED"] = load.aero.law == "projected"
-            options["LIFT"] = load.aero.lift_direction == "lift"
-            options["UNIT"] = load.aero.unit_tangent
-        elif loaded:
-            self.force_in = torch.zeros(self.count, 4, device=self.device)
-            if force is not None:
-                self.force_in[:, :3] = force.reshape(-1, 3)
-            if drag is not None:
-                self.force_in[:, 3] = drag.reshape(-1)
+        if twin is not None:
+            vectors = twin.vectors(self.time, self.dt, steps)
+            self.vectors[:steps].copy_(vectors.reshape(steps, -1, 3).expand(-1, self.scenes, -1))
+        loaded = twin is not None or options["FORCE"]
         if loaded:
             self.load.zero_()
         changes = self._run(state, steps, options, looks)
-        if load is not None or force is not None:
+        if loaded:
             changes["work"] = state.work + self._work().reshape(self.solver.points.mass.shape[:-1])
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _take_wind(self, load: WindLoad, winds: Tensor) -> None:
-        aero = load.aero
-        half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
-        self.coefficients.copy_(torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest]))
-        self.winds[: len(winds)].copy_(winds.reshape(len(winds), -1, 3).expand(-1, self.scenes, -1))
-        patches = [(t, None if t.is_inference() else t._version) for t in (load.normal, load.area)]
-        known = zip(self._patch_of, patches, strict=False)
-        if not self._patch_of or any(a is not b or v is None or v != w for (a, v), (b, w) in known):
-            self._patch_of = patches
-            shape = self.solver.points.mass.shape
-            self._take_patches(load.normal.expand(*shape, 3).reshape(-1, 3), load.area.expand(shape).reshape(-1))
+    def _take_twin(self, twin: Twin) -> None:
+        """Take the numbers of a twin, and its values of the particles where they are other ones."""
+        self.numbers[: len(twin.numbers)].copy_(twin.numbers)
+        sources = [(t, None if t.is_inference() else t._version) for t in twin.sources]
+        known = zip(self._values_of, sources, strict=False)
+        if not self._values_of or any(a is not b or v is None or v != w for (a, v), (b, w) in known):
+            self._values_of = sources
+            values = twin.values()
+            self._take_values(values.expand(*self.solver.points.mass.shape, values.shape[-1]).flatten(0, -2))
+
+    # ---- forces in torch
+
+    def _fill(self, force: Tensor | None, drag: Tensor | None) -> None:
+        """Put a force and its resistance into the buffer that the kernels read."""
+        points = self.solver.points
+        if force is not None:
+            self.force_in[:, :3].copy_(force.expand_as(points.position).reshape(-1, 3))
+        if drag is not None:
+            self.force_in[:, 3].copy_(drag.expand_as(points.mass).reshape(-1))
+
+    def _ask(self, state: MPMState) -> tuple[Tensor | None, Tensor | None]:
+        """The sum of the forces in torch and that of their resistances."""
+        return added([split(force(state), force, state) for force in self.asked])
+
+    def _asked_key(self) -> tuple[object, ...]:
+        """What recorded forces rest on; the forces themselves are in it, so that nothing else takes their place."""
+        return (self.asked, fingerprint(self.asked)) if self.asked else ()
+
+    def _resists(self, state: MPMState) -> bool:
+        """Whether a force in torch gives a resistance, from asking each once."""
+        key = self._asked_key()
+        if key != self._resist[0]:
+            self._resist = key, self._ask(state)[1] is not None
+        return self._resist[1]
+
+    def _push(self) -> None:
+        """Let the forces in torch look at the particles as they are in the buffers now, and fill theirs."""
+        self._fill(*self._ask(self._look_at()))
+
+    def _room(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """A buffer for a field of the particles, which stays where it is: graphs write to it and read from it."""
+        if name not in self._seen:
+            self._seen[name] = torch.zeros(shape, dtype=dtype, device=self.device)
+        return self._seen[name]
 
     @abstractmethod
-    def _take_patches(self, normal: Tensor, area: Tensor) -> None:
-        """Take the patches of a load, shapes (N, 3) and (N,)."""
+    def _look_at(self) -> MPMState:
+        """The state of the particles in the buffers."""
+
+    @abstractmethod
+    def _take_values(self, values: Tensor) -> None:
+        """Take the values of a twin, shape (N, n)."""
 
     @abstractmethod
     def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
@@ -220,7 +256,7 @@ class FusedSolver(ABC):
             self.first_step.add_(count)
 
         recordable = all(boundary.recordable for boundary in self.solver._acting)
-        self.repeater.run(steps, key, several, recordable)
+        self.repeater.run(steps, (key, self._asked_key()), several, recordable)
 
 
 class FusedTotal(FusedSolver):
@@ -245,7 +281,7 @@ class FusedTotal(FusedSolver):
         rows = [points.volume, solver.laws.mu, solver.laws.lam, points.mass]
         self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
         self.law = self.law[order].contiguous()
-        self.patch = torch.zeros(4, self.count, device=self.device)
+        self.values = torch.zeros(TWIN_VALUES, self.count, device=self.device)
         self.rest = points.position.contiguous()
         inverse = static["node_inverse_mass"].reshape(-1)
         active = (inverse > 0).nonzero()[:, 0]
@@ -286,10 +322,8 @@ class FusedTotal(FusedSolver):
         self.piece_node, self.piece_scene = self.cell_node[cell].contiguous(), self.cell_scene[cell].contiguous()
         self.first_piece = torch.cat([first, first.new_tensor([self.pieces])]).int()
 
-    def _take_patches(self, normal: Tensor, area: Tensor) -> None:
-        order = self.order.long()
-        self.patch[:3].copy_(normal.T[:, order])
-        self.patch[3].copy_(area[order])
+    def _take_values(self, values: Tensor) -> None:
+        self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
     def _sums(self, rows: int, width: int) -> Tensor:
         """Buffer of the sums of each cell or piece of one, with a row of zeros behind the last."""
@@ -304,12 +338,7 @@ class FusedTotal(FusedSolver):
         self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
         done = 0
         for mark in sorted({*looks, steps}):
-            if options["FORCE"]:  # its buffer is another one each time
-                for _ in range(mark - done):
-                    self._substep(0, options)
-                    self.first_step.add_(1)
-            else:
-                self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
+            self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
             done = mark
             if mark in looks:
                 self._look()
@@ -320,20 +349,22 @@ class FusedTotal(FusedSolver):
         block = 128
         kernels.total_look[(-(-self.count // block),)](
             self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
-            ny * nz, nz, 1 / self.grid.dx, KIND=self.energy_kind, BLOCK=block, num_warps=4,
+            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         solver = self.solver
+        if self.asked:
+            self._push()
         width = 8 if self.position else 4
         partial = self._sums(self.pieces, width)
         _, ny, nz = self.grid.resolution
         per_program = max(1, 32 // self.lanes)
         kernels.total_particles[(-(-self.pieces // per_program),)](
-            self.fraction, self.material, self.law, self.law_table, self.patch, self.force_in, self.load, self.order,
+            self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
             self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, partial,
-            self.schedule, self.winds, self.scenes, self.coefficients, self.first_step, offset,
+            self.schedule, self.vectors, self.scenes, self.numbers, self.first_step, offset,
             ny * nz, nz, 1 / self.grid.dx, solver.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
             **_REGISTERS.get(self.lanes, {}),
@@ -353,6 +384,8 @@ class FusedTotal(FusedSolver):
         )  # fmt: skip
         if not self.plain:
             self._constrain()
+        if not self.plain or self.asked:
+            self.time.add_(self.dt)
 
     def _constrain(self) -> None:
         """Boundary conditions that the kernels do not know, and the displacements after them."""
@@ -372,20 +405,13 @@ class FusedTotal(FusedSolver):
         )  # fmt: skip
         self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
         self.displacement.addcmul_(self.velocity, self.dt.float())
-        self.time.add_(self.dt)
 
     def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
         shape = state.position.shape
         position, velocity = (torch.empty(shape, device=self.device) for _ in range(2))
         affine, F = (torch.empty(*shape, 3, device=self.device) for _ in range(2))
-        _, ny, nz = self.grid.resolution
-        block = 128
-        kernels.total_read[(-(-self.count // block),)](
-            self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
-            self.fields, self.schedule[steps], position, velocity, affine, F,
-            ny * nz, nz, 1 / self.grid.dx,
-            WORK=options["WIND"] or options["FORCE"], IMPLICIT=options["IMPLICIT"], BLOCK=block, num_warps=4,
-        )  # fmt: skip
+        loaded = options["TWIN"] is not None or options["FORCE"]
+        self._read_into(position, velocity, affine, F, self.schedule[steps], loaded, options["IMPLICIT"])
         nodes = (*self.solver._static["node_inverse_mass"].shape, 3)
         return {
             "position": position,
@@ -396,6 +422,27 @@ class FusedTotal(FusedSolver):
             "node_displacement": self.displacement[:, :3].reshape(nodes).contiguous(),
             "node_velocity": self.velocity[:, :3].reshape(nodes).contiguous(),
         }
+
+    def _read_into(
+        self, position: Tensor, velocity: Tensor, affine: Tensor, F: Tensor, row: Tensor, work: bool, implicit: bool
+    ) -> None:
+        """Particle fields from the nodes, and the end of the work of the substep of a row of the schedule."""
+        _, ny, nz = self.grid.resolution
+        block = 128
+        kernels.total_read[(-(-self.count // block),)](
+            self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
+            self.fields, row, position, velocity, affine, F,
+            ny * nz, nz, 1 / self.grid.dx,
+            WORK=work, IMPLICIT=implicit, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+
+    def _look_at(self) -> MPMState:
+        shape = self.solver.points.position.shape
+        position, velocity = (self._room(name, *shape) for name in ("position", "velocity"))
+        affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
+        self._read_into(position, velocity, affine, F, self.schedule, False, False)
+        lost = self._room("lost", *shape[:-1], dtype=torch.bool)
+        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid)
 
     def _work(self) -> Tensor:
         # cells are sorted by scene
@@ -408,7 +455,8 @@ class FusedUpdated(FusedSolver):
     def __init__(self, solver: MPMSolver) -> None:
         super().__init__(solver)
         points = solver.points
-        self.plastic = bool(self.kinds & PLASTIC_KINDS.value)
+        self.plastic = len(self.laws.flows) > 0
+        self.internal = solver.laws.initial_internal() is not None
         _check_indices(44 * self.count)
         self.moving = torch.zeros(44 if self.plastic else 35, self.count, device=self.device)
         self.constants = torch.zeros(self.count, 9, device=self.device)
@@ -423,9 +471,8 @@ class FusedUpdated(FusedSolver):
         self.node_position: Tensor | None = None
         self.grid = GridSpec(solver.dx, (0, 0, 0), (0, 0, 0))
 
-    def _take_patches(self, normal: Tensor, area: Tensor) -> None:
-        self.constants[:, 5:8] = normal
-        self.constants[:, 8] = area
+    def _take_values(self, values: Tensor) -> None:
+        self.constants[:, 5 : 5 + values.shape[1]] = values
 
     def _take_grid(self, grid: GridSpec, width: int) -> None:
         """Make room for a grid, and forget the graphs of another one."""
@@ -453,6 +500,8 @@ class FusedUpdated(FusedSolver):
         for mark in marks:
             if load:
                 self._load(state.replace(**fields))
+                if self.asked:
+                    self._push()
                 self._particles(0, options, gather=False, scatter=True)
             sort = mark == steps or mark % RESORT == 0
             self._several(mark - done - (1 if sort else 0), options)
@@ -492,28 +541,28 @@ class FusedUpdated(FusedSolver):
 
     def _several(self, steps: int, options: dict[str, Any]) -> None:
         """Substeps from the start of one to the start of another."""
-        if options["FORCE"]:
-            for _ in range(steps):
-                self._substep(0, options)
-                self.first_step.add_(1)
-        else:
-            self._repeat(steps, (*options.values(), self.grid), lambda offset: self._substep(offset, options))
+        self._repeat(steps, (*options.values(), self.grid), lambda offset: self._substep(offset, options))
 
     def _look(self) -> None:
         block = 128
         kernels.updated_look[(-(-self.count // block),)](
-            self.moving, self.count, self.speed, KIND=self.energy_kind, BLOCK=block, num_warps=4
+            self.moving, self.count, self.speed, WAVE=self.wave, BLOCK=block, num_warps=4
         )
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         self._nodes(offset, options)
-        self._particles(offset + 1, options, gather=True, scatter=True)
+        if self.asked:  # the forces look at the end of a substep before the next one starts
+            self._particles(offset + 1, options, gather=True, scatter=False)
+            self._push()
+            self._particles(offset + 1, options, gather=False, scatter=True)
+        else:
+            self._particles(offset + 1, options, gather=True, scatter=True)
 
     def _particles(self, offset: int, options: dict[str, Any], gather: bool, scatter: bool) -> None:
         grid, solver = self.grid, self.solver
         kernels.updated_particles[(-(-self.count // 32),)](
             self.moving, self.order, self.load, self.count,
-            self.momentum, self.velocity, self.schedule, self.winds, self.scenes, self.coefficients, self.first_step,
+            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.numbers, self.first_step,
             offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx, 1 / grid.dx,
             solver.stiffness_damping, self.particles,
             **options, PLASTIC=self.plastic, MLS=solver.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
@@ -530,8 +579,15 @@ class FusedUpdated(FusedSolver):
             *self.gravity, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=len(acting) > 0,
             BLOCK=block, num_warps=4,
         )  # fmt: skip
-        if not acting:
-            return
+        if acting:
+            self._constrain()
+        if acting or self.asked:
+            self.time.add_(self.dt)
+
+    def _constrain(self) -> None:
+        """Boundary conditions on the velocities of the nodes."""
+        grid, solver = self.grid, self.solver
+        nodes = grid.node_count * self.scenes
         shape = (*solver.points.position.shape[:-2], grid.node_count)
         velocity = self.velocity[:nodes, :3].reshape(*shape, 3)
         position = self.node_position
@@ -539,7 +595,6 @@ class FusedUpdated(FusedSolver):
             position = position.expand_as(velocity)
         velocity = solver._constrain(velocity, self._share, position, position, self.time, self.dt)
         self.velocity[:nodes, :3].copy_(velocity.reshape(-1, 3))
-        self.time.add_(self.dt)
 
     def _share(self, k: int) -> Tensor:
         """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
@@ -561,6 +616,19 @@ class FusedUpdated(FusedSolver):
         F_total = torch.empty_like(F) if self.plastic else F
         lost = torch.empty(state.lost.shape, dtype=torch.bool, device=self.device)
         internal = None if state.internal is None else torch.empty(state.internal.shape, device=self.device)
+        return self._read_into(position, velocity, affine, F, F_total, lost, internal)
+
+    def _read_into(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        affine: Tensor,
+        F: Tensor,
+        F_total: Tensor,
+        lost: Tensor,
+        internal: Tensor | None,
+    ) -> dict[str, Any]:
+        """The rows of the particles as fields of the state."""
         block = 128
         kernels.updated_read[(-(-self.count // block),)](
             self.order, self.moving, self.count, position, velocity, affine, F, F_total, lost,
@@ -577,6 +645,16 @@ class FusedUpdated(FusedSolver):
             "internal": internal,
         }
 
+    def _look_at(self) -> MPMState:
+        shape = self.solver.points.position.shape
+        position, velocity = (self._room(name, *shape) for name in ("position", "velocity"))
+        affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
+        F_total = self._room("F_total", *shape, 3) if self.plastic else F
+        lost = self._room("lost", *shape[:-1], dtype=torch.bool)
+        internal = self._room("internal", *shape[:-1]) if self.internal else None
+        fields = self._read_into(position, velocity, affine, F, F_total, lost, internal)
+        return MPMState(**fields, time=self.time, grid=self.grid)
+
     def _work(self) -> Tensor:
         # whatever the order within a scene, the particles are sorted by scene
         return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
@@ -585,8 +663,8 @@ class FusedUpdated(FusedSolver):
 def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     """Cells per second as ``MPMSolver`` needs them for the Courant number, in one kernel; None for other laws."""
     points, laws, spatial = solver.points, solver.laws, not solver.total_lagrangian
-    kind = energy_kind(points.laws)
-    if not kind:
+    wave = shared(points.laws, "wave")
+    if wave is None:
         return None
     out = torch.zeros(1, device=points.position.device)
     count, block = points.mass.numel(), 128
@@ -594,21 +672,21 @@ def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     with torch.cuda.device_of(out):
         kernels.largest_speed[(-(-count // block),)](
             state.F_elastic.contiguous(), density.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(),
-            state.velocity.contiguous(), out, count, KIND=kind, SPATIAL=spatial, BLOCK=block, num_warps=4,
+            state.velocity.contiguous(), out, count, WAVE=wave, SPATIAL=spatial, BLOCK=block, num_warps=4,
         )  # fmt: skip
     return out[0] / solver.dx
 
 
 def elastic_energy(solver: MPMSolver, F: Tensor) -> Tensor | None:
     """Energy density [J/m³] in one kernel, shape (..., P); None for other laws."""
-    kind = energy_kind(solver.points.laws)
-    if not kind:
+    energy = shared(solver.points.laws, "energy")
+    if energy is None:
         return None
     out = torch.empty(F.shape[:-2], device=F.device)
     block = 128
     with torch.cuda.device_of(out):
         kernels.elastic_energy[(-(-out.numel() // block),)](
-            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), KIND=kind,
+            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), ENERGY=energy,
             BLOCK=block, num_warps=4,
         )  # fmt: skip
     return out

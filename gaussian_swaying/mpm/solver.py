@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
-from gaussian_swaying.aero.load import WindLoad
 from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Impulse, Nodes
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
 from gaussian_swaying.mpm.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.mpm.recompute import recompute
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
@@ -25,7 +25,7 @@ from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather,
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.fused import FusedSolver
 
-ForceFunction = Callable[[MPMState], Tensor | tuple[Tensor, Tensor | None]]
+WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
 
 
@@ -265,6 +265,12 @@ class MPMSolver(nn.Module):
                 self._fused = (FusedTotal if self.total_lagrangian else FusedUpdated)(self)
         return self._fused
 
+    def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> FusedSolver | None:
+        """As :meth:`fused`, for rollouts in some forces; None too if one of them has to be asked in every substep."""
+        if not all(force.recordable for force in divide(forces)[1]):
+            return None
+        return self.fused(*_tensors(state), *tensors_of(forces))
+
     def held_mass(self, k: int, time: Tensor | None) -> Tensor:
         """Mass of the particles that the ``k``-th boundary holds at a time [kg], zero elsewhere, shape (..., P)."""
         mass = self._static[f"pinned_mass_{k}"]
@@ -451,7 +457,14 @@ class MPMSolver(nn.Module):
             return state
         return state.replace(grid=roomy if roomy.node_count <= self.max_nodes else grid)
 
-    def step(self, state: MPMState, dt: float, force: Tensor | None = None, drag: Tensor | None = None) -> MPMState:
+    def step(
+        self,
+        state: MPMState,
+        dt: float,
+        forces: Forces | None = None,
+        force: Tensor | None = None,
+        drag: Tensor | None = None,
+    ) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.
 
         Where the substep changes, forces act for the mean of the old and the new one: the velocities stand half a
@@ -461,7 +474,8 @@ class MPMSolver(nn.Module):
         Args:
             state: The state now.
             dt: Substep [s].
-            force: External force on each particle [N], shape (..., P, 3).
+            forces: What pushes the particles, see :meth:`rollout`.
+            force: A force on each particle that is known already [N], shape (..., P, 3); it is added to ``forces``.
             drag: By how much that force falls per velocity gained in the substep [kg/s], shape (..., P); a drag that is
                 taken so is stable however light the particle (see ``AeroForce.resistance``).
 
@@ -472,6 +486,15 @@ class MPMSolver(nn.Module):
             check_shape("force", force, self.points.count, 3)
         if drag is not None:
             check_shape("drag", drag, self.points.count)
+        acting = as_forces(forces)
+        if acting and force is None and drag is None:
+            return self.rollout(state, dt, 1, acting)
+        found = [split(part(state), part, state) for part in acting]
+        force, drag = added([(force, drag), *found])
+        return self._step(state, dt, force, drag)
+
+    def _step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
+        """One substep with a force and a drag that are known."""
         fused = self.fused(*_tensors(state), force, drag)
         if fused is not None:
             return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
@@ -495,44 +518,46 @@ class MPMSolver(nn.Module):
         state: MPMState,
         dt: float,
         steps: int,
-        force_fn: ForceFunction | WindLoad | None = None,
+        forces: Forces | None = None,
         checkpoint: int = 0,
+        watch: WatchFunction | None = None,
     ) -> MPMState:
         """Advance by several substeps.
 
-        With the Triton kernels the substeps are replayed from CUDA graphs, without wind or in that of a ``WindLoad``;
-        another ``force_fn`` is called once a substep.
+        With the Triton kernels the substeps are replayed from CUDA graphs, and with them the forces: the first that
+        has a Triton twin within the kernels, the others in torch. If one of these is not ``recordable``, as functions
+        are not, the host goes from substep to substep and asks them all.
 
         Args:
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            force_fn: Gives the force of each substep [N], shape (..., P, 3), from its state, or the force and its drag
-                (see :meth:`step`).
+            forces: What pushes the particles, one or several that add up: each a ``Force``, such as ``WindForce``, or a
+                function of the state that gives the force [N], shape (..., P, 3), or the force and its resistance
+                [kg/s], shape (..., P) (``drag`` in :meth:`step`).
             checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
                 in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
-                ``force_fn`` must then give the same force each time it sees the same state.
+                The forces must then be the same each time they see the same state.
+            watch: Told now and then how many substeps are done, or under way on a GPU; not with ``checkpoint``.
 
         Returns:
             The state ``steps * dt`` later.
         """
-        load = force_fn if isinstance(force_fn, WindLoad) else None
-        if force_fn is None or load is not None:
-            fused = self.fused(*_tensors(state), *([] if load is None else load.tensors()))
-            if fused is not None:
-                return fused.rollout(state, dt, steps, load)[0]
-        winds = None if load is None else load.winds(state.time, dt, steps)
+        acting = as_forces(forces)
+        fused = self._fused_for(state, acting)
+        if fused is not None:
+            return fused.rollout(state, dt, steps, acting, watch=watch)[0]
+        sources = [force.during(state.time, dt, steps) for force in acting]
 
         def force_at(state: MPMState, k: int) -> tuple[Tensor | None, Tensor | None]:
-            if load is not None:
-                assert winds is not None
-                return load.force(state, winds[k])
-            found = None if force_fn is None else force_fn(state)
-            return found if isinstance(found, tuple) else (found, None)
+            pairs = zip(sources, acting, strict=True)
+            return added([split(source(state, k), force, state) for source, force in pairs])
 
         def advance(state: MPMState, first: int, count: int) -> MPMState:
             for k in range(first, first + count):
-                state = self.step(state, dt, *force_at(state, k))
+                state = self._step(state, dt, *force_at(state, k))
+                if watch is not None and checkpoint <= 0:
+                    watch(k + 1)
             return state
 
         if checkpoint <= 0 or not torch.is_grad_enabled():
@@ -551,8 +576,9 @@ class MPMSolver(nn.Module):
         state: MPMState,
         dt: float,
         steps: int,
-        force_fn: ForceFunction | WindLoad | None = None,
+        forces: Forces | None = None,
         looks: int = 8,
+        watch: WatchFunction | None = None,
     ) -> tuple[MPMState, Tensor]:
         """Advance by several substeps and look at the Courant number on the way, as material may stiffen and slacken.
 
@@ -560,22 +586,24 @@ class MPMSolver(nn.Module):
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            force_fn: As in :meth:`rollout`.
+            forces: As in :meth:`rollout`.
             looks: How often to look, evenly, the last time at the end.
+            watch: As in :meth:`rollout`.
 
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
         """
         marks = sorted({math.ceil((k + 1) * steps / looks) for k in range(looks)})
-        load = force_fn if isinstance(force_fn, WindLoad) else None
-        if (force_fn is None or load is not None) and self.stiffness_damping == 0:
-            fused = self.fused(*_tensors(state), *([] if load is None else load.tensors()))
+        acting = as_forces(forces)
+        if self.stiffness_damping == 0:
+            fused = self._fused_for(state, acting)
             if fused is not None and fused.watches:
-                state, cells = fused.rollout(state, dt, steps, load, looks=marks)
+                state, cells = fused.rollout(state, dt, steps, acting, looks=marks, watch=watch)
                 return state, dt * cells
         seen = []
         for first, last in pairwise([0, *marks]):
-            state = self.rollout(state, dt, last - first, force_fn)
+            part = None if watch is None else partial(_told, watch, first)
+            state = self.rollout(state, dt, last - first, acting, watch=part)
             seen.append(self.cfl_number(state, dt))
         return state, torch.stack(seen).amax()
 
@@ -766,6 +794,10 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
+
+
+def _told(watch: WatchFunction, before: int, done: int) -> None:
+    watch(before + done)
 
 
 def _conditions(modules: nn.ModuleList) -> list[Boundary]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
@@ -91,20 +92,18 @@ def check_sway(sway: float) -> None:
 
 
 def calibrate(
-    measure: Callable[[Setting], Motion], start: Setting, side: float, sway: float = SWAY, kind: str = "stands"
+    measure: Callable[[Setting], Motion], start: Setting, side: float, sway: float | None = SWAY
 ) -> Calibration:
     """Find the setting with which a scene moves by ``sway`` and nothing is stretched too far.
 
-    What stands gets another E first, then another thickness, then less wind. What hangs swings like a pendulum, so
-    weight decides: it gets another thickness, then less wind, and E only keeps it from being stretched. A sheet moves
-    as far as the wind takes it, and E alone is raised until it is not stretched.
+    E is changed first, then the thickness, which costs nothing, then the wind is weakened.
 
     Args:
         measure: Runs the scene with a setting.
         start: The first setting.
         side: Longest side of the object [m].
-        sway: Largest displacement wanted, as a share of the longest side.
-        kind: ``stands``, ``hangs`` or ``sheet``.
+        sway: Largest displacement wanted, as a share of the longest side. None for a sheet, which may go as far as the
+            wind takes it: E is raised until it is not stretched too far, and nothing else is changed.
 
     Returns:
         The best setting of those that were run.
@@ -112,66 +111,62 @@ def calibrate(
     Raises:
         ValueError: If ``sway`` is out of range.
     """
-    check_sway(sway)
+    if sway is not None:
+        check_sway(sway)
     setting = start
     tried: list[tuple[Setting, Motion]] = []
     while True:
         motion = measure(setting)
         tried.append((setting, motion))
-        firmer = 1.05 * motion.strain  # factor on E that brings the stretch to its limit
-        hold = 1.0 if kind == "sheet" else (motion.share / sway) ** (1 / _response(tried))
-        if kind == "stands":
-            hold, firmer = max(hold, firmer), 1.0
-        stiff = max(firmer, 1.0) if motion.strain > 1 else 1.0
-        done = motion.complete and motion.strain <= 1 and 1 / CLOSE <= hold <= CLOSE and stiff == 1
-        following = adjusted(setting, hold, stiff, start, side, kind)
-        if done or following == setting or len(tried) == MOST_RUNS:
+        hold, good = 1.05 * motion.strain, motion.complete and motion.strain <= 1  # brings the stretch to its limit
+        if sway is not None:
+            miss = motion.share / sway
+            good = good and miss <= CLOSE and max(miss, hold) >= 1 / CLOSE
+            hold = max(hold, miss ** (1 / _response(tried)))
+        following = adjusted(setting, hold, start, side, sway is None)
+        if good or following == setting or len(tried) == MOST_RUNS:
             break
         setting = following
-    best, motion = min(tried, key=lambda entry: _badness(entry[1], sway, kind))
-    return Calibration(best, motion, len(tried), describe(best, motion, sway, kind))
+    best, motion = min(tried, key=lambda entry: _badness(entry[1], sway))
+    return Calibration(best, motion, len(tried), describe(best, motion, sway))
 
 
-def adjusted(setting: Setting, hold: float, stiff: float, start: Setting, side: float, kind: str) -> Setting:
-    """A setting that holds ``hold`` times as much against the wind, and is ``stiff`` times as stiff besides.
+def adjusted(setting: Setting, hold: float, start: Setting, side: float, only_E: bool = False) -> Setting:
+    """A setting that holds ``hold`` times as much against the wind.
 
     Args:
         setting: The last one.
-        hold: Factor on E thickness / wind² of what stands, on thickness / wind² of what hangs.
-        stiff: Factor on E alone.
-        start: The first setting; the thickness stays at its value where E can do the work.
+        hold: Factor on E thickness / wind².
+        start: The first setting, whose thickness stays where E can do the work.
         side: Longest side of the object [m].
-        kind: As for :func:`calibrate`.
+        only_E: Change E alone.
 
     Returns:
         The new setting, its values within bounds and of two digits.
     """
     hold = min(max(hold, 0.03), 30.0)
-    stiffness = min(setting.E * stiff, max(STIFFEST, setting.E))
-    if kind == "sheet":
-        return replace(setting, E=_two_digits(stiffness))
-    wanted = hold * stiffness ** (kind == "stands") * setting.thickness / setting.wind**2
-    if kind == "stands":
-        stiffness = min(max(wanted / start.thickness, SOFTEST), STIFFEST)
-        wanted /= stiffness
-    thickness = min(max(wanted, THINNEST * side), THICKEST * side)
-    wind = min(1.0, math.sqrt(thickness / wanted))
+    if only_E:
+        return replace(setting, E=_two_digits(min(setting.E * hold, STIFFEST)))
+    wanted = hold * setting.E * setting.thickness / setting.wind**2
+    stiffness = min(max(wanted / start.thickness, SOFTEST), STIFFEST)
+    thickness = min(max(wanted / stiffness, THINNEST * side), THICKEST * side)
+    wind = min(1.0, math.sqrt(stiffness * thickness / wanted))
     return Setting(_two_digits(stiffness), _two_digits(thickness), _two_digits(wind))
 
 
-def describe(setting: Setting, motion: Motion, sway: float, kind: str) -> str:
+def describe(setting: Setting, motion: Motion, sway: float | None) -> str:
     """What a calibration came to, in words."""
     moved = f"{motion.share:.2g} of the longest side" if motion.complete else "much too far"
     words = [f"in {SECONDS:g} s of this wind 99 % of it moves by at most {moved}"]
     if setting.wind < 1:
         words.append(f"the wind was weakened to {setting.wind:g} of what was asked for, as stiffer costs too much")
-    if kind != "sheet" and motion.complete and motion.share < sway / CLOSE**2:
-        words.append("it hardly moves: more --wind moves it more" if motion.strain < 0.8 else "more would stretch it")
     if motion.strain > 1:
         words.append(
-            f"thin parts are stretched to between {motion.stretch_min:.2g} and {motion.stretch_max:.2g} of their "
-            "length: hold more of it, or give a smaller --sway or --wind"
+            f"parts are stretched to between {motion.stretch_min:.2g} and {motion.stretch_max:.2g} of their length: "
+            "hold more of it, or give a smaller --sway or --wind"
         )
+    elif sway is not None and motion.complete and motion.share < sway / CLOSE**2:
+        words.append("it hardly moves: more --wind moves it more" if motion.strain < 0.8 else "more would stretch it")
     return "; ".join(words)
 
 
@@ -188,9 +183,9 @@ def _response(tried: list[tuple[Setting, Motion]]) -> float:
     return min(max(-math.log(other_share / share) / math.log(other_hold / hold), 0.5), 1.5)
 
 
-def _badness(motion: Motion, sway: float, kind: str) -> float:
+def _badness(motion: Motion, sway: float | None) -> float:
     """Zero for a motion as wanted, more the further it is from that."""
-    miss = 0.0 if kind == "sheet" else abs(math.log(max(motion.share, 1e-9) / sway))
+    miss = 0.0 if sway is None else abs(math.log(max(motion.share, 1e-9) / sway))
     return miss + 3 * max(math.log(motion.strain), 0.0) + (0.0 if motion.complete else 100.0)
 
 
@@ -207,12 +202,17 @@ def apply_setting(pipeline: SimulationPipeline, setting: Setting, base: Setting)
         volume=points.volume * thicker,
         youngs_modulus=points.youngs_modulus * (setting.E / base.E),
     )
+    assert isinstance(wind, WindField)  # that of the configuration that the preview writes
     wind.flows = wind.flows * (setting.wind / base.wind)
 
 
 @torch.inference_mode()
 def measure_motion(
-    pipeline: SimulationPipeline, setting: Setting, base: Setting, sway: float = math.inf, seconds: float = SECONDS
+    pipeline: SimulationPipeline,
+    setting: Setting,
+    base: Setting,
+    sway: float | None = None,
+    seconds: float = SECONDS,
 ) -> Motion:
     """Run a scene from rest, without pictures, with another setting than its own; the scene stays as it is.
 
@@ -220,7 +220,7 @@ def measure_motion(
         pipeline: The run, whose material and wind are those of ``base``.
         setting: The setting to try.
         base: The setting of the pipeline.
-        sway: The run is stopped as soon as it moved :data:`STOP` times this share of the longest side.
+        sway: The run is stopped as soon as it moved :data:`STOP` times this share of the longest side; None for never.
         seconds: How much time to simulate.
 
     Returns:
@@ -230,7 +230,9 @@ def measure_motion(
     points, flows = scene.points, wind.flows
     apply_setting(pipeline, setting, base)
     side = scene.size * scene.frame.metres_per_unit
-    motion = Motion(0.0, 1.0, 1.0)
+    limit = math.inf if sway is None else STOP * sway
+    motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
+    torch.set_num_threads(1)  # a few hundred particles: more threads would only wait for each other
     try:
         state = pipeline.start()
         for _ in range(max(1, round(seconds / pipeline.frame_dt))):
@@ -243,11 +245,12 @@ def measure_motion(
                 min(motion.stretch_min, _quantile(stretch.amin(-1), STRETCHED)),
                 max(motion.stretch_max, _quantile(stretch.amax(-1), 1 - STRETCHED)),
             )
-            if motion.share > STOP * sway:
+            if motion.share > limit:
                 return replace(motion, complete=False)
     except SimulationDiverged:
-        return Motion(max(motion.share, STOP * min(sway, 1.0)), 0.0, 10.0, complete=False)
+        return Motion(max(motion.share, min(limit, 1.0)), 0.0, 10.0, complete=False)
     finally:
+        torch.set_num_threads(threads)
         scene.points, wind.flows = points, flows
     return motion
 

@@ -269,7 +269,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     pipeline, recorder = build_pipeline(parser, settings)
     folder = output_folder(settings)
     scene = pipeline.scene
-    print(f"{len(scene.simulated):,} of {len(scene.model.means):,} Gaussians simulated on {pipeline.device}")
+    by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
+    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {pipeline.device}")
     if scene.filled:
         print(f"{scene.filled:,} points fill the inside")
     print(scene.frame.describe())

@@ -8,20 +8,6 @@ from collections.abc import Sequence
 
 from gaussian_swaying.simulation.preview import Suggestion
 
-_SWITCHES = {
-    "capture": "--capture",
-    "output": "--output",
-    "up": "--up",
-    "hold": "--hold",
-    "region": "--region",
-    "longest_side": "--longest-side",
-    "sway": "--sway",
-    "wind": "--wind",
-    "frames": "--frames",
-    "height": "--height",
-    "device": "--device",
-}
-
 
 def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, **changes: str | list[str]) -> str:
     """The command line of ``tools/preview.py`` that gives these options, and some in place of theirs.
@@ -32,12 +18,15 @@ def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, *
         changes: Options to give instead, by their names in ``options``.
     """
     words = ["python", "tools/preview.py", str(options.scene)]
-    for name, switch in _SWITCHES.items():
-        value = changes.get(name, getattr(options, name, None))
-        if value is None or value == getattr(defaults, name, None):
+    for name, default in vars(defaults).items():
+        value = changes.get(name, getattr(options, name, default))
+        if name == "scene" or value is None or value == default:
+            continue
+        words.append("--" + name.replace("_", "-"))
+        if value is True:
             continue
         listed = isinstance(value, Sequence) and not isinstance(value, str)
-        words += [switch, *(f"{v:g}" if isinstance(v, float) else str(v) for v in (value if listed else [value]))]
+        words += [f"{v:g}" if isinstance(v, float) else str(v) for v in (value if listed else [value])]
     return shlex.join(words)
 
 

@@ -11,7 +11,16 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.gaussians.selection import Box, Cylinder, Region
-from gaussian_swaying.simulation.shape import DIRECTIONS, plane_axes, quantile, rounded, sheet_normal, snapped, width
+from gaussian_swaying.simulation.shape import (
+    DIRECTIONS,
+    FEWEST,
+    plane_axes,
+    quantile,
+    rounded,
+    sheet_normal,
+    snapped,
+    width,
+)
 
 PIN_DEPTH = 0.06  # depth of the pinned end, as a share of the object's length towards it
 ENDS = {"bottom": "lower", "top": "upper"}
@@ -119,12 +128,11 @@ def guess_hold(
     return HoldGuess(end, directions[end], confidence, why, scores, tuple(_option(e, sideways) for e in (end, second)))
 
 
-def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
-    """What an object would stand on, in words: a wide base in balance, or a stalk.
+def balanced_base(points: Tensor, weight: Tensor, up: Tensor) -> tuple[float, float] | None:
+    """Widths of the base on which an object would stand in balance, and of the object [scene units]; None without one.
 
-    The base is what lies within 3 % of the length from the lower end. It is wide if it is at least 0.4 times as wide as
-    the object, and in balance if the centre of the visible area lies above it. A stalk is a lower end that is at most
-    two thirds as wide as the upper one.
+    The base is what lies within 3 % of the length from the lower end. It has to be at least 0.4 times as wide as the
+    object, with the centre of the visible area above it.
 
     Args:
         points: Centres, float64, shape (N, 3).
@@ -134,8 +142,26 @@ def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
     height = points @ up
     low, high = quantile(height, 0.002), quantile(height, 0.995)
     foot, wide = points[height <= low + 0.03 * (high - low)], width(points, up)
-    if len(foot) and width(foot, up) >= 0.4 * wide and _above(points, weight, foot, up, 0.0):
-        return f"it would stand in balance on a base {width(foot, up):.3g} wide, itself {wide:.3g}"
+    if len(foot) >= FEWEST and width(foot, up) >= 0.4 * wide and _above(points, weight, foot, up, 0.0):
+        return width(foot, up), wide
+    return None
+
+
+def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
+    """What an object would stand on, in words: a wide base (:func:`balanced_base`), or a stalk.
+
+    A stalk is a lower end that is at most two thirds as wide as the upper one.
+
+    Args:
+        points: Centres, float64, shape (N, 3).
+        weight: Visible area, shape (N,).
+        up: Up direction, float64, shape (3,).
+    """
+    base = balanced_base(points, weight, up)
+    if base is not None:
+        return f"it would stand in balance on a base {base[0]:.3g} wide, itself {base[1]:.3g}"
+    height = points @ up
+    low, high = quantile(height, 0.002), quantile(height, 0.995)
     depth = 0.08 * (high - low)
     top, bottom = (width(points[mask], up) for mask in (height >= high - depth, height <= low + depth))
     if top > 1.5 * bottom:
@@ -161,7 +187,10 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
         return None
     which = ((high - height) / length * slices).long().clamp(max=slices - 1)
     parts = [points[which == k] for k in range(slices)]
-    wide = [width(part, up) if len(part) else 0.0 for part in parts]
+    across = plane_axes(up)  # of a plate one of the two widths is next to nothing
+    wide = [
+        max(quantile(part @ a, 0.97) - quantile(part @ a, 0.03) for a in across) if len(part) else 0.0 for part in parts
+    ]
     limit = min(0.04 * length, 0.25 * max(wide))
     thin = [bool(len(part)) and value < limit for part, value in zip(parts, wide, strict=True)]
     start = next((k for k in range(4) if thin[k]), None)

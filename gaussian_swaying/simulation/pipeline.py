@@ -13,15 +13,15 @@ from typing import Any, NoReturn
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 import gaussian_swaying
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.load import WindLoad
-from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
+from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering import passes
@@ -40,6 +40,8 @@ from gaussian_swaying.simulation.diagnostics import (
     measure,
 )
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
+from gaussian_swaying.simulation.health import advice, extremes
+from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.recorder import Recorder, check_camera_name, frame_folder
 from gaussian_swaying.simulation.scene import SimulatedScene
 from gaussian_swaying.simulation.seal import sha256
@@ -50,6 +52,8 @@ CFL_SAMPLES = 8  # how often a frame is looked at, as material may stiffen and s
 MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
 MAX_WIND = 1e6  # m/s; any more is a mistake, and would overflow positions
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
+MAX_SUBSTEPS = 1_000_000  # in a frame: hours of a processor, and minutes of the fastest GPU
+MAX_LOOKS = 2_000  # how many frames' cameras are looked at before a run
 
 
 class SimulationPipeline(nn.Module):
@@ -58,7 +62,7 @@ class SimulationPipeline(nn.Module):
     Args:
         scene: Gaussians, material points and patches.
         solver: Moves the material; its boundaries are given in scene units.
-        wind: Air velocity over time.
+        wind: Air velocity over time, the same everywhere or not.
         aero: Force of the wind on patches.
         shader: Colours from normals and light; None leaves the colours of the splat.
         camera: Where each frame is seen from.
@@ -74,7 +78,7 @@ class SimulationPipeline(nn.Module):
         self,
         scene: SimulatedScene,
         solver: MPMSolver,
-        wind: WindField,
+        wind: WindField | SpatialWind,
         aero: AeroForce,
         shader: Shader | None,
         camera: CameraPath,
@@ -87,6 +91,8 @@ class SimulationPipeline(nn.Module):
     ) -> None:
         super().__init__()
         check_positive("frame_dt", frame_dt)
+        if not all(0 <= value <= 1 for value in background):
+            raise ValueError(f"Expected `background` within [0, 1], but got {list(background)}: 1 is white, not 255.")
         self.scene, self.solver, self.wind, self.aero, self.shader = scene, solver, wind, aero, shader
         self.camera, self.cameras, self.frame_dt = camera, dict(cameras or {}), float(frame_dt)
         for name in self.cameras:
@@ -96,14 +102,15 @@ class SimulationPipeline(nn.Module):
         self.to(device)
         self.editor = SceneEditor(scene, edits)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
-        self._most_substeps = sys.maxsize
+        self._most_substeps = MAX_SUBSTEPS
+        self._progress: RunProgress | None = None
         self.files: list[Path] = []  # what the last run wrote
         self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
+        self._wind_force: list[WindForce] = []  # in a list, as it is no part of the module's state
+        self._wind_parts: tuple[object, ...] = ()
         self.idle = self.aero.idle  # asked once, as it makes the host wait
         self._force_end = self.force_scale()  # likewise
         self._tearing: TearingGauge | None = None
-        self._load: WindLoad | None = None
-        self._load_parts: tuple[object, ...] = ()
 
     @property
     def device(self) -> torch.device:
@@ -133,7 +140,16 @@ class SimulationPipeline(nn.Module):
         self.idle, self._force_end = self.aero.idle, self.force_scale()
         check_spacing(self.solver)
         self.solver.fused()  # what its kernels refuse is refused here
-        self._most_substeps = MAX_GROWTH * self.solver.substeps(state, self.frame_dt)
+        at_rest = self.solver.substeps(state, self.frame_dt)
+        if at_rest > MAX_SUBSTEPS:
+            remedy = "soften it (`material.E`, `material.nu`), raise its density or `solver.dx`, or shorten `frame_dt`"
+            if self.solver.substep is not None:
+                remedy = "raise `solver.substep`, set it to null for the longest that is stable, or shorten `frame_dt`"
+            raise ValueError(
+                f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
+                f"than the {MAX_SUBSTEPS:,} that are of use: {remedy}."
+            )
+        self._most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
 
@@ -170,7 +186,9 @@ class SimulationPipeline(nn.Module):
             start = torch.where(changed, start, state.internal)
         state = state.replace(internal=start)
         self.solver.fused()
-        self._most_substeps = max(self._most_substeps, MAX_GROWTH * self.solver.substeps(state, self.frame_dt))
+        self._most_substeps = max(
+            self._most_substeps, min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
+        )
         if self._tearing is not None:
             elastic = self.solver.laws.elastic_particles()
             if elastic is not None:  # what has flowed apart before is no tear
@@ -184,12 +202,17 @@ class SimulationPipeline(nn.Module):
         return state if resumed else edited
 
     @property
-    def load(self) -> WindLoad:
+    def wind_force(self) -> WindForce:
         """The wind on the patches of the scene."""
         parts = (self.aero, self.wind, self.scene.patch_normal, self.scene.patch_area)
-        if self._load is None or any(a is not b for a, b in zip(parts, self._load_parts, strict=True)):
-            self._load, self._load_parts = WindLoad(*parts), parts
-        return self._load
+        if not self._wind_force or any(a is not b for a, b in zip(parts, self._wind_parts, strict=True)):
+            self._wind_force, self._wind_parts = [WindForce(*parts)], parts
+        return self._wind_force[0]
+
+    @property
+    def forces(self) -> list[Force]:
+        """What pushes the particles besides gravity: the wind, unless it has no effect."""
+        return [] if self.idle else [self.wind_force]
 
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
         """Advance by one frame.
@@ -211,7 +234,7 @@ class SimulationPipeline(nn.Module):
             steps = self._substeps(state)
             for retry in range(MAX_RETRIES + 1):
                 if steps > self._most_substeps:
-                    cause = f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest"
+                    cause = f"a frame would take {steps:,} substeps, and {self._most_substeps:,} are the most"
                     self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
                 end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 work = (end.work - state.work).sum()
@@ -250,14 +273,15 @@ class SimulationPipeline(nn.Module):
 
     def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
         """The state some substeps later, and the largest Courant number on the way."""
-        load = None if self.idle else self.load
-        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, load, CFL_SAMPLES)
+        progress = self._progress
+        watch = None if progress is None else lambda done: progress.substep(done, steps)
+        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch)
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
         if self.idle:
             return 1
-        winds = self.load.winds(state.time, self.frame_dt / 4, 5)
+        winds = self.wind_force.samples(state, self.frame_dt / 4, 5)
         wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
         fastest = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
@@ -339,15 +363,22 @@ class SimulationPipeline(nn.Module):
         if self.idle:
             return torch.zeros_like(area)
         normal, _ = deform_patch(state.F_total, self.scene.patch_normal, area)
-        wind = self.load.winds(state.time, 0.0, 1)[0]
+        wind = self.wind_force.air(state.time, state.position)
         force = self.aero(wind, state.velocity, normal, torch.ones_like(area))
         return torch.where(area > 0, torch.linalg.vector_norm(force, dim=-1), 0.0)
 
     def force_scale(self) -> float:
         """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
-        speed = float(torch.linalg.vector_norm(self.wind.flows, dim=-1).amax())
+        speed = float(torch.linalg.vector_norm(self.flows(), dim=-1).amax())
         coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).abs().sum())
         return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
+
+    def flows(self) -> Tensor:
+        """Flows of the wind without gusts [m/s], shape (K, 3); of one that depends on the place, at the particles."""
+        if isinstance(self.wind, WindField):
+            return self.wind.flows
+        position = self.scene.points.position
+        return self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
 
     def draw_normals(self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera") -> Tensor:
         """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3).
@@ -426,8 +457,8 @@ class SimulationPipeline(nn.Module):
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         check_positive("frames", frames)
-        for frame in range(frames):
-            self.check_camera(frame)
+        for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
+            self.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
         state = self.start()  # what is refused is refused before anything is written
         splat = self._splat()
 
@@ -490,12 +521,13 @@ class SimulationPipeline(nn.Module):
             first, log = checkpoint["frame"] + 1, checkpoint["log"]
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
-        bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
+        bar = self._progress = RunProgress(frames, first, progress)
         try:
             if self.device.type == "cuda" and first < frames:
                 with walls("startup"):
                     self._warm_up(recorder, state, first)
             for frame in range(first, frames):
+                bar.begin(frame)
                 with walls("simulation"):
                     if frame > 0:
                         state, health = self.advance(state)
@@ -517,8 +549,7 @@ class SimulationPipeline(nn.Module):
                             }
                         )
                 done = frame + 1
-                bar.update()
-                bar.set_postfix(substeps=health.substeps, moved=f"{health.displacement_mean:.3f} m")
+                bar.end(health.substeps, health.displacement_mean)
             with walls("writing"):
                 recorder.wait()
         except SimulationDiverged as error:
@@ -533,6 +564,10 @@ class SimulationPipeline(nn.Module):
         finally:
             with suppress(OSError):  # a terminal that has gone
                 bar.close()
+                if progress:
+                    for sentence in self.health(log[:done])[1]:
+                        print(f"warning: {sentence}", file=sys.stderr)
+            self._progress = None
             summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log[:done], frames, walls, peak) | (settings or {})
             if recorder.images and "force" in recorder.renders:
@@ -549,6 +584,19 @@ class SimulationPipeline(nn.Module):
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
+
+    def health(self, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+        """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
+
+        Args:
+            log: Diagnostics of its frames.
+        """
+        scene, points = self.scene, self.scene.points
+        where = scene.frame.point_to_scene(points.position.double().cpu())
+        elastic = self.solver.laws.elastic_particles()
+        size = scene.size * scene.frame.metres_per_unit
+        found = extremes(log, where, size, None if elastic is None else elastic.cpu())
+        return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
 
     def _warm_up(self, recorder: Recorder, state: MPMState, frame: int) -> None:
         """Load and compile the kernels of a frame, of which nothing is kept."""
@@ -608,6 +656,7 @@ class SimulationPipeline(nn.Module):
         self, state: MPMState, log: list[dict[str, float]], frames: int, walls: _Walls, peak: _PeakMemory
     ) -> dict[str, Any]:
         moved = [entry["displacement_mean"] for entry in log]
+        found, sentences = self.health(log)
         energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
         return {
             "device": describe_device(self.device),
@@ -615,7 +664,7 @@ class SimulationPipeline(nn.Module):
             "seed": self.wind.seed,
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
-            "simulated_gaussians": len(self.scene.simulated),
+            "simulated_gaussians": len(self.scene.chosen),
             "surface_particles": self.scene.on_surface,
             "filled_particles": self.scene.filled,
             "mass_kg": float(self.solver.points.mass.sum()),
@@ -647,6 +696,8 @@ class SimulationPipeline(nn.Module):
             "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),
+            "extremes": found,
+            "warnings": sentences,
             "per_frame": log,
         }
 

@@ -21,9 +21,10 @@ from gaussian_swaying.gaussians.selection import Box, Not, Region, Union
 from gaussian_swaying.gaussians.subdivision import subdivide
 from gaussian_swaying.gaussians.surface import smallest_axis_normal
 from gaussian_swaying.simulation.frame import SimFrame
+from gaussian_swaying.simulation.framing import orbit_frame, whole_box
 from gaussian_swaying.simulation.hold import HoldGuess, end_region, given_hold, guess_hold
 from gaussian_swaying.simulation.preview_capture import CapturedFrom, ShownObject, photo_azimuth, shown_object
-from gaussian_swaying.simulation.shape import FEWEST, bounds, quantile, rounded, sheet_normal
+from gaussian_swaying.simulation.shape import FEWEST, bounds, connected_parts, quantile, rounded, sheet_normal
 from gaussian_swaying.simulation.up import UpGuess, given_up, guess_up
 
 CELLS = 24  # along the longest side: enough to bend, few enough for a laptop
@@ -122,6 +123,9 @@ class Suggestion:
             better one.
         thickness: Thickness of the surface [m], likewise.
         stiffness_reason: Why, in words.
+        whole: Corners of the box of the object with what does not move of it [scene units].
+        camera_offset: From the centre of what moves to that of the whole, in multiples of its longest side.
+        camera_radius: Distance of a camera that shows the whole, likewise.
     """
 
     up: UpGuess
@@ -140,6 +144,9 @@ class Suggestion:
     youngs_modulus: float
     thickness: float
     stiffness_reason: str
+    whole: tuple[list[float], list[float]]
+    camera_offset: tuple[float, ...]
+    camera_radius: float
 
 
 def suggest(
@@ -222,6 +229,9 @@ def suggest(
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
     elif flat is not None:  # a curtain is moved by wind onto it
         flow = _across_picture(azimuth - 90, speed)
+    outside = upward.ground if shown is None else upward.ground | ~shown.mask
+    whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
+    offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
     return Suggestion(
         up=upward,
         region=chosen,
@@ -239,6 +249,9 @@ def suggest(
         youngs_modulus=SHELL_E if flat is None else CLOTH_E,
         thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
         stiffness_reason="rubber, not tried" if flat is None else "the cloth of the paper's flags, not tried",
+        whole=whole,
+        camera_offset=offset,
+        camera_radius=radius,
     )
 
 
@@ -258,45 +271,6 @@ def suggest_threshold(opacity: Tensor, weight: Tensor) -> float:
         if float(weight[opacity >= threshold].sum()) >= KEPT_AREA * total:
             return threshold
     return 0.0
-
-
-def connected_parts(points: Tensor, cell: float) -> Tensor:
-    """Number of the connected part that each point is in; points in the same or in touching cells are connected.
-
-    Args:
-        points: Shape (N, 3).
-        cell: Size of a cell.
-
-    Returns:
-        Numbers from 0 on, shape (N,).
-
-    Raises:
-        ValueError: If ``cell`` is not positive.
-    """
-    check_shape("points", points, None, 3)
-    check_positive("cell", cell)
-    low = points.amin(0).double()
-    index = ((points.double() - low) / cell).floor().long().clamp(max=2**20 - 4) + 1
-    key, of_point = ((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]).unique(return_inverse=True)
-    pairs = []
-    for x, y, z in torch.cartesian_prod(*(torch.arange(-1, 2),) * 3).tolist():
-        wanted = key + (x << 42) + (y << 21) + z
-        if (x, y, z) > (0, 0, 0):  # the other half of the neighbours finds the same pairs
-            at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
-            found = (key[at] == wanted).nonzero()[:, 0]
-            pairs.append(torch.stack([found, at[found]]))
-    one, other = torch.cat(pairs, 1)
-    label = torch.arange(len(key))
-    while True:  # the smaller number spreads, by halving of paths
-        smaller = torch.minimum(label[one], label[other])
-        new = label.clone()
-        for end in (one, other, label[one], label[other]):
-            new.scatter_reduce_(0, end, smaller, "amin")
-        new = new[new]
-        if new.equal(label):
-            break
-        label = new
-    return label.unique(return_inverse=True)[1][of_point]
 
 
 def suggest_region(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
-import time
 from argparse import ArgumentError
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -29,14 +27,15 @@ from gaussian_swaying.simulation.calibration import (
     measure_motion,
 )
 from gaussian_swaying.simulation.config import build_parser, build_pipeline
-from gaussian_swaying.simulation.cost import Cost, estimate_cost
+from gaussian_swaying.simulation.cost import Cost, Stopwatch, estimate_cost
 from gaussian_swaying.simulation.doubts import doubts
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
 from gaussian_swaying.simulation.preview_capture import captured_from
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
-from gaussian_swaying.simulation.starter import draft_yaml, kind, region_dict, starter_yaml
+from gaussian_swaying.simulation.starter import draft_yaml, region_dict, starter_yaml
 
 
 @dataclass(frozen=True)
@@ -111,9 +110,9 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
     found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture)
-    begin = time.perf_counter()
+    begin = Stopwatch()
     draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
-    startup = time.perf_counter() - begin
+    startup = begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
     found = _calibrated(found, draft, options.sway)
@@ -144,19 +143,18 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         ("draft", "a first look", output / f"{stem}_draft"),
         ("starter", "the starter", output / stem),
     ):
-        pictures = f"{_seconds_of(texts[name])}, {_duration(costs[name].total_seconds)} here"
+        pictures = f"{_seconds_of(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  python tools/sim.py --config {folder / name}.yaml --output {where}")
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), texts)
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), texts)
 
 
 def _calibrated(found: Suggestion, draft: SimulationPipeline, sway: float) -> Suggestion:
     """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
-    how = kind(found)
-    if how is None or not any(found.flow):
+    if found.pin is None or not any(found.flow):
         return found
-    start = Setting(found.youngs_modulus, found.thickness)
-    best = calibrate(lambda tried: measure_motion(draft, tried, start, sway), start, found.longest_side, sway, how)
+    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
+    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
     apply_setting(draft, best.setting, start)
     return replace(
         found,
@@ -182,8 +180,10 @@ def preview_config(options: argparse.Namespace) -> Preview:
     arguments = [*(item for file in options.config for item in ("--config", file)), "--device", options.device]
     if options.scene is not None:
         arguments += ["--scene.ply", options.scene]
+    begin = Stopwatch()
     pipeline, settings = _pipeline(arguments)
-    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images)
+    startup = begin.quiet
+    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images, startup_seconds=startup)
     cloud = pipeline.scene.model.to_cloud().to("cpu")
     data: dict[str, Any] = {
         "config": options.config,
@@ -310,6 +310,7 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "mass_kg": float(scene.points.mass.sum()),
         "area_m2": float(scene.patch_area.sum()),
         "filled": scene.filled,
+        "points": scene.points.count,
         "further": scene.on_surface - len(scene.simulated),
         "dx_m": pipeline.solver.dx,
         "formulation": pipeline.solver.formulation,
@@ -384,7 +385,7 @@ def _cost_lines(cost: Cost) -> list[str]:
     frame = cost.substeps * cost.substep_seconds
     picture = ""
     if cost.picture_seconds is not None:
-        picture = f" + {_duration(cost.picture_seconds)} for its pictures"
+        picture = f" + {duration(cost.picture_seconds)} for its pictures"
     return [
         "",
         f"cost on this machine ({cost.device})",
@@ -392,8 +393,8 @@ def _cost_lines(cost: Cost) -> list[str]:
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {_duration(cost.total_seconds)}",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
+        f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
 
 
@@ -427,16 +428,6 @@ def _short(region: dict[str, Any]) -> str:
     return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)
 
 
-def _duration(seconds: float) -> str:
-    """A duration that people read: 12 ms, 3.4 s, 5 min, 2.1 h."""
-    if not math.isfinite(seconds):
-        return "unknown"
-    for unit, size, limit in (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0)):
-        if seconds < limit:
-            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 3600:.2g} h"
-
-
 # ---- the command
 
 
@@ -465,7 +456,7 @@ def _preview(options: argparse.Namespace) -> None:
     if options.scene is None and options.config is None:
         raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
     if options.capture is not None and options.config is not None:
-        raise ValueError("`--capture` is for guesses, and a configuration is shown as it is: leave out one of them.")
+        raise ValueError("`--capture` is for guesses, but `--config` is shown as it is: leave out one of them.")
     if options.frames < 1:
         raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
     if not 64 <= options.height <= 4320:

@@ -23,8 +23,10 @@ from gaussian_swaying.gaussians.surface import (
     deform_all,
     limit_deformed,
 )
-from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
 
 
@@ -60,8 +62,8 @@ class Material:
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it).
-        law: Constitutive law, for example ``Sand``; fixed corotated elasticity if null. All but ``FixedCorotated``,
-            ``NeoHookean``, ``SpringNetwork`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
+        law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
+            elasticity if null. Those that flow need ``solver.formulation: updated``.
         regions: Parts made of something else; later entries win.
     """
 
@@ -186,9 +188,10 @@ class SimulatedScene(nn.Module):
     """Gaussians, material points and patches of one scene, and how the first follow the second.
 
     Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
-    simulated one (with ``sampling: grid`` the nearest few), static ones stay. The points that fill a solid, and those at the faces of a sheet of three layers,
-    are material only: no Gaussian belongs to them, and their patch area is zero. The further points of large Gaussians
-    (``particle_spacing``) are patches of their own, but no Gaussian is drawn where they are.
+    simulated one (with ``sampling: grid`` the nearest few), static ones stay. The points that fill a solid, and those
+    at the faces of a sheet of three layers, are material only: no Gaussian belongs to them, and their patch area is
+    zero. The further points of large Gaussians (``particle_spacing``) are patches of their own, but no Gaussian is
+    drawn where they are.
 
     Args:
         scene: Where the Gaussians come from.
@@ -197,6 +200,8 @@ class SimulatedScene(nn.Module):
         dtype: Precision of the simulation.
 
     Attributes:
+        chosen: Indices of the Gaussians that the region and the opacity choose; with ``sampling: gaussian`` these are
+            the simulated ones, with ``grid`` the others of them are carried.
         points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
         filled: Number of points within a solid.
         on_surface: Number of points on the surface, which are the first: the simulated Gaussians, then the further
@@ -225,6 +230,7 @@ class SimulatedScene(nn.Module):
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
         means = cloud.means[simulated]
+        check_extent(means, self.frame.metres_per_unit, dx, simulated)
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
@@ -263,6 +269,7 @@ class SimulatedScene(nn.Module):
         else:
             normal_of = simulated[source]
         carried = carried.nonzero()[:, 0]
+        self.register_buffer("chosen", chosen.nonzero()[:, 0], persistent=False)
         self.register_buffer("simulated", simulated)
         self.register_buffer("carried", carried)
         anchor, share = blend_weights(cloud.means[simulated], cloud.means[carried], followed)
@@ -288,6 +295,7 @@ class SimulatedScene(nn.Module):
         facing = self.frame.direction_to_sim(normals[moving].double()).to(normals.dtype)
         self.register_buffer("rest_facing", facing, persistent=False)
         self.register_buffer("identity", torch.eye(3, dtype=cloud.means.dtype), persistent=False)
+        self.chosen: Tensor
         self.simulated: Tensor
         self.carried: Tensor
         self.anchor: Tensor

@@ -1,4 +1,4 @@
-"""Measures of a cloud of points: bounds, quantiles, widths, the normal of a sheet."""
+"""Measures of a cloud of points: bounds, quantiles, widths, the normal of a sheet, connected parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
+from gaussian_swaying._checks import check_positive, check_shape
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
 FEWEST = 16  # Gaussians that make an object
@@ -84,3 +84,42 @@ def snapped(direction: Tensor) -> tuple[float, ...]:
 def rounded(value: float, cell: float) -> float:
     """A coordinate with no more digits than matter: a hundredth of a cell."""
     return round(value, max(0, 2 - math.floor(math.log10(cell))))
+
+
+def connected_parts(points: Tensor, cell: float) -> Tensor:
+    """Number of the connected part that each point is in; points in the same or in touching cells are connected.
+
+    Args:
+        points: Shape (N, 3).
+        cell: Size of a cell.
+
+    Returns:
+        Numbers from 0 on, shape (N,).
+
+    Raises:
+        ValueError: If ``cell`` is not positive.
+    """
+    check_shape("points", points, None, 3)
+    check_positive("cell", cell)
+    low = points.amin(0).double()
+    index = ((points.double() - low) / cell).floor().long().clamp(max=2**20 - 4) + 1
+    key, of_point = ((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]).unique(return_inverse=True)
+    pairs = []
+    for x, y, z in torch.cartesian_prod(*(torch.arange(-1, 2),) * 3).tolist():
+        wanted = key + (x << 42) + (y << 21) + z
+        if (x, y, z) > (0, 0, 0):  # the other half of the neighbours finds the same pairs
+            at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
+            found = (key[at] == wanted).nonzero()[:, 0]
+            pairs.append(torch.stack([found, at[found]]))
+    one, other = torch.cat(pairs, 1)
+    label = torch.arange(len(key))
+    while True:  # the smaller number spreads, by halving of paths
+        smaller = torch.minimum(label[one], label[other])
+        new = label.clone()
+        for end in (one, other, label[one], label[other]):
+            new.scatter_reduce_(0, end, smaller, "amin")
+        new = new[new]
+        if new.equal(label):
+            break
+        label = new
+    return label.unique(return_inverse=True)[1][of_point]

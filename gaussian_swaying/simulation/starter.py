@@ -77,15 +77,6 @@ def region_dict(region: Region) -> dict[str, Any]:
     return {"class_path": type(region).__name__, "init_args": arguments}
 
 
-def kind(suggestion: Suggestion) -> str | None:
-    """How a calibration is to treat it: ``sheet``, ``stands`` or ``hangs``; None if nothing holds it."""
-    if suggestion.pin is None:
-        return None
-    if suggestion.sheet:
-        return "sheet"
-    return "hangs" if suggestion.hold.end == "top" else "stands"
-
-
 def draft_yaml(suggestion: Suggestion, ply: str | Path) -> str:
     """A configuration for a first look, as :func:`starter_yaml`: a coarser grid, 2 s, a small picture."""
     dx = max(suggest_spacing(suggestion.longest_side, suggestion.spacing, DRAFT_CELLS), suggestion.dx)
@@ -120,9 +111,9 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
     - class_path: PinnedRegion
       init_args:
         region: {json.dumps(region_dict(s.pin))}"""
-    hangs = s.hold.end != "bottom" or s.sheet
-    gravity = "[0.0, 0.0, -9.8]" if hangs else "[0.0, 0.0, 0.0] "
-    why = "it hangs" if hangs else "what stands was captured in balance with its weight"
+    falls = s.sheet or s.pin is None
+    gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "
+    why = "cloth and what nothing holds" if falls else "it was captured in balance with its weight"
     return f"""\
 {title}
 # Guessed from the splat; every number may be changed. A splat does not tell what it is made of: E and thickness are
@@ -179,7 +170,8 @@ camera:
     fov_y: 40.0                 # degrees
     azimuth: {s.azimuth:<19.6g}# degrees about up; onto the broad side
     elevation: 8.0
-    radius: 1.9                 # times the longest side of what moves
+    radius: {s.camera_radius:<20.6g}# times the longest side of what moves; shows all of the object
+    target_offset: {json.dumps(list(s.camera_offset))}  # scene axes, likewise; from the centre of what moves
 
 recorder:
   trajectory: false             # positions of all particles in each frame

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying.simulation.hold import balanced_base
 from gaussian_swaying.simulation.shape import DIRECTIONS, FEWEST, bounds, plane_axes, quantile, sheet_normal
 
 # what captures and modelling programs agree on: z up (Blender), y down (COLMAP), y up (glTF)
@@ -93,10 +94,9 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
     """The scene axis that most likely points up.
 
     Each of the six directions along an axis collects points: for convention (z up and y down 0.75, y up 0.5, others
-    -1), for a floor below (3, less if
-    what is on it is flat), for the origin at the lower end (1), and for the axis being the longest
-    (log2 of its ratio to the next, up to 1.5); a thin sheet hangs, so its normal loses 1. A lead of 2 over the
-    next is called high confidence, of 1 medium.
+    -1), for a floor below (3, less if what is on it is flat), for the origin at the lower end (1), for a wide base in
+    balance (0.5, no sheet), and for the axis being the longest (log2 of its ratio to the next, up to 1.5); a thin sheet
+    hangs, so its normal loses 1. A lead of 2 over the next is called high confidence, of 1 medium.
 
     Args:
         points: Centres [scene units], shape (N, 3).
@@ -133,6 +133,10 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
             gain = min(math.log2(longest[1] / max(longest[0], 1e-30)), 1.5)
             points_for += gain
             reasons.append(f"it is the longest side, {longest[1]:.3g} against {longest[0]:.3g} (+{gain:.2g})")
+        up = torch.tensor(direction, dtype=torch.float64)
+        if sheet is None and balanced_base(points.double(), weight.double(), up) is not None:
+            points_for += 0.5
+            reasons.append("it would stand in balance on a wide base (+0.5)")
         if sheet is not None and abs(sheet[axis]) > 0.8:
             points_for -= 1
         scores[name], why[name] = points_for, reasons

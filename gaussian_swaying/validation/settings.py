@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.boundary import Boundary, Nodes
-from gaussian_swaying.mpm.solver import ForceFunction, MPMSolver
+from gaussian_swaying.mpm.forces import ForceFunction
+from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 Result = dict[str, float]

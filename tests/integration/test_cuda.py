@@ -77,7 +77,7 @@ def test_a_step_never_makes_the_host_wait(formulation):
     state = solver.step(solver.init_state(points, frame=frame), 1e-4)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        end = solver.step(state, 1e-4, torch.zeros(500, 3, device="cuda"))
+        end = solver.step(state, 1e-4, force=torch.zeros(500, 3, device="cuda"))
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert bool(torch.isfinite(end.position).all())

@@ -14,7 +14,7 @@ RESULTS = ROOT / "docs" / "results"
 
 
 def test_one_example_for_each_component():
-    used = ("GaussianSurfaceModel", "MPMSolver", "AeroForce", "WindLoad", "DiffuseShader")
+    used = ("GaussianSurfaceModel", "MPMSolver", "AeroForce", "WindForce", "DiffuseShader")
     assert len(EXAMPLES) == README.count("```python") == 5
     for name, (example, _) in zip(used, EXAMPLES, strict=True):
         assert name in example

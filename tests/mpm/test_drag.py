@@ -33,7 +33,7 @@ def _run(solver, state, wind, dt, steps, aero=AERO):
         force = aero(wind, state.velocity, normal, area)
         drag = aero.resistance(wind, state.velocity, area)
         state = solver.fit_grid(state, min(20, steps) * dt) if k % 20 == 0 else state
-        state = solver.step(state, dt, force, drag)
+        state = solver.step(state, dt, force=force, drag=drag)
         fastest = max(fastest, float(state.velocity.norm(dim=-1).max()))
     return state, fastest
 

@@ -15,10 +15,9 @@ import torch
 
 from gaussian_swaying import _graphs
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.load import WindLoad
-from gaussian_swaying.aero.wind import FlowKey, WindField
+from gaussian_swaying.aero.wind import FlowKey, SpatialWind, WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.selection import Box, Everything
-from gaussian_swaying.mpm import materials
 from gaussian_swaying.mpm.boundary import (
     Boundary,
     EnclosingBox,
@@ -29,11 +28,25 @@ from gaussian_swaying.mpm.boundary import (
     SequentialRelease,
     VelocityBox,
 )
+from gaussian_swaying.mpm.forces import Force, Twin
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
 
 try:
+    import triton
+    import triton.language as tl
+
     from gaussian_swaying.mpm import fused
 except ImportError:
     fused = None
@@ -47,20 +60,20 @@ FORMULATIONS = ["total", "updated"]
 FIELDS = ["position", "velocity", "affine", "F_elastic", "F_total", "internal", "node_displacement", "node_velocity"]
 WIND = WindField([5.0, 2.0, -1.0])
 ELASTIC = {
-    "corotated": materials.FixedCorotated(),
-    "neo-hookean": materials.NeoHookean(),
-    "springs": materials.SpringNetwork(),
-    "hencky": materials.StVKHencky(),
+    "corotated": FixedCorotated(),
+    "neo-hookean": NeoHookean(),
+    "springs": SpringNetwork(),
+    "hencky": StVKHencky(),
 }
 PLASTIC = {
-    "sand": materials.Sand(),
-    "sand that swells": materials.Sand(volume_correction=True),
-    "metal": materials.Metal(5e2, 1e3),
-    "foam": materials.Foam(2e2, 5.0),
-    "foam without viscosity": materials.Foam(2e2, 0.0),
-    "plasticine": materials.Plasticine(1e3, 2e4, 1e2),
-    "snow": materials.Snow(),
-    "fluid": materials.Fluid(),
+    "sand": Sand(),
+    "sand that swells": Sand(volume_correction=True),
+    "metal": Metal(5e2, 1e3),
+    "foam": Foam(2e2, 5.0),
+    "foam without viscosity": Foam(2e2, 0.0),
+    "plasticine": Plasticine(1e3, 2e4, 1e2),
+    "snow": Snow(),
+    "fluid": Fluid(),
 }
 
 
@@ -138,7 +151,7 @@ def _load(points, wind=WIND, seed=4, **settings):
     area[..., ::5] = 0.0  # within the body
     aero = AeroForce(**{"C_L": 0.3, **settings}).to(device)
     wind = wind.to(device) if isinstance(wind, WindField) else [w.to(device) for w in wind]
-    return WindLoad(aero, wind, normal.to(device), area.to(device))
+    return WindForce(aero, wind, normal.to(device), area.to(device))
 
 
 def _solver(transfer, formulation="updated", **options):
@@ -199,7 +212,7 @@ def test_laws_in_updated(kernel_device, law):
     law = (ELASTIC | PLASTIC)[law]
     ends = _wind_case(_points(kernel_device, law), "updated", steps=2)
     _agree(ends)
-    if law.plastic and not isinstance(law, materials.Fluid):
+    if law.plastic and not isinstance(law, Fluid):
         assert float((ends[1].F_elastic - ends[1].F_total).abs().max()) > 0.01
 
 
@@ -376,7 +389,7 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
         else:
             state = state.replace(grid=whole.grid)
         state = state.replace(**fields)
-        end = solver.rollout(state, DT, 2, WindLoad(load.aero, wind, load.normal[k], load.area[k]))
+        end = solver.rollout(state, DT, 2, WindForce(load.aero, wind, load.normal[k], load.area[k]))
         for name in ("position", "velocity", "affine", "F_elastic"):
             error = (getattr(end, name) - getattr(ends[1], name)[k]).abs().max()
             assert float(error) <= TOLERANCE * float(getattr(end, name).abs().max()), name
@@ -430,7 +443,7 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
         F[5] = 0.0
         return state.replace(F_total=F)
 
-    points = _points(kernel_device, materials.Sand())
+    points = _points(kernel_device, Sand())
     _agree(_wind_case(points, "updated", start=start))
 
 
@@ -440,7 +453,7 @@ def test_wind_along_the_normal(kernel_device, formulation):
     points = _points(kernel_device)
     up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
     wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
-    load = WindLoad(AeroForce(unit_tangent=True).to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
+    load = WindForce(AeroForce(unit_tangent=True).to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
 
     def start(solver, points):
         return solver.init_state(points)
@@ -457,8 +470,8 @@ def test_forces_and_drag_of_step(kernel_device, formulation, implicit):
     drag = (0.5 * _random(9, *points.mass.shape).abs()).to(kernel_device) if implicit else None
 
     def run(solver, state):
-        states = [solver.step(state, DT, force, drag)]
-        states.append(solver.step(states[0], DT, 2 * force, drag))
+        states = [solver.step(state, DT, force=force, drag=drag)]
+        states.append(solver.step(states[0], DT, force=2 * force, drag=drag))
         return states
 
     ends = _both(points, run, formulation)
@@ -486,6 +499,228 @@ def test_a_force_function_is_called_each_substep(kernel_device, formulation):
     ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2, force), formulation)
     _agree(ends)
     assert times == [0.0, DT] * 2
+
+
+class _Pull(Force):
+    """Pulls particles to a place that moves, the more so the more they are sheared; with a resistance if asked."""
+
+    recordable = True
+
+    def __init__(self, device, resistance=None):
+        super().__init__()
+        self.register_buffer("place", torch.tensor([0.3, 0.1, -0.2], device=device))
+        self.register_buffer("way", torch.tensor([80.0, 0.0, 0.0], device=device))
+        self.resistance, self.called = resistance, 0
+
+    def forward(self, state):
+        self.called += 1
+        shear = 1 + state.F_total[..., 0, 1:2].abs() + 1e-3 * state.affine[..., 1, 2:3].abs()
+        pull = 5.0 * shear * (self.place + self.way * state.time - state.position) - 0.1 * state.velocity
+        if state.internal is not None:
+            pull = pull + state.internal[..., None]
+        if self.resistance is None:
+            return pull
+        return pull, self.resistance * (1 + state.velocity.square().sum(-1))
+
+
+FORCES = {
+    "custom": lambda points, pull: [pull],
+    "wind and custom": lambda points, pull: [_load(points), pull],
+    "custom, wind, wind": lambda points, pull: [
+        pull,
+        _load(points),
+        _load(points, WindField([0.0, 9.0, 0.0]), seed=14),
+    ],
+    "semi-implicit wind and custom": lambda points, pull: [_load(points, drag_step="semi_implicit"), pull],
+}
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "name"),
+    _on("wind and custom", "custom, wind, wind", interpreted=["custom", "semi-implicit wind and custom"]),
+    indirect=["kernel_device"],
+)
+@pytest.mark.parametrize("resistance", [None, 2.0], ids=["force", "resistance"])
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_forces_in_torch_among_the_kernels(kernel_device, formulation, resistance, name, monkeypatch):
+    """Over a part that ends, particles that are sorted anew, and a batch; all forces and their work."""
+    monkeypatch.setattr(fused, "MAX_STEPS", 3)
+    monkeypatch.setattr(fused, "RESORT", 2)
+    points = _points(kernel_device, count=10, batch=(2,))
+    pull = _Pull(kernel_device, resistance)
+
+    def run(solver, state):
+        monkeypatch.setattr(solver, "_step", None if solver.transfer == "triton" else solver._step)
+        forces = FORCES[name](points, pull)
+        states = [solver.rollout(state, DT, 1, forces)]
+        states.append(solver.rollout(states[-1], 0.7 * DT, 4, forces))
+        return states
+
+    ends = _both(points, run, formulation)
+    _agree(ends)
+    free = _solver("torch", formulation)
+    with torch.no_grad():
+        calm = free.rollout(_start(free, points), DT, 1, FORCES[name](points, pull)[:-1])
+    assert not torch.allclose(calm.velocity, ends[0][0].velocity, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    _on(("total", "corotated"), ("updated", "sand that swells")),
+    indirect=["kernel_device"],
+    ids=str,
+)
+def test_forces_in_torch_with_boundaries_looks_and_flow(kernel_device, case):
+    """The time that forces and boundaries are told advances once a substep; the internal variable is passed on."""
+    formulation, law = case
+    points = _points(kernel_device, (ELASTIC | PLASTIC)[law], count=12)
+    forces = [_Pull(kernel_device, 1.0), _load(points)]
+    found = _both(
+        points,
+        lambda solver, state: solver.watched_rollout(state, DT, 3, forces, 2),
+        formulation,
+        boundaries=[PinnedRegion(LEFT, start=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")],
+    )
+    _agree([state for state, _ in found])
+    assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=2 * TOLERANCE)
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, formulation):
+    """And with it the others, which run in torch then."""
+    points = _points(kernel_device, count=12)
+
+    class Waiting(_Pull):
+        def forward(self, state):
+            return super().forward(state) if float(state.time) > 0.5 * DT else 0 * state.position
+
+    def run(solver, state):
+        waiting = Waiting(kernel_device)
+        end = solver.rollout(state, DT, 3, [_load(points), waiting])
+        assert waiting.called == 2
+        return end
+
+    _agree(_both(points, run, formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_wind_that_depends_on_the_place(kernel_device, formulation):
+    class Shear(SpatialWind):
+        recordable = True
+
+        def forward(self, time, position):
+            speed = (8.0 + 1e3 * time) * (1 + 3 * position[..., 2])
+            return torch.stack([speed, torch.zeros_like(speed), torch.ones_like(speed)], dim=-1)
+
+    points = _points(kernel_device, count=12)
+    load = _load(points)
+    shear = WindForce(load.aero, Shear(), load.normal, load.area)
+    _agree(_both(points, lambda solver, state: solver.rollout(state, DT, 2, shear), formulation))
+
+
+if fused is not None:
+
+    @triton.jit
+    def _toward(F, velocity, values, vector, numbers, OPTIONS: tl.constexpr):
+        """Pulls along a vector by a share of each particle; resists if it was compiled so."""
+        scale = values[0] * tl.load(numbers) * F[0]
+        resistance = values[0] * 0
+        if OPTIONS[0]:
+            resistance = values[1]
+        force = (
+            scale * tl.load(vector) - resistance * velocity[0],
+            scale * tl.load(vector + 1) - resistance * velocity[1],
+            scale * tl.load(vector + 2) - resistance * velocity[2],
+        )
+        return force, resistance
+
+
+class _Toward(Force):
+    """A force outside the package with a twin."""
+
+    has_twin = True
+
+    def __init__(self, points, resists):
+        super().__init__()
+        self.resists = resists
+        self.register_buffer("share", torch.stack([points.mass, 3 * points.mass], dim=-1))
+
+    def along(self, time):
+        return torch.stack([300 * time + 9, -5 + 0 * time, 1 + 2000 * time], dim=-1)
+
+    def forward(self, state):
+        scale = self.share[..., 0] * 2.5 * state.F_total[..., 0, 0]
+        force = scale[..., None] * self.along(state.time).to(scale)
+        if not self.resists:
+            return force
+        return force - self.share[..., 1:] * state.velocity, self.share[..., 1]
+
+    def twin(self):
+        return Twin(
+            function=_toward,
+            options=(self.resists,),
+            implicit=self.resists,
+            sources=(self.share,),
+            values=lambda: self.share,
+            numbers=torch.tensor([2.5], device=self.share.device),
+            vectors=lambda time, dt, steps: self.along(
+                time + dt * torch.arange(steps, dtype=torch.float64, device=time.device)
+            ),
+        )
+
+
+@pytest.mark.parametrize("resists", [False, True])
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_twin_from_outside(kernel_device, formulation, resists):
+    """Before a wind, so the wind is the one that is left to torch; and the kernels can be told of another twin."""
+    points = _points(kernel_device, count=12)
+    own = _Toward(points, resists)
+
+    def run(solver, state):
+        states = [solver.rollout(state, DT, 2, own)]
+        states.append(solver.rollout(states[-1], DT, 2, [own, _load(points)]))
+        states.append(solver.rollout(states[-1], DT, 2, _load(points)))
+        own.share *= 2
+        states.append(solver.rollout(states[-1], DT, 1, own))
+        own.share /= 2
+        return states
+
+    _agree(_both(points, run, formulation))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_forces_in_torch_are_replayed_from_graphs(formulation):
+    """Python is left after the recording; what changes in place is seen, and a number that changes is recorded anew."""
+    pytest.importorskip("triton")
+    points = _points(torch.device("cuda"), count=60)
+    pulls = [_Pull("cuda", 1.0) for _ in range(2)]
+    solvers = [_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    state = _start(solvers[0], points, strain=0.02)
+    _start(solvers[1], points)
+    load = _load(points)
+    called = []
+    for k in range(7):
+        if k == 4:
+            for pull in pulls:
+                pull.place += 0.2
+        if k == 5:
+            for pull in pulls:
+                pull.resistance = 3.0
+        before = pulls[1].called
+        dt = [1e-4, 7e-5][k % 2]
+        expected, found = (
+            solver.rollout(state, dt, 22, [load, pull]) for solver, pull in zip(solvers, pulls, strict=True)
+        )
+        _agree([expected, found], tolerance=1e-4)
+        called.append(pulls[1].called - before)
+        state = expected
+    once = 1 if formulation == "updated" else 0  # at the start, where the particles are sorted
+    assert called[0] > 22 - 1
+    assert called[2] == called[3] == called[4] == once
+    assert called[5] > 22 - 1
+    assert any(solvers[1].fused().repeater._graphs.values())
 
 
 @pytest.mark.parametrize(
@@ -1035,7 +1270,7 @@ def test_boundaries_that_change(kernel_device, formulation):
 def test_laws_that_change(kernel_device):
     ends = []
     for transfer in ("torch", "triton"):
-        law = materials.Metal(5e2, 1e3)
+        law = Metal(5e2, 1e3)
         points, solver = _points(kernel_device, law, count=12), _solver(transfer)
         state = _start(solver, points)
         solver.rollout(state, DT, 1)
@@ -1096,7 +1331,7 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
     assert auto.rollout(start, DT, 2, load).position.requires_grad
     assert auto.step(state, DT, force=velocity).position.requires_grad
     area = load.area.clone().requires_grad_()
-    assert auto.rollout(state, DT, 1, WindLoad(load.aero, load.wind, load.normal, area)).position.requires_grad
+    assert auto.rollout(state, DT, 1, WindForce(load.aero, load.wind, load.normal, area)).position.requires_grad
     knock = Impulse(Everything(), [0.0, 0.0, 0.1], end=DT)
     knock.impulse.requires_grad_()
     pushed = _bound(_solver("auto", formulation, boundaries=[knock]), points)
@@ -1106,7 +1341,7 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
     for attempt in (
         lambda: only.rollout(start, DT, 2, load),
         lambda: only.step(state, DT, force=velocity),
-        lambda: only.rollout(state, DT, 1, WindLoad(load.aero, load.wind, load.normal, area)),
+        lambda: only.rollout(state, DT, 1, WindForce(load.aero, load.wind, load.normal, area)),
     ):
         with pytest.raises(ValueError, match="`transfer: triton` has no gradients"):
             attempt()
@@ -1114,7 +1349,7 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
         assert not only.rollout(start, DT, 1, load).position.requires_grad
 
 
-class OwnLaw(materials.FixedCorotated):
+class OwnLaw(FixedCorotated):
     """A law of a user's own, which may be anything."""
 
 

@@ -435,7 +435,7 @@ def test_shapes_are_checked():
     solver = MPMSolver(dx=0.1)
     state = solver.init_state(_block(count=64))
     with pytest.raises(ValueError, match=r"Expected `force` of shape \(64, 3\), but got \(64, 2\)"):
-        solver.step(state, 1e-3, torch.zeros(64, 2))
+        solver.step(state, 1e-3, force=torch.zeros(64, 2))
     with pytest.raises(ValueError, match=r"Expected `velocity` of shape \(64, 3\), but got \(63, 3\)"):
         solver.init_state(_block(count=64), torch.zeros(63, 3))
     with pytest.raises(TypeError, match="Expected `points` to be a MaterialPoints"):

@@ -232,7 +232,7 @@ def test_a_splat_that_was_exchanged(make_cloud, make_pipeline, tmp_path):
 @pytest.mark.parametrize("formulation", ["total"], indirect=True)
 def test_edits_that_bring_an_internal_variable(make_pipeline, tmp_path, formulation):
     """A law that flows from the second frame on: the state has then what it had not at the start."""
-    from gaussian_swaying.mpm.materials import Snow
+    from gaussian_swaying.mpm.laws.snow import Snow
     from gaussian_swaying.simulation.edits import Edit
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
 

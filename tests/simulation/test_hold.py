@@ -152,6 +152,7 @@ def held(cloud):
         (lamp("cone"), "top", "medium"),
         ([block([0.0, 0.0, 0.0], [1.0, 0.01, 1.6])], "top", "low"),  # a curtain
         ([ball([0.0, 0.0, 0.0], 1.0)], "bottom", "low"),
+        ([block([0.0, 0.0, 0.0], [2.0, 0.01, 1.4]), block([0.8, 0.0, 0.5], [1.2, 0.5, 1.0])], "bottom", "low"),
     ],
 )
 def test_things_stand_or_hang(thing, end, confidence):

@@ -14,8 +14,12 @@ import yaml
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, SequentialRelease, VelocityBox
-from gaussian_swaying.mpm.constitutive import lame_parameters
-from gaussian_swaying.mpm.materials import Foam, Metal, Plasticine, Sand, Snow
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.simulation.config import build_parser, build_pipeline, main
 from gaussian_swaying.simulation.physgaussian import convert, to_yaml
 from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera, read_model_camera

@@ -10,8 +10,9 @@ from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.linalg import polar_rotation
-from gaussian_swaying.mpm.materials import NeoHookean, Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 

@@ -79,7 +79,7 @@ def test_filled_points_feel_no_wind():
         state = pipeline.start()
         turned = torch.eye(3) + 0.1 * torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 2.0], [0.0, 0.5, 0.3]])
         state = state.replace(F_total=turned.expand_as(state.F_total))
-        forces.append(pipeline.load(state)[0])
+        forces.append(pipeline.wind_force(state)[0])
     assert torch.equal(forces[0][:count], forces[1])
     assert not bool(forces[0][count:].any())
     assert float(forces[1].norm(dim=-1).min()) > 0

@@ -47,7 +47,7 @@ def _fly(formulation, law, wind, gravity, seconds):
         state = solver.fit_grid(state, 0.04)
         for _ in range(steps):
             n, a = deform_patch(state.F_total, normal, area)
-            state = solver.step(state, 0.04 / steps, aero(flow, state.velocity, n, a))
+            state = solver.step(state, 0.04 / steps, force=aero(flow, state.velocity, n, a))
     return float((points.mass * state.velocity[:, 1]).sum() / points.mass.sum())
 
 
@@ -274,7 +274,7 @@ def _blow(solver, state, normal, aero, wind, steps, dt=2e-4):
     for step in range(steps):
         if step % 20 == 0:
             state = solver.fit_grid(state, 20 * dt, margin=1)
-        state = solver.step(state, dt, aero(wind, state.velocity, *deform_patch(state.F_total, normal, area)))
+        state = solver.step(state, dt, force=aero(wind, state.velocity, *deform_patch(state.F_total, normal, area)))
     return state
 
 

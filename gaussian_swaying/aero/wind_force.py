@@ -1,0 +1,217 @@
+"""The wind on the patches of a body, as a force for ``MPMSolver.rollout``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_shape
+from gaussian_swaying._graphs import fingerprint, record
+from gaussian_swaying.aero.force import AeroForce, capped_area
+from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given, Twin
+from gaussian_swaying.mpm.state import MPMState
+
+Wind = WindField | SpatialWind
+
+
+class WindForce(Force):
+    """Wind on surface patches that deform with their particles.
+
+    Give it to ``MPMSolver.rollout`` as one of its ``forces``. Where the wind is the same everywhere it has a Triton
+    twin, so on a GPU the whole of it is computed within the substep's own kernels.
+
+    Args:
+        aero: Coefficients and law of the force.
+        wind: The air, or one for each scene of a batch.
+        normal: Unit normals of the patches at rest, shape (..., P, 3).
+        area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind.
+
+    Raises:
+        ValueError: If the shapes do not agree, or there are not as many winds as scenes.
+
+    Example:
+        >>> up = torch.tensor([[0.0, 0.0, 1.0]])
+        >>> force = WindForce(AeroForce(C_F=0.0, C_L=0.0), WindField([0.0, 0.0, 2.0]), up, torch.ones(1))
+        >>> force.winds(torch.zeros((), dtype=torch.float64), dt=1e-3, steps=4).shape
+        torch.Size([4, 3])
+    """
+
+    def __init__(self, aero: AeroForce, wind: Wind | Sequence[Wind], normal: Tensor, area: Tensor) -> None:
+        super().__init__()
+        check_shape("normal", normal, "P", 3)
+        check_shape("area", area, normal.shape[-2])
+        self.aero = aero
+        self.register_buffer("normal", normal, persistent=False)
+        self.register_buffer("area", area, persistent=False)
+        self.normal: Tensor
+        self.area: Tensor
+        self._shared = isinstance(wind, nn.Module)
+        self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
+        if not self._shared and normal.shape[:-2] != (len(self._fields),):
+            raise ValueError(
+                f"Expected one `wind` for each of the {tuple(normal.shape[:-2])} scenes, but got {len(self._fields)}."
+            )
+        self._key: tuple[tuple[object, ...], ...] = ()
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without the graph, which nothing can copy."""
+        kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
+        return kept | {"_key": (), "_graph": None}
+
+    @property
+    def wind(self) -> nn.Module | tuple[nn.Module, ...]:
+        """The air, or one for each scene of a batch."""
+        return self._fields[0] if self._shared else tuple(self._fields)
+
+    @property
+    def uniform(self) -> bool:
+        """Whether the wind is the same everywhere in a scene."""
+        return all(isinstance(wind, WindField) for wind in self._fields)
+
+    @property
+    def recordable(self) -> bool:  # type: ignore[override]
+        """Whether the wind can be recorded: what is here, with modulations and spatial winds that say so."""
+        return all(
+            wind.recordable if isinstance(wind, SpatialWind) else type(wind) is WindField for wind in self._fields
+        ) and all(
+            getattr(part, "recordable", False)
+            for wind in self._fields
+            if isinstance(wind, WindField)
+            for part in wind.modulations
+        )
+
+    @property
+    def device(self) -> torch.device | None:
+        """Where the wind is; None if its parts are on several devices."""
+        found = {tensor.device for tensor in self._wind_tensors()}
+        return found.pop() if len(found) == 1 else None
+
+    def _wind_tensors(self) -> list[Tensor]:
+        return [*self._fields.parameters(), *self._fields.buffers()]
+
+    def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """Velocity of a uniform wind [m/s] at the start of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on.
+
+        Gusts take some seventy small kernels. On a GPU they are recorded in a CUDA graph at the second call if all
+        modulations are ``recordable``, and again when a number or a buffer of the wind was replaced; one force must
+        then not be asked by two threads at once.
+
+        Args:
+            time: Scalar float64 tensor.
+            dt: Number, or scalar float64 tensor on the same device.
+            steps: How many.
+
+        Returns:
+            Shape (steps, 3), or (steps, B, 1, 3) with a wind for each scene; float64, on the device of ``time``.
+        """
+        on_gpu = time.is_cuda and self.device == time.device
+        if not (on_gpu and self.recordable and steps <= MOST_STEPS) or (
+            torch.is_grad_enabled() and any(t.requires_grad for t in self._wind_tensors())
+        ):
+            return self._winds(time, dt, steps)
+        key = fingerprint(self._fields)
+        new = self._key != key
+        if new:
+            self._key, self._graph = key, None
+            with torch.inference_mode(False):  # they may be written within inference mode and without
+                self._now, self._dt = (torch.zeros((), dtype=torch.float64, device=time.device) for _ in range(2))
+        elif self._graph is None:
+            self._graph = record(time.device, self._tabulate)
+        self._now.copy_(time)
+        self._dt.copy_(dt) if isinstance(dt, Tensor) else self._dt.fill_(dt)
+        if self._graph is None:  # the first time as it is, so that all is loaded before it is recorded
+            self._tabulate()
+        else:
+            self._graph.replay()
+        return self._table[:steps].clone()
+
+    def _tabulate(self) -> None:
+        self._table = self._winds(self._now, self._dt, MOST_STEPS)
+
+    def _winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        if self._shared:
+            return self._fields[0](times).to(time.device)
+        return torch.stack([wind(times) for wind in self._fields], dim=1)[:, :, None].to(time.device)
+
+    def air(self, time: Tensor, position: Tensor) -> Tensor:
+        """Air velocity at some places [m/s].
+
+        Args:
+            time: Time [s], scalar float64 tensor.
+            position: Places [m], shape (..., P, 3).
+
+        Returns:
+            Broadcastable to (..., P, 3).
+        """
+        if self.uniform:
+            return self._winds(time, 0.0, 1)[0]
+        if self._shared:
+            return self._fields[0](time, position)
+        parts = [
+            wind(time, place) if isinstance(wind, SpatialWind) else wind(time).to(place).expand_as(place)
+            for wind, place in zip(self._fields, position, strict=True)
+        ]
+        return torch.stack([part.expand_as(position[0]).to(position) for part in parts])
+
+    def samples(self, state: MPMState, dt: float, steps: int) -> Tensor:
+        """Air velocity at ``steps`` times, ``dt`` [s] apart, from that of a state on, where its particles are [m/s].
+
+        Returns:
+            Shape (steps, ...), broadcastable to (steps, ..., P, 3) from its second axis on.
+        """
+        if self.uniform:
+            return self.winds(state.time, dt, steps)
+        return torch.stack([self.air(state.time + k * dt, state.position) for k in range(steps)])
+
+    def force(self, state: MPMState, wind: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Force on every particle [N] (..., P, 3), and the resistance of a semi-implicit drag [kg/s] (..., P) or None.
+
+        Args:
+            state: The state at the start of the substep.
+            wind: Air velocity [m/s], broadcastable to (..., P, 3).
+        """
+        normal, area = deform_patch(state.F_total, self.normal, self.area)
+        area = capped_area(area, self.area, self.aero.max_area_ratio)
+        return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
+
+    def forward(self, state: MPMState) -> tuple[Tensor, Tensor | None]:
+        """:meth:`force` in the wind of ``state.time``."""
+        return self.force(state, self.air(state.time, state.position))
+
+    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
+        """See ``Force.during``: a uniform wind is computed for all substeps at once."""
+        if not self.uniform:
+            return super().during(time, dt, steps)
+        winds = self.winds(time, dt, steps)
+        return lambda state, k: self.force(state, winds[k])
+
+    @property
+    def has_twin(self) -> bool:
+        """Whether the kernels can compute it: where the wind is uniform."""
+        return self.uniform
+
+    def twin(self) -> Twin:
+        """See ``Force.twin``; of a uniform wind."""
+        from gaussian_swaying.aero.force_triton import wind_force
+
+        aero = self.aero
+        implicit = aero.drag_step == "semi_implicit"
+        half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
+        return Twin(
+            function=wind_force,
+            options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
+            implicit=implicit,
+            sources=(self.normal, self.area),
+            values=lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1),
+            numbers=torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest]),
+            vectors=self.winds,
+        )
+
+
+__all__ = ["WindForce"]

@@ -1,0 +1,193 @@
+"""Forces on material points: what a force is, several of them, and what one of them gives to the fused substep."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_shape
+from gaussian_swaying._graphs import Recordable
+from gaussian_swaying.mpm.state import MPMState
+
+MOST_STEPS = 256
+"""Substeps for which a :class:`Twin` is asked for its vectors at a time, at most."""
+
+TWIN_VALUES, TWIN_NUMBERS = 4, 8
+"""How many numbers a :class:`Twin` has for each particle and in all, at most."""
+
+Given = Tensor | tuple[Tensor, Tensor | None]
+"""A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
+
+ForceFunction = Callable[[MPMState], Given]
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A force as a Triton function, which the particle kernels call; its definition is the force in torch.
+
+    Attributes:
+        function: A ``@triton.jit`` function ``(F, velocity, values, vector, numbers, OPTIONS)`` that returns the force
+            (three numbers) and the resistance of some particles. ``F`` is the total deformation gradient in nine parts,
+            ``velocity`` has three, ``values`` four; ``vector`` and ``numbers`` are pointers. The force must be zero
+            where all values are.
+        options: Constants that the function is compiled for.
+        implicit: Whether there is a resistance, so that the force acts with the velocity that it leads to; if not, the
+            function returns zero for it.
+        sources: The tensors that the values are made of: these are asked for again when one is another tensor or was
+            changed in place.
+        values: Gives up to four numbers for each particle, shape (..., P, n).
+        numbers: Up to eight numbers, shape (n,).
+        vectors: ``vectors(time, dt, steps)`` is what depends on time alone: a vector for the start of each of ``steps``
+            (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3), or
+            (steps, B, 1, 3) for a batch of scenes.
+    """
+
+    function: Any
+    options: tuple[bool | int | float, ...]
+    implicit: bool
+    sources: tuple[Tensor, ...]
+    values: Callable[[], Tensor]
+    numbers: Tensor
+    vectors: Callable[[Tensor, Tensor, int], Tensor]
+
+
+class Force(Recordable, nn.Module, ABC):
+    """Base of all forces: gives the force on every particle from the state, in torch.
+
+    A force of your own is a subclass with a ``forward``. It may keep numbers, tensors (``register_buffer``) and
+    parameters; gradients reach them. Move it to the device of the material, as any module.
+
+    Attributes:
+        recordable: Whether ``forward`` may be recorded in a CUDA graph with the substep: it depends on nothing but the
+            position, velocity, affine, F_elastic, F_total, internal, lost and time of the state and on numbers and
+            tensors of the module, and never makes the host wait (no ``float(tensor)``, no ``if tensor``, no copy from
+            the host). Where it is False (the default) the host calls the force in every substep, which is slow on a
+            GPU; everywhere else it makes no difference.
+
+    Example:
+        >>> class Weight(Force):
+        ...     recordable = True
+        ...
+        ...     def forward(self, state):
+        ...         return 0.1 * state.position.new_tensor([0.0, 0.0, -9.8]).expand_as(state.position)
+    """
+
+    @abstractmethod
+    def forward(self, state: MPMState) -> Given:
+        """The force at the start of a substep.
+
+        Args:
+            state: The state then.
+
+        Returns:
+            Force [N], shape (..., P, 3); or the force and its resistance: by how much it falls per velocity gained in
+            the substep [kg/s], shape (..., P). A force with a resistance acts with the velocity that it leads to, so it
+            is stable however light the particle.
+        """
+
+    def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
+        """The force in each of several substeps; what depends on time alone can be computed here, for all at once.
+
+        Args:
+            time: Start of the first substep [s], scalar float64 tensor.
+            dt: Substep [s].
+            steps: How many.
+
+        Returns:
+            A function of the state at the start of a substep and of its number.
+        """
+        return lambda state, k: self(state)
+
+    @property
+    def has_twin(self) -> bool:
+        """Whether there is a :meth:`twin`."""
+        return False
+
+    def twin(self) -> Twin:
+        """The force for the fused substep, of a force that ``has_twin``."""
+        raise NotImplementedError(f"The force {type(self).__name__} has no Triton twin.")
+
+
+class FunctionForce(Force):
+    """A function of the state as a force; the host calls it in every substep.
+
+    Args:
+        function: Gives the force [N], shape (..., P, 3), or the force and its resistance.
+    """
+
+    def __init__(self, function: ForceFunction) -> None:
+        super().__init__()
+        self.function = function
+
+    def forward(self, state: MPMState) -> Given:
+        """What the function gives."""
+        return self.function(state)
+
+
+Forces = Force | ForceFunction | Sequence[Force | ForceFunction]
+"""One force or several, each a :class:`Force` or a function of the state."""
+
+
+def as_forces(forces: Forces | None) -> tuple[Force, ...]:
+    """One force, several or none as a tuple.
+
+    Raises:
+        TypeError: If something else is among them.
+    """
+    if forces is None:
+        return ()
+    several = list(forces) if isinstance(forces, Sequence) else [forces]
+    for force in several:
+        if not callable(force):
+            raise TypeError(
+                f"Expected `forces` to be Force objects or functions of the state, but got {type(force).__name__}: a "
+                "tensor is given to `step` as `force`."
+            )
+    return tuple(force if isinstance(force, Force) else FunctionForce(force) for force in several)
+
+
+def split(found: Given, force: Force, state: MPMState) -> tuple[Tensor, Tensor | None]:
+    """What a force gave for a state: the force and its resistance or None, in the precision of the state.
+
+    Raises:
+        TypeError: If it gave no tensor.
+        ValueError: If its shape is wrong.
+    """
+    value, drag = found if isinstance(found, tuple) else (found, None)
+    name, particles = type(force).__name__, state.position.shape[-2]
+    check_shape(f"force of {name}", value, particles, 3)
+    if drag is not None:
+        check_shape(f"resistance of {name}", drag, particles)
+        drag = drag.to(state.position.dtype)
+    return value.to(state.position.dtype), drag
+
+
+def added(parts: Sequence[tuple[Tensor | None, Tensor | None]]) -> tuple[Tensor | None, Tensor | None]:
+    """The sum of forces and that of their resistances; None where there is none."""
+    value = drag = None
+    for one, its_drag in parts:
+        if one is not None:
+            value = one if value is None else value + one
+        if its_drag is not None:
+            drag = its_drag if drag is None else drag + its_drag
+    return value, drag
+
+
+def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
+    """Parameters and buffers of forces, of which one might ask for a gradient."""
+    return [tensor for force in forces for tensor in (*force.parameters(), *force.buffers())]
+
+
+def divide(forces: Sequence[Force]) -> tuple[Force | None, tuple[Force, ...]]:
+    """The first force that has a twin, and the others, which are left to torch."""
+    for k, force in enumerate(forces):
+        if force.has_twin:
+            return force, (*forces[:k], *forces[k + 1 :])
+    return None, tuple(forces)
+
+
+__all__ = ["Force", "ForceFunction", "Forces", "FunctionForce", "Twin", "as_forces"]

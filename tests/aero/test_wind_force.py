@@ -1,0 +1,228 @@
+"""The wind as a load: what it gives at each substep, and that a rollout in it is the one with its forces."""
+
+import copy
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+DT = 1e-3
+GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
+RISING = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(4 * DT, [0.0, 20.0, 0.0])], interpolation="linear")
+
+
+def _setting(batch=(), wind=GUSTS, formulation="total", **settings):
+    generator = torch.Generator().manual_seed(0)
+    position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
+    area = 0.02 * torch.rand(*batch, 20, dtype=torch.float64, generator=generator)
+    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch")
+    velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    state = solver.init_state(points, velocity)
+    return solver, solver.rollout(state, DT, 2), WindForce(AeroForce(**settings), wind, normal, area)
+
+
+def test_winds_are_those_of_the_start_of_each_substep():
+    *_, load = _setting()
+    time = torch.tensor(0.01, dtype=torch.float64)
+    winds = load.winds(time, DT, 5)
+    assert winds.shape == (5, 3)
+    assert winds.dtype == torch.float64
+    for k in range(5):
+        assert torch.equal(winds[k], GUSTS(time + k * DT))
+    assert len(set(winds[:, 0].tolist())) > 1
+
+
+def test_each_scene_has_its_own_wind():
+    *_, load = _setting(batch=(2,), wind=[GUSTS, RISING])
+    time = torch.tensor(DT, dtype=torch.float64)
+    winds = load.winds(time, DT, 3)
+    assert winds.shape == (3, 2, 1, 3)
+    assert torch.equal(winds[:, 1, 0], torch.stack([RISING(time + k * DT) for k in range(3)]))
+
+
+@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
+def test_force_is_that_on_the_deformed_patches(drag_step):
+    _, state, load = _setting(drag_step=drag_step, C_L=0.4)
+    wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
+    force, resistance = load.force(state, wind)
+    normal, area = deform_patch(state.F_total, load.normal, load.area)
+    assert float((area / load.area - 1).abs().max()) > 1e-4
+    assert torch.equal(force, load.aero(wind, state.velocity, normal, area))
+    if drag_step == "explicit":
+        assert resistance is None
+    else:
+        assert torch.equal(resistance, load.aero.resistance(wind, state.velocity, area))
+    now, _ = load(state)
+    assert torch.equal(now, load.force(state, GUSTS(state.time))[0])
+
+
+@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
+def test_the_area_of_what_has_flowed_is_capped(drag_step):
+    """Shear without end: the normal turns, the force stays that on so many times the area at rest."""
+    _, state, free = _setting(drag_step=drag_step)
+    load = WindForce(AeroForce(drag_step=drag_step, max_area_ratio=1.5), GUSTS, free.normal, free.area)
+    wind = torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64)
+    F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+    F[:10, 0, 1] = 3e4
+    F[10:15, 0, 0] = 1.2
+    state = state.replace(F_total=F)
+    normal, area = deform_patch(F, free.normal, free.area)
+    growth = area / free.area
+    assert float(growth[:10].min()) > 1.5 > float(growth[10:].max())
+    force, resistance = load.force(state, wind)
+    capped = torch.cat([1.5 * free.area[:10], area[10:]])
+    torch.testing.assert_close(force, load.aero(wind, state.velocity, normal, capped))
+    if drag_step == "semi_implicit":
+        torch.testing.assert_close(resistance, load.aero.resistance(wind, state.velocity, capped))
+    torch.testing.assert_close(force[10:], free.force(state, wind)[0][10:])
+    assert float((force[:10] - free.force(state, wind)[0][:10]).abs().max()) > 1.0
+
+
+def test_gradients_through_a_capped_area_are_finite():
+    """Also where the patch stands exactly at the cap; in F only the direction of the normal is left above it."""
+    _, state, free = _setting()
+    load = WindForce(AeroForce(max_area_ratio=1.0), GUSTS, free.normal, free.area)
+    F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+    F[:10, 0, 1] = 3e4
+    F.requires_grad_()
+    force, _ = load.force(state.replace(F_total=F), torch.tensor([5.0, 0.0, 1.0], dtype=torch.float64))
+    (found,) = torch.autograd.grad(force.square().sum(), F)
+    assert bool(torch.isfinite(found).all())
+    assert float(found.abs().amax()) > 0
+    scaled = F.detach()[:10].requires_grad_()
+    size = load.force(state.replace(F_total=torch.cat([scaled, F.detach()[10:]])), load.winds(state.time, 0.0, 1)[0])
+    (slope,) = torch.autograd.grad(size[0][:10].square().sum(), scaled)
+    # growth of F as a whole turns no normal, so the force does not see it
+    assert float((slope * scaled.detach()).sum((-1, -2)).abs().max()) < 1e-9 * 3e4 * float(slope.abs().max())
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+@pytest.mark.parametrize("drag_step", ["explicit", "semi_implicit"])
+def test_a_rollout_in_the_wind_is_the_one_with_its_forces(formulation, drag_step):
+    solver, state, load = _setting(wind=RISING, formulation=formulation, drag_step=drag_step)
+    whole = solver.rollout(state, DT, 5, load)
+    step = state
+    for _ in range(5):
+        force, drag = load(step)
+        step = solver.step(step, DT, force=force, drag=drag)
+    called = solver.rollout(state, DT, 5, lambda s: load(s))
+    calm = solver.rollout(state, DT, 5)
+    for other in (step, called):
+        torch.testing.assert_close(whole.position, other.position, rtol=0, atol=1e-12)
+        torch.testing.assert_close(whole.work, other.work)
+    assert float((whole.position - calm.position).abs().max()) > 1e-6
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_batch_is_each_scene_by_itself(formulation):
+    solver, state, load = _setting(batch=(2,), wind=[GUSTS, RISING], formulation=formulation)
+    force, _ = load(state)
+    for k, wind in enumerate(load.wind):
+        normal, area = deform_patch(state.F_total[k], load.normal[k], load.area[k])
+        expected = load.aero(wind(state.time), state.velocity[k], normal, area)
+        torch.testing.assert_close(force[k], expected)
+    assert solver.rollout(state, DT, 2, load).work.shape == (2,)
+
+
+def test_gradients_reach_the_patches_and_the_coefficients():
+    solver, state, load = _setting()
+    load.area.requires_grad_()
+    load.aero.C_D.requires_grad_()
+    end = solver.rollout(state, DT, 3, load).position.square().sum()
+    for found in torch.autograd.grad(end, [load.area, load.aero.C_D]):
+        assert float(found.abs().max()) > 0
+
+
+@pytest.mark.parametrize("name", ["area", "normal", "C_D", "flows"])
+def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
+    """The rollout as a whole is asked about it, before any substep."""
+    solver, state, load = _setting(wind=WindField([3.0, 0.0, 0.0]))
+    owner = {"C_D": load.aero, "flows": load.wind}.get(name, load)
+    getattr(owner, name).requires_grad_()
+    asked = []
+    monkeypatch.setattr(solver, "fused", lambda *tensors: asked.append(tensors))
+    solver.rollout(state, DT, 1, load)
+    assert any(tensor.requires_grad for tensor in asked[0])
+    asked.clear()
+    solver.watched_rollout(state, DT, 1, load)
+    assert any(tensor.requires_grad for tensor in asked[0])
+
+
+def test_a_copy_leaves_the_graph_behind():
+    _, state, load = _setting()
+    load._graph = (value for value in ())  # like a graph, it cannot be copied
+    expected = load.winds(state.time, DT, 3)
+    for found in (copy.deepcopy(load), copy.copy(load)):
+        assert found._graph is None
+        assert torch.equal(found.winds(state.time, DT, 3), expected)
+
+
+def test_shapes_are_checked():
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
+    with pytest.raises(ValueError, match="normal"):
+        WindForce(AeroForce(), GUSTS, torch.zeros(4), torch.ones(4))
+    with pytest.raises(ValueError, match="area"):
+        WindForce(AeroForce(), GUSTS, up, torch.ones(3))
+    with pytest.raises(ValueError, match=r"one `wind` for each of the \(2,\) scenes, but got 3"):
+        WindForce(AeroForce(), [GUSTS] * 3, up.expand(2, 4, 3), torch.ones(2, 4))
+    with pytest.raises(ValueError, match=r"one `wind` for each of the \(\) scenes, but got 1"):
+        WindForce(AeroForce(), [GUSTS], up, torch.ones(4))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("scenes", [0, 3])
+def test_a_recorded_wind_blows_as_the_plain_one(scenes):
+    """From the second call on a graph is replayed: another time, substep, seed, amplitude or flow still counts."""
+
+    def field(seed):
+        gusts = [SineSway(period=0.7), UniformGust(0.2), GaussianGust(0.4)]
+        return WindField([3.0, 1.0, 0.0], modulations=gusts, seed=seed).cuda()
+
+    wind = [field(seed) for seed in range(scenes)] if scenes else field(0)
+    first = wind[0] if scenes else wind
+    shape = (*((scenes,) if scenes else ()), 5, 3)
+    normal = torch.nn.functional.normalize(torch.ones(shape, device="cuda"), dim=-1)
+    load = WindForce(AeroForce().cuda(), wind, normal, torch.ones(shape[:-1], device="cuda"))
+    changes = [
+        lambda: None,
+        lambda: None,
+        lambda: setattr(first, "seed", 7),
+        lambda: None,
+        lambda: setattr(first.modulations[0], "amplitude", 0.1),
+        lambda: None,
+        lambda: first.flows.fill_(2.0),
+        lambda: setattr(first, "flows", torch.full((1, 3), 4.0, dtype=torch.float64, device="cuda")),
+        lambda: None,
+    ]
+    for k, change in enumerate(changes):
+        change()
+        time = torch.full((), 0.13 * k, dtype=torch.float64, device="cuda")
+        dt = 1e-3 * (k + 1)
+        given = dt if k % 2 else torch.full((), dt, dtype=torch.float64, device="cuda")
+        found = load.winds(time, given, 20 + k)
+        torch.testing.assert_close(found, load._winds(time, dt, 20 + k), rtol=1e-12, atol=0)
+    assert load._graph is not None
+
+
+@pytest.mark.gpu
+def test_a_wind_that_cannot_be_recorded_is_asked_each_time():
+    class Waiting(Modulation):
+        """Makes the host wait."""
+
+        def forward(self, velocity, time, seed, stream):
+            return velocity * (1.0 if float(time.max()) < 1 else 2.0)
+
+    wind = WindField([1.0, 0.0, 0.0], modulations=[Waiting()]).cuda()
+    normal = torch.tensor([[1.0, 0.0, 0.0]], device="cuda")
+    load = WindForce(AeroForce().cuda(), wind, normal, torch.ones(1, device="cuda"))
+    for time in (0.0, 0.5, 2.0, 0.5):
+        found = load.winds(torch.full((), time, dtype=torch.float64, device="cuda"), 1e-3, 4)
+        assert found[0, 0] == (2.0 if time > 1 else 1.0)

@@ -1,0 +1,311 @@
+"""Forces as a list: what they may be, that they add up, their work and their gradients; the examples of docs/forces.md.
+
+That the fused substep does the same is asked in ``test_fused``.
+"""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.forces import Force, FunctionForce, Twin, as_forces, divide
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "forces.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE, flags=re.DOTALL)
+DT = 1e-3
+FORMULATIONS = ["total", "updated"]
+
+
+class Spring(Force):
+    """Pulls every particle to a place, with a drag if asked."""
+
+    recordable = True
+
+    def __init__(self, stiffness=3.0, resistance=None):
+        super().__init__()
+        self.stiffness = torch.nn.Parameter(torch.tensor(float(stiffness), dtype=torch.float64))
+        self.resistance = resistance
+
+    def forward(self, state):
+        pull = -self.stiffness * state.position
+        if self.resistance is None:
+            return pull
+        drag = torch.full_like(state.position[..., 0], self.resistance)
+        return pull - drag[..., None] * state.velocity, drag
+
+
+def _setting(formulation="total", batch=(), **options):
+    generator = torch.Generator().manual_seed(0)
+    position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch", **options)
+    velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    normal = torch.nn.functional.normalize(torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator), dim=-1)
+    wind = WindForce(AeroForce(), WindField([4.0, 0.0, 1.0]), normal, torch.full(position.shape[:-1], 0.01))
+    return solver, solver.init_state(points, velocity), wind
+
+
+def _push(state):
+    """A force as a plain function."""
+    return 0.2 * torch.ones_like(state.position)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("batch", [(), (2,)])
+@torch.no_grad()
+def test_forces_add_up(formulation, batch):
+    """A rollout with several is the one with the sum of what they give; so is a single step."""
+    solver, start, wind = _setting(formulation, batch)
+    forces = [wind, Spring(2.0, 0.4), _push, Spring()]
+    state = start
+    for _ in range(4):
+        force = drag = 0.0
+        for given in (part(state) for part in forces):
+            value, resistance = given if isinstance(given, tuple) else (given, None)
+            force, drag = force + value, drag if resistance is None else drag + resistance
+        state = solver.step(state, DT, force=force, drag=drag)
+    several = solver.rollout(start, DT, 4, forces)
+    watched, _ = solver.watched_rollout(start, DT, 4, forces, looks=2)
+    stepped = start
+    for _ in range(4):
+        stepped = solver.step(stepped, DT, forces)
+    for other in (several, watched, stepped):
+        torch.testing.assert_close(other.position, state.position, rtol=0, atol=1e-12)
+        torch.testing.assert_close(other.work, state.work)
+    for k in range(len(forces)):  # each of them counts
+        fewer = solver.rollout(start, DT, 4, forces[:k] + forces[k + 1 :])
+        assert float((fewer.velocity - state.velocity).abs().max()) > 1e-5
+
+
+@torch.no_grad()
+def test_one_force_several_or_none():
+    solver, start, wind = _setting()
+    alone = solver.rollout(start, DT, 2, wind)
+    assert torch.equal(solver.rollout(start, DT, 2, [wind]).velocity, alone.velocity)
+    assert torch.equal(solver.rollout(start, DT, 2, _push).velocity, solver.rollout(start, DT, 2, (_push,)).velocity)
+    calm = solver.rollout(start, DT, 2)
+    assert torch.equal(solver.rollout(start, DT, 2, []).velocity, calm.velocity)
+    assert not torch.equal(alone.velocity, calm.velocity)
+
+
+@torch.no_grad()
+def test_a_force_that_is_given_to_a_step_is_added_to_the_others():
+    solver, start, wind = _setting()
+    given = torch.randn_like(start.position)
+    wind_now, _ = wind(start)
+    expected = solver.step(start, DT, force=wind_now + given)
+    assert torch.equal(solver.step(start, DT, wind, force=given).velocity, expected.velocity)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@torch.no_grad()
+def test_work_is_that_of_all_forces(formulation):
+    """What a free body that is too soft to store anything gains in kinetic energy."""
+    solver, start, wind = _setting(formulation, gravity=(0, 0, 0))
+    points = start.position.shape[0]
+    soft = MaterialPoints.create(start.position, volume=1e-4, density=50.0, youngs_modulus=1e-9, poisson_ratio=0.3)
+    state = solver.init_state(soft, torch.tensor([0.3, 0.1, 0.0], dtype=torch.float64).expand(points, 3))
+    end = solver.rollout(state, DT, 5, [wind, lambda s: 0.01 * torch.ones_like(s.position)])
+    alone = solver.rollout(state, DT, 5, wind)
+    assert float(end.work) > 1.01 * float(alone.work) > 0
+    if formulation == "total":  # nothing dissipates
+        growth = solver.energies(end)["kinetic"] - solver.energies(state)["kinetic"]
+        torch.testing.assert_close(end.work, growth, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("checkpoint", [0, 2])
+def test_gradients_reach_a_force(checkpoint):
+    """Against a difference of two rollouts."""
+    solver, start, wind = _setting()
+    spring = Spring(3.0, 0.2)
+
+    def final():
+        return solver.rollout(start, DT, 6, [wind, spring], checkpoint).position.square().sum()
+
+    (found,) = torch.autograd.grad(final(), spring.stiffness)
+    with torch.no_grad():
+        ends = []
+        for change in (1e-4, -1e-4):
+            spring.stiffness += change
+            ends.append(final())
+            spring.stiffness -= change
+    assert float(found) == pytest.approx(float(ends[0] - ends[1]) / 2e-4, rel=1e-6)
+
+
+@torch.no_grad()
+def test_a_force_with_a_resistance_is_stable_however_light_the_body():
+    """A free body dragged along by a resistance that an explicit step would not survive."""
+    solver, start, _ = _setting(gravity=(0, 0, 0))
+
+    class Carried(Force):
+        def __init__(self, implicit):
+            super().__init__()
+            self.implicit = implicit
+
+        def forward(self, state):
+            force = 100.0 * (torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64) - state.velocity)
+            return (force, torch.full_like(force[..., 0], 100.0)) if self.implicit else force
+
+    # drag x dt / mass is 20
+    carried = solver.rollout(start, DT, 40, Carried(True)).velocity
+    torch.testing.assert_close(
+        carried, torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64).expand(20, 3), atol=0.05, rtol=0
+    )
+    assert not float(solver.rollout(start, DT, 40, Carried(False)).velocity.abs().max()) < 1e3
+
+
+@torch.no_grad()
+def test_a_force_of_another_precision_changes_nothing_of_the_state():
+    solver, start, _ = _setting()
+    end = solver.rollout(start, DT, 2, lambda state: torch.ones(20, 3, dtype=torch.float32))
+    assert end.position.dtype == end.velocity.dtype == torch.float64
+
+
+def test_what_is_no_force_is_named():
+    solver, start, wind = _setting()
+    with pytest.raises(TypeError, match=r"`forces` to be Force objects or functions.*got Tensor.*`force`"):
+        solver.step(start, DT, torch.zeros(20, 3))
+    with pytest.raises(TypeError, match="got float"):
+        solver.rollout(start, DT, 1, [wind, 3.0])
+    with pytest.raises(ValueError, match=r"`force of FunctionForce` of shape \(20, 3\), but got \(3,\)"):
+        solver.rollout(start, DT, 1, lambda state: state.position[0])
+    spring = Spring()
+    spring.forward = lambda state: (state.position, torch.ones(3))
+    with pytest.raises(ValueError, match=r"`resistance of Spring` of shape \(20,\)"):
+        solver.rollout(start, DT, 1, spring)
+    with pytest.raises(TypeError, match=r"`force of FunctionForce` to be a torch\.Tensor, but got NoneType"):
+        solver.rollout(start, DT, 1, lambda state: None)
+
+
+def test_a_force_says_for_itself_whether_it_can_be_recorded():
+    class Own(Spring):
+        def forward(self, state):
+            return float(state.time) * state.position
+
+    assert Spring().recordable
+    assert not Own().recordable
+    assert not FunctionForce(_push).recordable
+    assert isinstance(as_forces(_push)[0], FunctionForce)
+
+
+def test_the_first_force_with_a_twin_is_fused():
+    *_, wind = _setting()
+    spring, other = Spring(), WindForce(wind.aero, wind.wind, wind.normal, 2 * wind.area)
+    assert divide([spring, wind, other]) == (wind, (spring, other))
+    assert divide([spring]) == (None, (spring,))
+    with pytest.raises(NotImplementedError, match="Spring has no Triton twin"):
+        spring.twin()
+    pytest.importorskip("triton")
+    assert isinstance(wind.twin(), Twin)
+
+
+# ---- wind that depends on the place
+
+
+class Shear(SpatialWind):
+    """Stronger with height, and with time."""
+
+    recordable = True
+
+    def forward(self, time, position):
+        speed = (5.0 + 100.0 * time) * (1 + position[..., 2])
+        return torch.stack([speed, torch.zeros_like(speed), torch.zeros_like(speed)], dim=-1)
+
+
+class Everywhere(SpatialWind):
+    """The same everywhere, said with places."""
+
+    def forward(self, time, position):
+        return torch.tensor([4.0, 0.0, 1.0], dtype=position.dtype)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@torch.no_grad()
+def test_a_wind_may_depend_on_the_place(formulation):
+    solver, start, wind = _setting(formulation)
+    same = WindForce(wind.aero, Everywhere(), wind.normal, wind.area)
+    torch.testing.assert_close(
+        solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, rtol=0, atol=1e-13
+    )
+    shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
+    assert not shear.has_twin
+    assert shear.recordable
+    assert not same.recordable
+    state = start
+    for _ in range(3):
+        force, _drag = wind.force(state, Shear()(state.time, state.position))
+        state = solver.step(state, DT, force=force)
+    end = solver.rollout(start, DT, 3, shear)
+    torch.testing.assert_close(end.velocity, state.velocity, rtol=0, atol=1e-13)
+    assert float((end.velocity - solver.rollout(start, DT, 3, wind).velocity).abs().max()) > 1e-4
+
+
+@torch.no_grad()
+def test_scenes_of_a_batch_may_mix_winds():
+    solver, start, wind = _setting(batch=(2,))
+    mixed = WindForce(wind.aero, [Shear(), WindField([1.0, 2.0, 3.0])], wind.normal, wind.area)
+    air = mixed.air(start.time, start.position)
+    torch.testing.assert_close(air[0], Shear()(start.time, start.position[0]))
+    assert air[1].unique(dim=0).tolist() == [[1.0, 2.0, 3.0]]
+    assert bool(torch.isfinite(solver.rollout(start, DT, 2, mixed).position).all())
+
+
+@torch.no_grad()
+def test_samples_are_the_wind_at_several_times():
+    _, start, wind = _setting()
+    assert torch.equal(wind.samples(start, 0.1, 3), wind.winds(start.time, 0.1, 3))
+    shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
+    found = shear.samples(start, 0.1, 3)
+    for k in range(3):
+        torch.testing.assert_close(found[k], Shear()(start.time + 0.1 * k, start.position))
+
+
+# ---- the page and the package
+
+
+def test_every_example_of_the_page_has_its_output():
+    assert len(EXAMPLES) == PAGE.count("```python") == 3
+    for name, (example, _) in zip(("PointVortex(Force)", "Buoyancy(Force)", "(SpatialWind)"), EXAMPLES, strict=True):
+        own = example[example.index("class ") : re.search(r"\n\n\n(?=\w)(?!class)", example).start()]
+        assert name in own
+        assert len([line for line in own.splitlines() if line.strip()]) <= 15
+
+
+@pytest.mark.parametrize(("example", "output"), EXAMPLES, ids=["vortex", "buoyancy", "spatial wind"])
+def test_example_prints_what_the_page_shows(example, output, capsys):
+    """Numbers to 2 % or the last digit that is shown."""
+    torch.manual_seed(0)
+    exec(compile(example, "docs/forces.md", "exec"), {})
+    printed, number = capsys.readouterr().out, r"\d+(?:\.\d+)?"
+    assert re.sub(number, "#", printed) == re.sub(number, "#", output)
+    for found, expected in zip(re.findall(number, printed), re.findall(number, output), strict=True):
+        digit = 10.0 ** -len(expected.partition(".")[2])
+        assert float(found) == pytest.approx(float(expected), rel=0.02, abs=1.01 * digit)
+
+
+def test_mpm_imports_nothing_that_is_built_on_it():
+    """Of the package only itself, regions, and what lies below all of it."""
+    allowed = ("gaussian_swaying.mpm", "gaussian_swaying._", "gaussian_swaying.gaussians.selection")
+    modules = sorted((ROOT / "gaussian_swaying" / "mpm").glob("*.py"))
+    assert len(modules) > 15
+    for path in modules:
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.ImportFrom):
+                assert node.level == 0, path.name
+                names = [
+                    node.module if node.module != "gaussian_swaying" else f"{node.module}.{a.name}" for a in node.names
+                ]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            for name in names:
+                if name.startswith("gaussian_swaying"):
+                    assert name.startswith(allowed), f"{path.name} imports {name}"
