@@ -1,0 +1,66 @@
+"""Checkpoints of a training that are damaged or something else are refused in one sentence."""
+
+import random
+
+import pytest
+import torch
+
+from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
+from gaussian_swaying.training.densification import PARAMETERS
+
+FIELDS = ("densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen")
+
+
+def _held():
+    state = {f"model.{name}": torch.randn(20, 3) for name in PARAMETERS}
+    return {"state_dict": state, "splat_training": dict.fromkeys(FIELDS, 0), "global_step": 5}
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "checkpoints" / "step.ckpt"
+    SealedCheckpoints().save_checkpoint(_held(), str(path))
+    return path
+
+
+def _refused(file, case):
+    with pytest.raises(ValueError, match=r"^[^\n]*step\.ckpt [^\n]*give another `--ckpt_path`\.$"):
+        SealedCheckpoints().load_checkpoint(str(file))
+    return case
+
+
+def test_damaged_ones(file):
+    content, generator = file.read_bytes(), random.Random(0)
+    assert read_training_checkpoint(file)["global_step"] == 5
+    assert torch.load(file, weights_only=True)["global_step"] == 5  # for others it is as any
+    for _ in range(40):
+        changed = bytearray(content)
+        changed[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
+        file.write_bytes(changed)
+        _refused(file, "a bit")
+    for broken in (b"", b"hello", content[:-1], content[: len(content) // 2], content[:-90], content + b"\n"):
+        file.write_bytes(broken)
+        _refused(file, "cut")
+    file.unlink()
+    _refused(file, "missing")
+    file.mkdir()
+    _refused(file, "a folder")
+
+
+def test_something_else_with_a_right_checksum(file):
+    def save(held):
+        SealedCheckpoints().save_checkpoint(held, str(file))
+        return file
+
+    for name in FIELDS:
+        held = _held()
+        del held["splat_training"][name]
+        _refused(save(held), name)
+    for name in PARAMETERS:
+        for wrong in (None, 3, torch.randn(19, 3), torch.randn(20, 3).double(), torch.full((20, 3), torch.nan)):
+            held = _held()
+            held["state_dict"][f"model.{name}"] = wrong
+            _refused(save(held), name)
+    for other in ([1], {}, {"splat_training": 3}, _held() | {"state_dict": None}):
+        _refused(save(other), other)
+    assert [path.name for path in file.parent.iterdir()] == ["step.ckpt"]
