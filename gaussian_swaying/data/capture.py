@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -179,6 +180,33 @@ def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
     if float(torch.linalg.eigvalsh(matrix)[0]) < 1e-6 * len(cameras):
         return torch.full((3,), float("nan"), dtype=torch.float64)
     return torch.linalg.solve(matrix, (across @ eyes[..., None]).sum(0)[:, 0])
+
+
+def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
+    """The point nearest to all optical axes, if most cameras have it before them.
+
+    Args:
+        cameras: At least one camera.
+
+    Returns:
+        The point [scene units], float64, shape (3,); None if they look at no common point.
+    """
+    focus = nearest_to_axes(cameras)
+    if not bool(torch.isfinite(focus).all()):
+        return None
+    depths = [c.world_to_camera[2, :3].double() @ focus + c.world_to_camera[2, 3].double() for c in cameras]
+    return focus if 2 * sum(bool(depth > 0) for depth in depths) > len(cameras) else None
+
+
+def view_reach(cameras: Sequence[Camera], focus: Tensor) -> float:
+    """How far to a side of a point (3,) the median camera sees [scene units]."""
+    reach = []
+    for camera in cameras:
+        distance = math.dist(camera.position.tolist(), focus.tolist())
+        across = 0.5 * camera.width / float(camera.intrinsics[0, 0])
+        upward = 0.5 * camera.height / float(camera.intrinsics[1, 1])
+        reach.append(distance * max(across, upward))
+    return sorted(reach)[len(reach) // 2]
 
 
 def _check_count(name: str, value: int, least: int) -> None:

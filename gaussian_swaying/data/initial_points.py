@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.data.capture import Capture, nearest_to_axes
+from gaussian_swaying.data.capture import Capture, common_focus, view_reach
 from gaussian_swaying.data.point_cloud import PointCloud, read_obj_mesh, read_ply_points, sample_mesh
 
 _ATTEMPTS = 100
@@ -169,12 +169,8 @@ def consistent_points(
 
 def _focus(capture: Capture) -> Tensor:
     """The point nearest to all optical axes, or an error if the cameras do not look at it."""
-    cameras = [view.camera for view in capture.split("train")]
-    focus = nearest_to_axes(cameras)
-    ahead = 0
-    for camera in cameras:
-        ahead += bool((camera.world_to_camera[2, :3].double() @ focus + camera.world_to_camera[2, 3].double()) > 0)
-    if not bool(torch.isfinite(focus).all()) or 2 * ahead <= len(cameras):
+    focus = common_focus([view.camera for view in capture.split("train")])
+    if focus is None:
         raise ValueError(
             f"The cameras of {capture.path} look at no common point, so no cube for random initial points is known: "
             "set the initial points to a .ply or .obj file."
@@ -185,11 +181,4 @@ def _focus(capture: Capture) -> Tensor:
 def _view_cube(capture: Capture) -> tuple[Tensor, float]:
     """Centre and half side of the cube that the median camera sees."""
     focus = _focus(capture)
-    reach = []
-    for view in capture.split("train"):
-        camera = view.camera
-        distance = math.dist(camera.position.tolist(), focus.tolist())
-        across = 0.5 * camera.width / float(camera.intrinsics[0, 0])
-        upward = 0.5 * camera.height / float(camera.intrinsics[1, 1])
-        reach.append(distance * max(across, upward))
-    return focus, sorted(reach)[len(reach) // 2]
+    return focus, view_reach([view.camera for view in capture.split("train")], focus)

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gaussian_swaying.data.capture import nearest_to_axes
+from gaussian_swaying.data.capture import common_focus, view_reach
 from gaussian_swaying.data.capture_camera import read_views
 from gaussian_swaying.gaussians.selection import Cylinder
 from gaussian_swaying.rendering.camera import Camera
@@ -118,19 +118,8 @@ def captured_from(path: str | Path) -> CapturedFrom:
     cameras = [camera for _, camera in read_views(path)]
     up, confidence, reason = cameras_up(cameras)
     eyes = torch.stack([camera.position.double() for camera in cameras])
-    focus: Tensor | None = nearest_to_axes(cameras)
-    assert focus is not None
-    ahead = sum(float(c.world_to_camera[2, :3].double() @ focus + c.world_to_camera[2, 3]) > 0 for c in cameras)
-    if not bool(torch.isfinite(focus).all()) or 2 * ahead <= len(cameras):
-        focus = None
-    reach = 0.0
-    if focus is not None:
-        sides = [
-            float((eye - focus).norm())
-            * max(0.5 * c.width / float(c.intrinsics[0, 0]), 0.5 * c.height / float(c.intrinsics[1, 1]))
-            for eye, c in zip(eyes, cameras, strict=True)
-        ]
-        reach = sorted(sides)[len(sides) // 2]
+    focus = common_focus(cameras)
+    reach = 0.0 if focus is None else view_reach(cameras, focus)
     return CapturedFrom(str(path), cameras, eyes, up, confidence, reason, focus, reach)
 
 

@@ -12,7 +12,7 @@ import yaml
 from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.simulation import config
-from gaussian_swaying.simulation.preview_cli import main
+from gaussian_swaying.simulation.preview_cli import main, splat_name
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -174,6 +174,27 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
     ):
         check_refused(scene, tmp_path, capsys, *options, words=words)
+
+
+def test_a_point_cloud_is_called_after_its_training():
+    assert splat_name("splats/guitar.ply") == "guitar"
+    assert splat_name("outputs/train/fox/point_cloud.ply") == "fox"
+    assert splat_name("/data/bonsai/point_cloud/iteration_30000/point_cloud.ply") == "bonsai"
+
+
+def test_weak_guesses_print_their_commands(splat, tmp_path, capsys):
+    """A flag whose origin is far from its pole may hang from its top."""
+    cloud = FlagScene(spacing=0.08).generate()
+    cloud.means.add_(5.0)
+    write_ply(splat, cloud)
+    assert preview(splat, tmp_path / "out", "--up", "+z") == 0
+    report = capsys.readouterr().out
+    assert "warning: that it is held at the top is a weak guess" in report
+    again = f"python tools/preview.py {splat} --output {tmp_path / 'out'} --up +z --hold"
+    for end in ("top", "-x"):
+        assert f"{again} {end} --height 96 --device cpu" in report
+    assert preview(splat, tmp_path / "out", "--up", "+z", "--hold", "-x") == 0
+    assert "weak guess" not in capsys.readouterr().out
 
 
 def test_script_answers_help():
