@@ -41,7 +41,9 @@ def test_the_numbers_are_the_papers(name):
     flow = wind.schedule[0].flow if wind.schedule else wind.flow
     assert (material.E, material.nu, material.density) == PAPER[name][:3]
     assert not any(getattr(entry, field) for entry in material.regions for field in ("E", "nu", "density", "law"))
-    assert (aero.C_D, aero.C_F, aero.C_L, list(flow)) == PAPER[name][3:]
+    assert (aero.C_D, aero.C_F, aero.C_L) == PAPER[name][3:6]
+    given = PAPER[name][6]  # in axes that the paper does not give: those of the vase are turned here
+    assert list(flow) == ([given[2], given[1], given[0]] if name == "vase" else given)
     assert material.law.class_path.endswith("Sand" if name == "sand" else "FixedCorotated")
     assert settings.solver.formulation == ("updated" if name == "sand" else "total")
     assert settings.scene.opacity_threshold == (0.02 if name == "sand" else 0.1)
@@ -54,25 +56,40 @@ def test_what_flows_has_a_limit_on_its_area_and_all_have_one_on_what_is_drawn(na
     settings = build_parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
     law = settings.material.law
     flows = law is not None and law.class_path.endswith("Sand")
-    assert (settings.aero.max_area_ratio, settings.scene.max_stretch) == (1.0 if flows else None, 2.0)
+    assert settings.aero.max_area_ratio == (1.0 if flows else None)
+    assert settings.scene.max_stretch == (1.3 if name == "sand" else 2.0)  # grains that scatter
 
 
 def test_the_wind_of_the_vase_turns():
     parser = build_parser()
     wind = parser.instantiate(parser.parse_args(files("vase"))).wind
     assert [wind.mean_flow(torch.tensor(t, dtype=torch.float64)).tolist() for t in (0.0, 9.0)] == [
-        [0, 0, -1.5],
-        [0, 0, 1.5],
+        [-1.5, 0, 0],
+        [1.5, 0, 0],
     ]
 
 
 @pytest.mark.parametrize("name", PAPER)
 def test_the_preset_is_a_small_version(name):
-    """Fewer Gaussians on a coarser grid in a smaller picture, and nothing else; pins and regions still hold some."""
+    """Fewer Gaussians on a coarser grid in a smaller picture; pins and regions still hold some.
+
+    A coarse grid is stiffer, so thicknesses, which the paper leaves open, may be smaller; nothing else differs.
+    """
     parser = build_parser()
     full, small = (parser.parse_args(arguments) for arguments in (files(name)[:2], files(name)))
     changed = yaml.safe_load((CONFIGS / f"preview/{name}.yaml").read_text())
-    assert set(changed) == {"scene", "solver", "camera"}
+    if name == "sand":  # half as long, of a larger bear, as sand takes the most substeps
+        assert (changed.pop("frames"), changed["scene"].pop("metres_per_unit")) == (125, 0.5)
+        sway = small.wind.modulations[0].init_args
+        assert changed.pop("wind")["modulations"][0]["init_args"]["period"] == sway.period == 10.0
+        assert (sway.amplitude, small.wind.modulations[1].init_args.std) == (0.5, 0.3)
+    assert set(changed) - {"material"} == {"scene", "solver", "camera"}
+    assert set(changed.get("material", {})) <= {"thickness", "regions"}
+    assert small.material.thickness <= full.material.thickness
+    assert len(small.material.regions) == len(full.material.regions)
+    for one, other in zip(small.material.regions, full.material.regions, strict=True):
+        assert one.region == other.region
+        assert one.thickness <= other.thickness
     assert set(changed["scene"]) == {"generator"}
     assert small.scene.generator.init_args.spacing > 2 * full.scene.generator.init_args.spacing
     assert small.solver.dx > full.solver.dx

@@ -32,6 +32,7 @@ def test_a_scene_is_run_and_pictured(gallery, tmp_path):
     row = gallery.run_scene("flag2", options, tmp_path)
     assert row["frames"] == 3
     assert row["displacement_share"] == pytest.approx(row["displacement_mean_max_m"] / row["size_m"])
+    assert gallery.of_today("flag2", row)
     assert row["size_m"] == pytest.approx(1.2, abs=0.2)
     picture = imread(tmp_path / "gallery_flag2.png")
     assert picture.shape[1] == 5 * 360
@@ -56,6 +57,12 @@ def test_whole_means_all_of_it(gallery):
     row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview"}
     result = {"device": "CPU", "versions": {}, "seed": 0, "scenes": {"ficus": row, "sand": {"failed": "x"}}}
     text = "\n".join(gallery.page([result]))
+    assert "| Ficus \\*, preset" in text  # no word of its configuration
+    assert "Recorded before" in text
+    row["configuration"] = gallery.fingerprint("ficus", "preview")
+    assert row["configuration"] != gallery.fingerprint("ficus", None)
+    text = "\n".join(gallery.page([result]))
+    assert "Recorded before" not in text
     shown = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
     assert shown in text
     assert "| Sand | failed" in text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -46,10 +47,8 @@ def floor(
     edges = [0.0]
     while edges[-1] < _REACH:
         edges.append(edges[-1] + max(spacing, _GROWTH * (edges[-1] - flat)))
-    rings = [
-        revolution([[high, 0.0], [low, 0.0]], max(high - low, 1e-6), colour)
-        for low, high in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    edges[-1] = max(_REACH, edges[-2] + 1e-3)
+    rings = [revolution([[high, 0.0], [low, 0.0]], high - low, colour) for low, high in pairwise(edges)]
     ground = join(rings)
     x, y = ground.center[:, 0], ground.center[:, 1]
     paint = torch.tensor(colour, dtype=torch.float64) * (1 + 0.015 * Draw(0).normal(len(ground), 1))

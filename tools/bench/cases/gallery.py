@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import subprocess
 import sys
@@ -53,6 +54,12 @@ def arguments(name: str, preset: str | None) -> list[str]:
     return [part for file in files for part in ("--config", str(file))]
 
 
+def fingerprint(name: str, preset: str | None) -> str:
+    """A few letters that change when a configuration file of a scene does."""
+    files = [Path(part) for part in arguments(name, preset) if part != "--config"]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
 def strip(frames: Path, target: Path) -> None:
     """A picture of five frames beside each other."""
     import numpy as np
@@ -89,7 +96,8 @@ def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
         strip(output / "frames", pictures / f"gallery_{name}.png")
     moved = summary["displacement_mean_max_m"]
     share = None if moved is None else moved / summary["size_m"]
-    return summary | {"process_s": seconds, "preset": options.preset, "displacement_share": share}
+    noted = {"preset": options.preset, "configuration": fingerprint(name, options.preset)}
+    return summary | noted | {"process_s": seconds, "displacement_share": share}
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -133,6 +141,11 @@ def most(_: list[Row]) -> str:
     return f"{100 * MOST:g} %"
 
 
+def of_today(name: str, row: Row) -> bool:
+    """Whether a run was recorded with the configuration files as they are now."""
+    return bool(row.get("configuration") == fingerprint(name, row.get("preset")))
+
+
 def page(recorded: list[Row]) -> list[str]:
     """Time, memory and motion of each scene, one table for each record."""
     lines = []
@@ -155,13 +168,19 @@ def page(recorded: list[Row]) -> list[str]:
             memory = row["peak_memory_bytes"]
             on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
             moved = row["displacement_share"]
+            older = "" if of_today(name, row) else " \\*"
             lines.append(
-                f"| {title}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
+                f"| {title}{older}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
                 f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
                 f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
                 f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
             )
         lines += [""]
+        if any("failed" not in row and not of_today(name, row) for name, row in result["scenes"].items()):
+            lines += [
+                "\\* Recorded before a configuration file of this scene was changed, or before that was noted.",
+                "",
+            ]
     return lines
 
 
