@@ -527,17 +527,22 @@ FORCES = {
 
 
 @pytest.mark.parametrize(
-    ("kernel_device", "name"),
-    _on("wind and custom", "custom, wind, wind", interpreted=["custom", "semi-implicit wind and custom"]),
+    ("kernel_device", "case"),
+    _on(
+        ("wind and custom", 2.0),
+        ("custom, wind, wind", None),
+        interpreted=[("custom", 2.0), ("semi-implicit wind and custom", None)],
+    ),
     indirect=["kernel_device"],
+    ids=str,
 )
-@pytest.mark.parametrize("resistance", [None, 2.0], ids=["force", "resistance"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_forces_in_torch_among_the_kernels(kernel_device, formulation, resistance, name, monkeypatch):
+def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, monkeypatch):
     """Over a part that ends, particles that are sorted anew, and a batch; all forces and their work."""
+    name, resistance = case
     monkeypatch.setattr(fused, "MAX_STEPS", 3)
     monkeypatch.setattr(fused, "RESORT", 2)
-    points = _points(kernel_device, count=10, batch=(2,))
+    points = _points(kernel_device, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)
 
     def run(solver, state):
