@@ -40,19 +40,17 @@ if TYPE_CHECKING:
         VelocityBox,
     )
     from gaussian_swaying.mpm.forces import Force
-    from gaussian_swaying.mpm.materials import (
-        ConstitutiveLaw,
-        FixedCorotated,
-        Fluid,
-        Foam,
-        Metal,
-        NeoHookean,
-        Plasticine,
-        Sand,
-        Snow,
-        SpringNetwork,
-        StVKHencky,
-    )
+    from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+    from gaussian_swaying.mpm.laws.fluid import Fluid
+    from gaussian_swaying.mpm.laws.foam import Foam
+    from gaussian_swaying.mpm.laws.hencky import StVKHencky
+    from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+    from gaussian_swaying.mpm.laws.metal import Metal
+    from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+    from gaussian_swaying.mpm.laws.plasticine import Plasticine
+    from gaussian_swaying.mpm.laws.sand import Sand
+    from gaussian_swaying.mpm.laws.snow import Snow
+    from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
     from gaussian_swaying.mpm.solver import MPMSolver
     from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
     from gaussian_swaying.rendering.camera import Camera
@@ -104,19 +102,17 @@ _HOMES = {
         "VelocityBox",
     ),
     "mpm.forces": ("Force",),
-    "mpm.materials": (
-        "ConstitutiveLaw",
-        "FixedCorotated",
-        "Fluid",
-        "Foam",
-        "Metal",
-        "NeoHookean",
-        "Plasticine",
-        "Sand",
-        "Snow",
-        "SpringNetwork",
-        "StVKHencky",
-    ),
+    "mpm.laws.fixed_corotated": ("FixedCorotated",),
+    "mpm.laws.fluid": ("Fluid",),
+    "mpm.laws.foam": ("Foam",),
+    "mpm.laws.hencky": ("StVKHencky",),
+    "mpm.laws.law": ("ConstitutiveLaw",),
+    "mpm.laws.metal": ("Metal",),
+    "mpm.laws.neo_hookean": ("NeoHookean",),
+    "mpm.laws.plasticine": ("Plasticine",),
+    "mpm.laws.sand": ("Sand",),
+    "mpm.laws.snow": ("Snow",),
+    "mpm.laws.spring_network": ("SpringNetwork",),
     "mpm.solver": ("MPMSolver",),
     "mpm.state": ("GridSpec", "MPMState", "MaterialPoints"),
     "rendering.camera": ("Camera",),

@@ -4,6 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.simulation.files import atomic
 from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
 
@@ -19,21 +20,23 @@ def main(arguments=None):
     parser.add_argument(
         "--sticky-planes", action="store_true", help="Make every plane stick, as PhysGaussian's code does."
     )
-    options = parser.parse_args(arguments)
-    try:
-        settings, notes = convert(read_config(options.config), options.cameras, options.sticky_planes)
-        text = to_yaml(settings, notes, options.config.name)
-        if options.output is None:
-            print(text, end="")
-        else:
-            with atomic(options.output) as temporary:
-                temporary.write_text(text, encoding="utf-8")
-    except (ValueError, TypeError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return run_command(
+        lambda: write(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="a smaller file"
+    )
+
+
+def write(options):
+    """Convert, write or print, and say what was written and what means something else."""
+    settings, notes = convert(read_config(options.config), options.cameras, options.sticky_planes)
+    text = to_yaml(settings, notes, options.config.name)
+    if options.output is None:
+        print(text, end="")
+    else:
+        with atomic(options.output) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        print(f"wrote {options.output}")
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    return 0
 
 
 if __name__ == "__main__":

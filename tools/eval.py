@@ -7,15 +7,11 @@ RUN is what ``tools/sim.py`` wrote. REFERENCE has ``frames/*.png`` and, for the 
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
-
-import torch
-
+from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.metrics.compare import evaluate, table
 from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 from gaussian_swaying.simulation.config import resolve_device
@@ -50,43 +46,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep
         their traceback.
     """
-    options = build_parser().parse_args(arguments)
+    parser = build_parser()
+    return run_command(
+        lambda: compare(parser.parse_args(arguments)),
+        stopped="Stopped; nothing was written.",
+        memory="fewer `--points`, or `--device cpu`",
+    )
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Compare, print the table and say what was written."""
     output = Path(options.output or Path(options.run) / "eval")
-    try:
-        device = resolve_device(options.device)
-        network = None
-        if options.i3d:
-            network = FrechetVideoDistance(options.i3d, options.clip_length, options.clip_stride, options.resize)
-        result = evaluate(
-            options.run,
-            options.reference,
-            output,
-            video=not options.no_video,
-            reference_offset=options.reference_offset,
-            frames=options.frames,
-            side=options.side,
-            points=options.points,
-            seed=options.seed,
-            device=device,
-            fvd=network,
-            progress=sys.stderr.isatty(),
-        )
-    except KeyboardInterrupt:
-        print("Stopped; nothing was written.", file=sys.stderr)
-        return 130
-    except torch.OutOfMemoryError as error:
-        print(f"error: {str(error).splitlines()[0]} Remedy: fewer `--points`, or `--device cpu`.", file=sys.stderr)
-        return 2
-    except (ValueError, TypeError, OSError) as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        print(f"error: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 2
+    device = resolve_device(options.device)
+    network = None
+    if options.i3d:
+        network = FrechetVideoDistance(options.i3d, options.clip_length, options.clip_stride, options.resize)
+    result = evaluate(
+        options.run,
+        options.reference,
+        output,
+        video=not options.no_video,
+        reference_offset=options.reference_offset,
+        frames=options.frames,
+        side=options.side,
+        points=options.points,
+        seed=options.seed,
+        device=device,
+        fvd=network,
+        progress=sys.stderr.isatty(),
+    )
     print(table(result), end="")
     for name in ("eval.json", "eval.md", "comparison.mp4"):
         if (output / name).exists() and not (name == "comparison.mp4" and (options.no_video or not result["size"])):
             print(f"wrote {output / name}")
-    return 0
 
 
 if __name__ == "__main__":

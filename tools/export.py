@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.export import SUFFIXES, convert, format_of
 from gaussian_swaying.simulation.frame import SimFrame
 
@@ -71,27 +72,29 @@ def usd_settings(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Parse and convert; 2 on bad input."""
-    options = build_options().parse_args(arguments)
-    try:
-        if options.fps is not None:
-            check_positive("--fps", options.fps)
-        if format_of(options.target) != "usd":
-            if options.up is not None or options.metres_per_unit is not None:
-                raise ValueError(
-                    "--up and --metres-per-unit are for USD files, as no other format says which way is up: leave them "
-                    "out, or let the target end in .usdc."
-                )
-            convert(options.source, options.target)
-        else:
-            fps, frame, origin = usd_settings(options)
-            convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation)
-            up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
-            print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    parser = build_options()
+    return run_command(
+        lambda: export(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="fewer Gaussians"
+    )
+
+
+def export(options: argparse.Namespace) -> None:
+    """Convert, and say what was written."""
+    if options.fps is not None:
+        check_positive("--fps", options.fps)
+    if format_of(options.target) != "usd":
+        if options.up is not None or options.metres_per_unit is not None:
+            raise ValueError(
+                "--up and --metres-per-unit are for USD files, as no other format says which way is up: leave them "
+                "out, or let the target end in .usdc."
+            )
+        convert(options.source, options.target)
+    else:
+        fps, frame, origin = usd_settings(options)
+        convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation)
+        up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
+        print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
     print(f"wrote {options.target}")
-    return 0
 
 
 if __name__ == "__main__":

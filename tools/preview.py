@@ -6,11 +6,9 @@ writes a first configuration. With ``--config`` it shows what that configuration
 
 from __future__ import annotations
 
-import os
 import sys
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
-
+import gaussian_swaying.cli  # noqa: F401  (sets up threads, before torch is imported)
 from gaussian_swaying.simulation.preview_cli import main
 
 if __name__ == "__main__":

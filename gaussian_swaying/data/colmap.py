@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.data.images import PosedImage
 from gaussian_swaying.data.lens import NO_DISTORTION, Lens
 
@@ -141,6 +142,7 @@ def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable
     if not file.is_file():
         file = model / f"{name}.txt"
     try:
+        check_regular(file, name)
         if file.suffix == ".bin":
             return binary(file.read_bytes())
         lines = file.read_text(encoding="utf-8").splitlines()

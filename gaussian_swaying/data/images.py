@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying.data.lens import Lens, remap
 
+_PIXELS = 80_000_000  # and one more for each byte of the file: reading takes some 12 bytes a pixel
 _WITH_ALPHA = ("RGBA", "LA", "PA", "P", "La", "RGBa")
 
 
@@ -39,7 +40,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image file [pixels], from its header.
 
     Raises:
-        ValueError: If the file is missing or is not an image.
+        ValueError: If the file is missing, is not an image, or has far more pixels than its size lets one expect.
     """
     import imageio.v3 as iio
 
@@ -47,6 +48,11 @@ def image_size(path: str | Path) -> tuple[int, int]:
         height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]
     except Exception as error:  # the readers of the formats raise what they like
         raise _unreadable(path, error) from error
+    if width * height > _PIXELS + Path(path).stat().st_size:
+        raise ValueError(
+            f"The image {path} announces {width:,} x {height:,} pixels, too many for its size: make it smaller, or "
+            "delete it to leave it out."
+        )
     return int(width), int(height)
 
 

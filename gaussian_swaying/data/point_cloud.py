@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.gaussians.ply_table import read_header
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +87,7 @@ def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
     from plyfile import PlyData, PlyParseError
 
     try:
+        read_header(path)  # what it announces is in the file
         ply = PlyData.read(str(path))
         table = ply["vertex"].data
         points = np.stack([np.asarray(table[axis], dtype=np.float32) for axis in ("x", "y", "z")], -1)
@@ -125,7 +128,7 @@ def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
     colors: list[list[float]] = []
     polygons: list[list[int]] = []
     try:
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in check_regular(path, "the mesh").read_text(encoding="utf-8", errors="replace").splitlines():
             words = line.split()
             if words[:1] == ["v"]:
                 numbers = [float(word) for word in words[1:]]

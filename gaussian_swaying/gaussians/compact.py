@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaussian_swaying.gaussians.ply import GaussianCloud, check_sizes_and_rotations, read_elements, read_ply
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.gaussians.ply import GaussianCloud, check_sizes_and_rotations, read_binary_header, read_ply
+from gaussian_swaying.gaussians.ply_table import read_element, read_header
 from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
 
 CHUNK = 256  # Gaussians that share a range of values in a compressed .ply
@@ -36,9 +38,8 @@ def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
     path = Path(path)
     if path.suffix.lower() == ".splat":
         return read_splat(path)
-    if path.is_file() and _is_compressed(path):
-        return read_compressed_ply(path)
-    return read_ply(path)
+    fields = {name for element in read_header(path).elements for name, _ in element.fields}
+    return read_compressed_ply(path) if "packed_position" in fields else read_ply(path)
 
 
 def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -56,11 +57,7 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is empty or cut off, or a Gaussian has no finite centre, no size or no rotation.
     """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; check the path of the .splat file.")
-    if not path.is_file():
-        raise ValueError(f"{path} is not a regular file; give the .splat file itself.")
+    path = check_regular(path, "the .splat file")
     size = path.stat().st_size
     if size == 0 or size % _SPLAT.itemsize:
         raise ValueError(
@@ -91,8 +88,9 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         ValueError: If the file is cut off or lacks something.
     """
     path = Path(path)
-    ply = read_elements(path)
-    vertices = ply["vertex"].data
+    header = read_binary_header(path)
+    held = {element.name for element in header.elements}
+    vertices = read_element(path, header, "vertex")
     count = len(vertices)
     if count == 0:
         raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
@@ -101,7 +99,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
             raise ValueError(f"{path} has no property `{name}`, so it is no compressed .ply; export it again.")
         if vertices.dtype[name].kind not in "iu":
             raise ValueError(f"{path}: property `{name}` is not a whole number; export the file again.")
-    chunks: Any = ply["chunk"].data if "chunk" in ply else np.empty(0)
+    chunks: Any = read_element(path, header, "chunk") if "chunk" in held else np.empty(0)
     if len(chunks) < -(-count // CHUNK):
         raise ValueError(
             f"{path} has {len(chunks)} chunks, too few for {count} Gaussians in chunks of {CHUNK}; export it again."
@@ -126,15 +124,8 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     rgba = np.stack([(color >> shift & 255) / 255 for shift in (24, 16, 8, 0)], -1)
     if "min_r" in chunks.dtype.names:
         rgba[:, :3] = within(rgba[:, :3], ("r", "g", "b"))
-    rest = _harmonics(path, ply["sh"].data, count) if "sh" in ply else None
+    rest = _harmonics(path, read_element(path, header, "sh"), count) if "sh" in held else None
     return _cloud(path, means, scales, _smallest_three(rotation), rgba, rest)
-
-
-def _is_compressed(path: Path) -> bool:
-    """Whether the header of a .ply names packed positions."""
-    with path.open("rb") as stream:
-        head = stream.read(65536)
-    return head.startswith(b"ply") and b"packed_position" in head.partition(b"end_header")[0]
 
 
 def _three(packed: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:

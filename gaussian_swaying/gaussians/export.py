@@ -19,6 +19,7 @@ from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
+from gaussian_swaying.simulation.files import atomic
 
 SUFFIXES = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
 """Formats, and how their files' names end."""
@@ -167,12 +168,8 @@ def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
 
 def _replace(path: Path, write: Callable[[Path], Any]) -> None:
     """Write under a temporary name of the same ending, and rename."""
-    temporary = path.with_name(f".{os.getpid()}.{path.name}")
-    try:
+    with atomic(path) as temporary:
         write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:

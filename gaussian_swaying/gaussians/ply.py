@@ -16,7 +16,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying.gaussians.ply_table import PlyHeader, read_element, read_header
 from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
+from gaussian_swaying.simulation.files import atomic
 
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -111,7 +113,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         UserWarning: Once, naming the properties that were ignored; once, if infinite opacity logits were replaced.
     """
     path = Path(path)
-    data: np.ndarray = read_elements(path)["vertex"].data
+    data = read_element(path, read_binary_header(path), "vertex")
     names = data.dtype.names or ()
     if "packed_position" in names:
         raise ValueError(
@@ -132,8 +134,6 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     def columns(fields: tuple[str, ...]) -> np.ndarray:
         table = np.empty((len(data), len(fields)), dtype=np.float32)
         for index, field in enumerate(fields):
-            if data.dtype[field].hasobject:
-                raise ValueError(f"{path}: property `{field}` is a list; export it as one float per Gaussian.")
             with np.errstate(over="ignore"):
                 table[:, index] = data[field]
         for index, field in enumerate(fields):
@@ -191,12 +191,8 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     rest = tuple(f"f_rest_{index}" for index in range(rest_count))
     names = (*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
     rows = table.astype("<f4", copy=False).view([(name, "<f4") for name in names]).reshape(count)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with atomic(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:
@@ -214,30 +210,12 @@ def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray)
     _reject(path, zero_quats, "the quaternion `rot_0` to `rot_3` is zero", "remove them or store 1 0 0 0")
 
 
-def read_elements(path: Path) -> Any:
-    """The elements of a binary .ply file with vertices, as plyfile reads them, or an error that names what is wrong."""
-    from plyfile import PlyData, PlyElementParseError, PlyHeaderParseError
-
-    if not path.exists():
-        raise FileNotFoundError(f"{path} does not exist; check the path of the .ply file.")
-    if path.is_dir():
-        raise ValueError(f"{path} is a directory; give the .ply file inside it, such as point_cloud.ply.")
-    with path.open("rb") as stream:
-        head = stream.read(256)
-    if not re.match(rb"ply\r?\n", head):
-        raise ValueError(f"{path} is not a .ply file (it does not start with `ply`); export the scene as .ply.")
-    if re.search(rb"^format ascii", head, re.MULTILINE):
+def read_binary_header(path: Path) -> PlyHeader:
+    """The header of a binary .ply file, as :func:`~gaussian_swaying.gaussians.ply_table.read_header`; no text."""
+    header = read_header(path)
+    if header.order == "":
         raise ValueError(f"{path} is an ASCII .ply (format ascii); export as binary.")
-    try:
-        ply = PlyData.read(str(path))
-    except PlyElementParseError as error:
-        raise ValueError(f"{path} is truncated: {error}; copy or export the file again.") from error
-    except (PlyHeaderParseError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} has a broken .ply header: {error}; export the file again.") from error
-    if "vertex" not in ply:
-        found = ", ".join(element.name for element in ply.elements) or "none"
-        raise ValueError(f"{path} has no element `vertex` (elements: {found}); export it from a 3DGS tool.")
-    return ply
+    return header
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -17,9 +17,11 @@ class Region(ABC):
     Attributes:
         recordable: Whether :meth:`contains` copies nothing from or to the host after a first call (see :meth:`on`), so
             that a CUDA graph may record it. A class with a ``contains`` of its own has to say so itself.
+        axes: In which axes the region is given, in words; empty for those of the points that it is asked about.
     """
 
     recordable: bool = False
+    axes: str = ""
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -46,6 +48,12 @@ class Region(ABC):
     @abstractmethod
     def contains(self, points: Tensor) -> Tensor:
         """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+
+    def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
+        """Least and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
+        flat = points.detach().reshape(-1, 3).double()
+        low, high = ([round(v, 4) for v in corner.tolist()] for corner in (flat.amin(0), flat.amax(0)))
+        return low, high
 
 
 class Everything(Region):
@@ -243,9 +251,10 @@ def select_simulated(
     inside = region.contains(means)
     selected = inside & (opacities >= opacity_threshold)
     if not bool(selected.any()):
-        low, high = ([round(v, 4) for v in t.tolist()] for t in (means.amin(0).double(), means.amax(0).double()))
+        low, high = region.bounds(means)
         raise ValueError(
-            f"No Gaussian is selected: the {means.shape[0]} centres span {low} to {high}, {int(inside.sum())} lie in "
+            f"No Gaussian is selected: the {means.shape[0]} centres span {low} to {high}{region.axes}, "
+            f"{int(inside.sum())} lie in "
             f"{region!r}, and none of these reaches the opacity threshold {opacity_threshold}; move the region into "
             f"these bounds or lower the threshold (the largest opacity is {float(opacities.max()):.3g})."
         )

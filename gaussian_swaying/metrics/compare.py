@@ -19,6 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying._inputs import check_archive, read_json
 from gaussian_swaying.data.images import image_size, read_image
 from gaussian_swaying.metrics.comparison_picture import comparison_picture
 from gaussian_swaying.metrics.reference import Cloth, frame_files, read_cloth, surface_points
@@ -368,7 +369,7 @@ def _read_summary(run: Path) -> dict[str, Any]:
     if not run.is_dir():
         raise ValueError(f"There is no run folder {run}: give the folder that tools/sim.py wrote.")
     try:
-        return dict(json.loads((run / "summary.json").read_text(encoding="utf-8")))
+        return dict(read_json(run / "summary.json", "summary"))
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(
             f"The run {run} has no readable summary.json: give the folder of a finished run of tools/sim.py."
@@ -391,7 +392,7 @@ def _sim_frame(run: Path, summary: dict[str, Any]) -> SimFrame:
 
 def _trajectory_length(path: Path) -> int:
     try:
-        with np.load(path) as arrays:
+        with np.load(check_archive(path, "the run")) as arrays:
             return len(arrays.files) // 2
     except Exception as error:  # not a zip, truncated, ...
         raise ValueError(f"{path} cannot be read as a trajectory ({error}): run the simulation again.") from error

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._inputs import check_archive
 from gaussian_swaying.data.point_cloud import PointCloud, sample_mesh
 
 
@@ -42,7 +43,7 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
         ValueError: If the file is missing or damaged, lacks an array, or one has a wrong shape or value.
     """
     try:
-        with np.load(path) as arrays:
+        with np.load(check_archive(path, "the reference")) as arrays:
             found = {name: arrays[name] for name in ("positions", "faces", "side", "settings") if name in arrays}
     except Exception as error:  # not there, not a zip, pickled, ...
         raise ValueError(f"The surface {path} cannot be read ({error}): make the reference again.") from error

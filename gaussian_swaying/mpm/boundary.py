@@ -74,7 +74,9 @@ class Nodes:
 
 
 class RegionInFrame(Region):
-    """A region given in scene units, asked about points in metres."""
+    """A region given in axes and units of its own, asked about points in others: metres with z up, or scene units."""
+
+    axes = " in the axes of the region"
 
     def __init__(self, region: Region, frame: FrameLike) -> None:
         self.region, self.frame = region, frame
@@ -84,18 +86,12 @@ class RegionInFrame(Region):
         """Whether each point (..., 3) [m, z up] lies inside; bool, shape (...)."""
         return self.region.contains(self.frame.point_to_scene(points))
 
-    def bounds(self, points: Tensor) -> str:
-        """Where points [m, z up] lie, in the units in which the region was given."""
-        given = self.frame.point_to_scene(points.reshape(-1, 3))
-        return self.region.bounds(given) if isinstance(self.region, RegionInFrame) else _bounds(given)
+    def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
+        """Least and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
+        return self.region.bounds(self.frame.point_to_scene(points.reshape(-1, 3)))
 
     def __repr__(self) -> str:
         return repr(self.region)
-
-
-def _bounds(points: Tensor) -> str:
-    low, high = ([round(v, 4) for v in corner.tolist()] for corner in (points.amin(0), points.amax(0)))
-    return f"{low} and {high}"
 
 
 def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float) -> Tensor:
@@ -193,16 +189,11 @@ class _OfParticles(Boundary):
         """Particles inside the region at rest; ValueError if there are none."""
         mask = self.region.contains(rest_position)
         if not bool(mask.any()):
-            inner = self.region
-            where = (
-                inner.bounds(rest_position)
-                if isinstance(inner, RegionInFrame)
-                else _bounds(rest_position.reshape(-1, 3))
-            )
+            low, high = self.region.bounds(rest_position)
             name = type(self).__name__
             raise ValueError(
-                f"The region {inner!r} of the {name} holds no particle: the simulated particles lie between {where}; "
-                "move or enlarge `region`."
+                f"The region {self.region!r} of the {name} holds no particle: the simulated particles lie "
+                f"between {low} and {high}; move or enlarge `region`."
             )
         return mask
 

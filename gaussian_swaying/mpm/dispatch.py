@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.constitutive import lame_parameters
-from gaussian_swaying.mpm.materials import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints
 
 

@@ -20,7 +20,8 @@ from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.mpm import transfer_triton as kernels
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, TWIN_VALUES, Force, Twin, added, divide, split
-from gaussian_swaying.mpm.materials_triton import PLASTIC_KINDS, energy_kind, law_row
+from gaussian_swaying.mpm.laws.triton.body import BodyLaws
+from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def unsupported(solver: MPMSolver) -> str | None:
     if solver.deterministic and not solver.total_lagrangian:
         return "in the updated formulation its sums have no fixed order, as `deterministic` asks for"
     for law in points.laws:
-        if law_row(law) is None:
+        if twin_of(law) is None:
             return f"the law {type(law).__name__} has no fused form"
     return None
 
@@ -72,12 +73,8 @@ class FusedSolver(ABC):
         self.particles = points.count
         self.count = points.mass.numel()
         self.scenes = self.count // max(self.particles, 1)
-        rows = [law_row(law) for law in points.laws]
-        table = [[float(row[0]), *row[1]] for row in rows if row is not None]
-        self.law_table = torch.tensor(table, device=self.device)
-        self.kinds = 0
-        for row in table:
-            self.kinds |= int(row[0])
+        self.laws = BodyLaws(points.laws)
+        self.law_table = torch.tensor(self.laws.table, device=self.device)
         self.law = torch.zeros(self.count, dtype=torch.int32, device=self.device)
         if points.law_index is not None:
             self.law = points.law_index.reshape(-1).int()
@@ -87,8 +84,8 @@ class FusedSolver(ABC):
         self.numbers = torch.zeros(TWIN_NUMBERS, device=self.device)
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
-        self.energy_kind = energy_kind(points.laws)
-        self.watches = self.energy_kind > 0
+        self.wave = shared(points.laws, "wave")
+        self.watches = self.wave is not None
         """Whether rollouts can look at the speed of waves."""
         self.speed = torch.zeros(1, device=self.device)
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
@@ -114,6 +111,7 @@ class FusedSolver(ABC):
         force: Tensor | None = None,
         drag: Tensor | None = None,
         looks: Sequence[int] = (),
+        watch: Callable[[int], None] | None = None,
     ) -> tuple[MPMState, Tensor]:
         """Advance by ``steps`` substeps of ``dt`` [s], with some forces or one that stays (see ``MPMSolver.step``).
 
@@ -125,6 +123,7 @@ class FusedSolver(ABC):
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: After which substeps to look at the speed of waves, if ``watches``.
+            watch: Told how many substeps have been handed to the GPU, each time the buffers are full.
 
         Returns:
             The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
@@ -136,7 +135,7 @@ class FusedSolver(ABC):
             if twin is not None:
                 self._take_twin(twin)
             options: dict[str, Any] = {
-                "KINDS": self.kinds,
+                "LAWS": self.laws,
                 "MULTI": len(self.law_table) > 1,
                 "VISCOUS": self.solver.stiffness_damping > 0,
                 "TWIN": None if twin is None else twin.function,
@@ -156,6 +155,8 @@ class FusedSolver(ABC):
                 state = self._advance(state, dt, part, twin, options, marks)
                 if force is None and not forces:  # a drag alone does no work that counts
                     state = state.replace(work=before)
+                if watch is not None:
+                    watch(first + part)
             return state, self.speed[0] / self.solver.dx
 
     def _advance(
@@ -348,7 +349,7 @@ class FusedTotal(FusedSolver):
         block = 128
         kernels.total_look[(-(-self.count // block),)](
             self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
-            ny * nz, nz, 1 / self.grid.dx, KIND=self.energy_kind, BLOCK=block, num_warps=4,
+            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
@@ -454,7 +455,7 @@ class FusedUpdated(FusedSolver):
     def __init__(self, solver: MPMSolver) -> None:
         super().__init__(solver)
         points = solver.points
-        self.plastic = bool(self.kinds & PLASTIC_KINDS.value)
+        self.plastic = len(self.laws.flows) > 0
         self.internal = solver.laws.initial_internal() is not None
         _check_indices(44 * self.count)
         self.moving = torch.zeros(44 if self.plastic else 35, self.count, device=self.device)
@@ -545,7 +546,7 @@ class FusedUpdated(FusedSolver):
     def _look(self) -> None:
         block = 128
         kernels.updated_look[(-(-self.count // block),)](
-            self.moving, self.count, self.speed, KIND=self.energy_kind, BLOCK=block, num_warps=4
+            self.moving, self.count, self.speed, WAVE=self.wave, BLOCK=block, num_warps=4
         )
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
@@ -662,8 +663,8 @@ class FusedUpdated(FusedSolver):
 def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     """Cells per second as ``MPMSolver`` needs them for the Courant number, in one kernel; None for other laws."""
     points, laws, spatial = solver.points, solver.laws, not solver.total_lagrangian
-    kind = energy_kind(points.laws)
-    if not kind:
+    wave = shared(points.laws, "wave")
+    if wave is None:
         return None
     out = torch.zeros(1, device=points.position.device)
     count, block = points.mass.numel(), 128
@@ -671,21 +672,21 @@ def largest_speed(solver: MPMSolver, state: MPMState) -> Tensor | None:
     with torch.cuda.device_of(out):
         kernels.largest_speed[(-(-count // block),)](
             state.F_elastic.contiguous(), density.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(),
-            state.velocity.contiguous(), out, count, KIND=kind, SPATIAL=spatial, BLOCK=block, num_warps=4,
+            state.velocity.contiguous(), out, count, WAVE=wave, SPATIAL=spatial, BLOCK=block, num_warps=4,
         )  # fmt: skip
     return out[0] / solver.dx
 
 
 def elastic_energy(solver: MPMSolver, F: Tensor) -> Tensor | None:
     """Energy density [J/m³] in one kernel, shape (..., P); None for other laws."""
-    kind = energy_kind(solver.points.laws)
-    if not kind:
+    energy = shared(solver.points.laws, "energy")
+    if energy is None:
         return None
     out = torch.empty(F.shape[:-2], device=F.device)
     block = 128
     with torch.cuda.device_of(out):
         kernels.elastic_energy[(-(-out.numel() // block),)](
-            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), KIND=kind,
+            F.contiguous(), solver.laws.mu.contiguous(), solver.laws.lam.contiguous(), out, out.numel(), ENERGY=energy,
             BLOCK=block, num_warps=4,
         )  # fmt: skip
     return out

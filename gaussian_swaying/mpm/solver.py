@@ -25,6 +25,7 @@ from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather,
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.fused import FusedSolver
 
+WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
 
 
@@ -520,6 +521,7 @@ class MPMSolver(nn.Module):
         steps: int,
         forces: Forces | None = None,
         checkpoint: int = 0,
+        watch: WatchFunction | None = None,
     ) -> MPMState:
         """Advance by several substeps.
 
@@ -537,6 +539,7 @@ class MPMSolver(nn.Module):
             checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
                 in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
                 The forces must then be the same each time they see the same state.
+            watch: Told now and then how many substeps are done, or under way on a GPU; not with ``checkpoint``.
 
         Returns:
             The state ``steps * dt`` later.
@@ -544,7 +547,7 @@ class MPMSolver(nn.Module):
         acting = as_forces(forces)
         fused = self._fused_for(state, acting)
         if fused is not None:
-            return fused.rollout(state, dt, steps, acting)[0]
+            return fused.rollout(state, dt, steps, acting, watch=watch)[0]
         sources = [force.during(state.time, dt, steps) for force in acting]
 
         def force_at(state: MPMState, k: int) -> tuple[Tensor | None, Tensor | None]:
@@ -554,6 +557,8 @@ class MPMSolver(nn.Module):
         def advance(state: MPMState, first: int, count: int) -> MPMState:
             for k in range(first, first + count):
                 state = self._step(state, dt, *force_at(state, k))
+                if watch is not None and checkpoint <= 0:
+                    watch(k + 1)
             return state
 
         if checkpoint <= 0 or not torch.is_grad_enabled():
@@ -574,6 +579,7 @@ class MPMSolver(nn.Module):
         steps: int,
         forces: Forces | None = None,
         looks: int = 8,
+        watch: WatchFunction | None = None,
     ) -> tuple[MPMState, Tensor]:
         """Advance by several substeps and look at the Courant number on the way, as material may stiffen and slacken.
 
@@ -583,6 +589,7 @@ class MPMSolver(nn.Module):
             steps: Number of substeps.
             forces: As in :meth:`rollout`.
             looks: How often to look, evenly, the last time at the end.
+            watch: As in :meth:`rollout`.
 
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
@@ -592,11 +599,12 @@ class MPMSolver(nn.Module):
         if self.stiffness_damping == 0:
             fused = self._fused_for(state, acting)
             if fused is not None and fused.watches:
-                state, cells = fused.rollout(state, dt, steps, acting, looks=marks)
+                state, cells = fused.rollout(state, dt, steps, acting, looks=marks, watch=watch)
                 return state, dt * cells
         seen = []
         for first, last in pairwise([0, *marks]):
-            state = self.rollout(state, dt, last - first, acting)
+            part = None if watch is None else partial(_told, watch, first)
+            state = self.rollout(state, dt, last - first, acting, watch=part)
             seen.append(self.cfl_number(state, dt))
         return state, torch.stack(seen).amax()
 
@@ -787,6 +795,10 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
+
+
+def _told(watch: WatchFunction, before: int, done: int) -> None:
+    watch(before + done)
 
 
 def _conditions(modules: nn.ModuleList) -> list[Boundary]:

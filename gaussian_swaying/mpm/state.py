@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_finite, check_shape
-from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,7 @@ class MaterialPoints:
             ValueError: If a value lies outside its physical range.
 
         Example:
-            >>> from gaussian_swaying.mpm.materials import Sand
+            >>> from gaussian_swaying.mpm.laws.sand import Sand
             >>> sand = MaterialPoints.create(torch.rand(10, 3), volume=1e-6, density=1600.0, youngs_modulus=1e6,
             ...                              poisson_ratio=0.3, law=Sand(friction_angle=30.0))
         """

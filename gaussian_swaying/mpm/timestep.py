@@ -11,8 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.constitutive import lame_parameters
 from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -93,8 +93,16 @@ def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
 
     Returns:
         At least 1.
+
+    Raises:
+        ValueError: If there are more than can be counted.
     """
-    ratio = frame_dt / substep
+    ratio = frame_dt / substep if substep > 0 else math.inf
+    if not ratio < 2**53:
+        raise ValueError(
+            f"A frame of {frame_dt:g} s takes more substeps of {substep:.3g} s than can be counted: soften the "
+            "material, raise its density or the grid spacing `dx`, or shorten the frame."
+        )
     return max(1, round(ratio) if exact else math.ceil(ratio - 1e-6))
 
 

@@ -19,6 +19,8 @@ Rows of node arrays: in ``total`` displacement and velocity, each in four column
 import triton
 import triton.language as tl
 
+from gaussian_swaying.mpm.damping_triton import kelvin_voigt_pk1
+from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff, pk1
 from gaussian_swaying.mpm.linalg_triton import (
     axpy9,
     largest,
@@ -27,7 +29,6 @@ from gaussian_swaying.mpm.linalg_triton import (
     scale9,
     transpose,
 )
-from gaussian_swaying.mpm.materials_triton import energy_density, kelvin_voigt_pk1, kirchhoff, pk1, wave_modulus
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
@@ -252,7 +253,7 @@ def total_particles(
     fields, partial,
     schedule, vectors, scenes, numbers, first_step, step_offset,
     sx, sy, inverse_dx, viscous_time,
-    KINDS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, FORCE: tl.constexpr,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, FORCE: tl.constexpr,
     IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
     CELLS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
@@ -296,10 +297,10 @@ def total_particles(
             u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
         F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
         if MULTI:
-            kind = tl.load(law_table + 5 * tl.load(law + index, mask, 0)).to(tl.int32)
+            row = law_table + ROW * tl.load(law + index, mask, 0)
         else:
-            kind = tl.load(law_table).to(tl.int32)
-        stress = pk1(F, mu, lam, kind, KINDS)
+            row = law_table
+        stress = pk1(F, mu, lam, row, LAWS)
         if VISCOUS:
             stress = axpy9(1.0, stress, 1.0, kelvin_voigt_pk1(F, rate, mu, lam, viscous_time))
         stress = scale9(-volume, stress)
@@ -492,7 +493,7 @@ def updated_particles(
     moving, order, load, count,
     momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
     ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size,
-    KINDS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr,
+    LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr,
     FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr,
     GATHER: tl.constexpr, SCATTER: tl.constexpr,
 ):  # fmt: skip
@@ -516,13 +517,9 @@ def updated_particles(
     where = tl.load(order + index, mask, 0)
     scene = where // scene_size
     if MULTI:
-        table = law_table + 5 * tl.load(moving + 30 * count + index, mask, 0.0).to(tl.int32)
+        law = law_table + ROW * tl.load(moving + 30 * count + index, mask, 0.0).to(tl.int32)
     else:
-        table = law_table
-    kind = tl.load(table).to(tl.int32)
-    p0 = tl.load(table + 1)
-    p1 = tl.load(table + 2)
-    p2 = tl.load(table + 3)
+        law = law_table
     sy = nz
     sx = ny * nz
     if PLASTIC:
@@ -555,7 +552,7 @@ def updated_particles(
         lost = tl.load(moving + 24 * count + index, mask, 0.0)
         tl.store(moving + 24 * count + index, tl.where(inside, lost, 1.0), mask)
         if PLASTIC or SCATTER:
-            F, internal, stress = kirchhoff(F, mu, lam, internal, kind, p0, p1, p2, dt, KINDS, True)
+            F, internal, stress = kirchhoff(F, mu, lam, internal, law, dt, LAWS, True)
         _store3(moving, count, index, x, mask)
         _store9(moving + 3 * count, count, index, F, mask)
         _store3(moving + 12 * count, count, index, v, mask)
@@ -565,7 +562,7 @@ def updated_particles(
     else:
         v = _load3(moving + 12 * count, count, index, mask)
         C = _load9(moving + 15 * count, count, index, mask)
-        F, internal, stress = kirchhoff(F, mu, lam, internal, kind, p0, p1, p2, dt, KINDS, False)
+        F, internal, stress = kirchhoff(F, mu, lam, internal, law, dt, LAWS, False)
     zero = mu * 0
     force = (zero, zero, zero)
     resistance = zero
@@ -765,9 +762,9 @@ def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, s
 
 
 @triton.jit
-def _wave_speed(F, density, mu, lam, KIND: tl.constexpr, SPATIAL: tl.constexpr):
+def _wave_speed(F, density, mu, lam, WAVE: tl.constexpr, SPATIAL: tl.constexpr):
     """Speed of a wave [m/s], as ``timestep.wave_speed``."""
-    squared = wave_modulus(F, mu, lam, KIND) / density
+    squared = WAVE(F, mu, lam) / density
     if SPATIAL:
         stretch = largest_eigenvalue(matmul(transpose(F), F))
         squared = squared * largest(stretch, 1.0)
@@ -775,14 +772,14 @@ def _wave_speed(F, density, mu, lam, KIND: tl.constexpr, SPATIAL: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=VARIES)
-def elastic_energy(F_in, mu_in, lam_in, out, count, KIND: tl.constexpr, BLOCK: tl.constexpr):
+def elastic_energy(F_in, mu_in, lam_in, out, count, ENERGY: tl.constexpr, BLOCK: tl.constexpr):
     """Energy density of particles [J/m³], as ``ConstitutiveLaw.energy``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     F = _load9(F_in, 1, index * 9, mask)
     mu = tl.load(mu_in + index, mask, 0.0)
     lam = tl.load(lam_in + index, mask, 0.0)
-    tl.store(out + index, energy_density(F, mu, lam, KIND), mask)
+    tl.store(out + index, ENERGY(F, mu, lam), mask)
 
 
 @triton.jit
@@ -794,7 +791,7 @@ def _keep_largest(out, speed, mask):
 
 @triton.jit(do_not_specialize=VARIES)
 def largest_speed(
-    F_in, density, mu_in, lam_in, velocity, out, count, KIND: tl.constexpr, SPATIAL: tl.constexpr, BLOCK: tl.constexpr
+    F_in, density, mu_in, lam_in, velocity, out, count, WAVE: tl.constexpr, SPATIAL: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Largest speed of a wave [m/s] (and of its particle, SPATIAL), into ``out``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -802,7 +799,7 @@ def largest_speed(
     F = _load9(F_in, 1, index * 9, mask)
     mu = tl.load(mu_in + index, mask, 0.0)
     lam = tl.load(lam_in + index, mask, 0.0)
-    speed = _wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, KIND, SPATIAL)
+    speed = _wave_speed(F, tl.load(density + index, mask, 1.0), mu, lam, WAVE, SPATIAL)
     if SPATIAL:
         v = _load3(velocity, 1, index * 3, mask)
         speed += tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -812,7 +809,7 @@ def largest_speed(
 @triton.jit(do_not_specialize=VARIES)
 def total_look(
     fraction, material, count, particle_cell, cell_node, fields, out, sx, sy, inverse_dx,
-    KIND: tl.constexpr, BLOCK: tl.constexpr,
+    WAVE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``total``: as ``largest_speed``, from the nodal displacements."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -825,11 +822,11 @@ def total_look(
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)
     density = tl.load(material + 3 * count + index, mask, 1.0) / tl.load(material + index, mask, 1.0)
-    _keep_largest(out, _wave_speed(F, density, mu, lam, KIND, False), mask)
+    _keep_largest(out, _wave_speed(F, density, mu, lam, WAVE, False), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
-def updated_look(moving, count, out, KIND: tl.constexpr, BLOCK: tl.constexpr):
+def updated_look(moving, count, out, WAVE: tl.constexpr, BLOCK: tl.constexpr):
     """``updated``: as ``largest_speed``, from the rows of ``moving``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
@@ -838,5 +835,5 @@ def updated_look(moving, count, out, KIND: tl.constexpr, BLOCK: tl.constexpr):
     lam = tl.load(moving + 29 * count + index, mask, 0.0)
     density = tl.load(moving + 26 * count + index, mask, 1.0) / tl.load(moving + 27 * count + index, mask, 1.0)
     v = _load3(moving + 12 * count, count, index, mask)
-    speed = _wave_speed(F, density, mu, lam, KIND, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    speed = _wave_speed(F, density, mu, lam, WAVE, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     _keep_largest(out, speed, mask)

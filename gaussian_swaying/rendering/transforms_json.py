@@ -1,6 +1,5 @@
 """Cameras of a ``transforms.json`` in the NeRF, Blender or instant-ngp style."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying._inputs import read_json
 from gaussian_swaying.rendering.camera import Camera, check_pixels, resized_intrinsics
 
 
@@ -82,12 +82,7 @@ def load_transforms(path: str | Path) -> dict[str, Any]:
         ValueError: If the file is missing, is not JSON or has no list ``frames``.
     """
     where = f"`{path}`"
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the camera file {where} ({error.strerror}): check `path`.") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"The camera file {where} is not valid JSON ({error}): export it again.") from error
+    data = read_json(path, "camera file")
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
         raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")

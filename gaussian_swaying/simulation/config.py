@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from argparse import SUPPRESS, Action, ArgumentError
+from argparse import SUPPRESS, Action
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,12 +13,16 @@ import torch
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.data.capture_camera import CaptureCamera
 from gaussian_swaying.mpm.boundary import RegionInFrame
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.keyframes import KeyframedCamera
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.continuing import how_to_resume
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
@@ -29,13 +31,15 @@ from gaussian_swaying.simulation.physgaussian_space import Normalisation
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.signals import stop_signals
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 # imported so that a configuration can name them without their modules
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
-# what may change between a run and the one that resumes it
+# what a configuration cannot hold; what may change between a run and the one that resumes it
+COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
 
 
@@ -81,6 +85,7 @@ def build_parser() -> ArgumentParser:
     """The parser of ``tools/sim.py``: one group of options per component, typos are errors."""
     from jsonargparse import ActionYesNo, ArgumentParser
 
+    limit_yaml()
     parser = ArgumentParser(
         prog="sim.py",
         exit_on_error=False,
@@ -171,7 +176,17 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
     Raises:
         ValueError: If a value is out of range; the message names the field.
     """
+    from jsonargparse import Namespace
+
     device = resolve_device(settings.device)
+    for name in COMMAND_LINE_ONLY:
+        if name in settings:
+            raise ValueError(f"`{name}` is an option of the command line, not of a YAML: remove it and give --{name}.")
+    for name in ("scene", "material", "solver", "wind", "aero", "recorder"):
+        if not isinstance(settings[name], Namespace):
+            raise ValueError(
+                f"Expected `{name}` to hold fields, such as those that --help lists, but got {settings[name]!r}."
+            )
     if settings.frames < 1:
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
     parts = parser.instantiate(settings)
@@ -216,18 +231,6 @@ def output_folder(settings: Namespace) -> Path:
     return Path("outputs") / (Path(files[-1]).stem if files else "run")
 
 
-def _one_sentence(message: str, arguments: Sequence[str]) -> str:
-    """The part of the parser's message that concerns people, with the config file if that cannot be parsed."""
-    noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
-    lines = [line.strip() for line in message.splitlines()]
-    kept = [line.removeprefix("- ").rstrip(".") for line in lines if line and not line.startswith(noise)]
-    if message.startswith("Problems parsing config"):
-        files = [b for a, b in pairwise(arguments) if a == "--config"]
-        files += [a.removeprefix("--config=") for a in arguments if a.startswith("--config=")]
-        kept[0] = f"{', '.join(files)} is not valid YAML{kept[0].removeprefix('Problems parsing config')}"
-    return " ".join(kept)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, build, run.
 
@@ -235,44 +238,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command line; that of the process if None.
 
     Returns:
-        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C. With the
-        environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM,
+        129 by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
-    try:
+    started: list[SimulationPipeline] = []
+
+    def advice(error: BaseException) -> str | None:
+        """How to go on from the checkpoint that the run has left, if it has left one."""
+        if not started or started[0].resumable is None:
+            return None
+        return how_to_resume(*started[0].resumable, arguments, isinstance(error, SimulationDiverged))
+
+    return run_command(
+        lambda: _simulate(parser, arguments, started),
+        stopped="Stopped; what was recorded is kept.",
+        advice=advice,
+        memory="a smaller `scene.region`, a coarser `solver.dx` or a smaller picture",
+        expected=(SimulationDiverged,),
+        arguments=arguments,
+    )
+
+
+def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[SimulationPipeline]) -> None:
+    """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
+    check_config_files(arguments)
+    with guessing(parser):
         settings = parser.parse_args(arguments)
-    except ArgumentError as error:
-        print(f"error: {_one_sentence(str(error), arguments)}; --help lists the options.", file=sys.stderr)
-        return 2
-    try:
-        pipeline, recorder = build_pipeline(parser, settings)
-        folder = output_folder(settings)
-        scene = pipeline.scene
-        print(f"{len(scene.simulated):,} of {len(scene.model.means):,} Gaussians simulated on {pipeline.device}")
-        if scene.filled:
-            print(f"{scene.filled:,} points fill the inside")
-        print(scene.frame.describe())
-        extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
-        text = config_text(parser, settings)
+    pipeline, recorder = build_pipeline(parser, settings)
+    folder = output_folder(settings)
+    scene = pipeline.scene
+    by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
+    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {pipeline.device}")
+    if scene.filled:
+        print(f"{scene.filled:,} points fill the inside")
+    print(scene.frame.describe())
+    extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
+    text = config_text(parser, settings)
+    started.append(pipeline)
+    with stop_signals():
         summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
-    except KeyboardInterrupt:
-        print("Stopped; what was recorded is kept. If there is a checkpoint, --resume continues.", file=sys.stderr)
-        return 130
-    except torch.OutOfMemoryError as error:
-        print(
-            f"error: {error} Remedy: a smaller `scene.region`, a coarser `solver.dx` or a smaller picture.",
-            file=sys.stderr,
-        )
-        return 2
-    except (ValueError, TypeError, OSError, SimulationDiverged) as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        message = str(error)
-        if "Does not validate" in message:  # a class within a class, whose own message the parser wraps
-            message = _one_sentence(message, arguments)
-        print(f"error: {message}", file=sys.stderr)
-        return 2
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
     if summary["torn_particles"]:
@@ -283,4 +289,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     for file in pipeline.files:
         print(f"wrote {file}")
-    return 0

@@ -12,7 +12,9 @@ from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.simulation.health import particle_of_extremes
 
+_PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
 _SAMPLE = 4096  # particles whose nearest neighbour is looked for
 
 
@@ -59,6 +61,9 @@ class FrameDiagnostics:
         stretch_max: Largest singular value of F.
         displacement_mean: Mean distance from rest [m].
         displacement_max: Largest distance from rest [m].
+        moved_particle: Index of the particle that is farthest from rest.
+        compressed_particle: Index of that with the smallest stretch.
+        stretched_particle: Index of that with the largest stretch.
     """
 
     time: float
@@ -82,6 +87,9 @@ class FrameDiagnostics:
     stretch_max: float
     displacement_mean: float
     displacement_max: float
+    moved_particle: int
+    compressed_particle: int
+    stretched_particle: int
 
     def as_dict(self) -> dict[str, float | int]:
         """The fields by name."""
@@ -202,6 +210,7 @@ class Measurement:
             torn=int(sum(found["counts"][1:])),
             **dict(zip(("J_min", "J_max", "displacement_mean", "displacement_max"), found["extremes"], strict=True)),
             **dict(zip(("stretch_min", "stretch_max"), found["stretch"], strict=True)),
+            **{name: int(value) for name, value in zip(_PARTICLES, found["particles"], strict=True)},
         )
 
 
@@ -221,7 +230,8 @@ def measure(
     counts = [state.lost.sum()] + ([] if tearing is None else [tearing(state.position).sum()])
     extremes = torch.stack([*torch.aminmax(determinant(state.F_total)), moved.mean(), moved.amax()])
     F = state.F_total.double()
-    stretch = torch.stack(torch.aminmax(symmetric_eigenvalues(matmul3(F.mT, F)))).clamp(min=0).sqrt()
+    squares = symmetric_eigenvalues(matmul3(F.mT, F))
+    stretch = torch.stack(torch.aminmax(squares)).clamp(min=0).sqrt()
     given = [value.to(state.time).reshape(1) for value in (cfl, wind_work) if isinstance(value, Tensor)]
     parts = {
         "time": state.time[None],
@@ -230,6 +240,7 @@ def measure(
         "counts": torch.stack(counts).double(),
         "extremes": extremes.double(),
         "stretch": stretch,
+        "particles": particle_of_extremes(moved, squares).double(),
         "given": torch.cat(given) if given else stretch[:0],
         "verdict": _verdict(solver, state, moved),
     }

@@ -4,16 +4,58 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
+import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+_TEMPORARY = re.compile(r"\..+\.gs-writing-\d+(\.[A-Za-z0-9_]+)?")
+_KINDS = {
+    stat.S_IFREG: "file",
+    stat.S_IFDIR: "folder",
+    stat.S_IFIFO: "named pipe",
+    stat.S_IFSOCK: "socket",
+    stat.S_IFCHR: "device",
+    stat.S_IFBLK: "device",
+}
+
 
 def temporary_name(path: Path) -> Path:
     """The name in the same folder under which this process writes ``path`` before it is whole."""
-    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    return path.with_name(f".{path.stem}.gs-writing-{os.getpid()}{path.suffix}")
+
+
+def remove_temporaries(folder: Path) -> None:
+    """Remove what :func:`temporary_name` named and a killed process left; whatever else is there stays."""
+    for path in folder.glob(".*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink()
+
+
+def kind_of(path: Path) -> str | None:
+    """What a path is, links followed: ``file``, ``folder``, ``named pipe``, ``socket`` ...; None if there is nothing.
+
+    Nothing is opened, so a pipe that nobody writes to keeps nobody waiting.
+    """
+    try:
+        return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "special file")
+    except (FileNotFoundError, NotADirectoryError):
+        return "link to nothing" if os.path.islink(path) else None
+    except OSError:
+        if not os.path.islink(path):
+            raise
+        return "link to itself"
+
+
+def check_regular(path: Path) -> None:
+    """Raise ValueError if there is something under the path that is no regular file."""
+    kind = kind_of(path)
+    if kind not in (None, "file"):
+        raise ValueError(f"Expected {path} to be a file, but it is a {kind}: move it away.")
 
 
 @contextmanager
@@ -28,9 +70,17 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON, whole or not at all."""
+    """Write JSON, whole or not at all; numbers that are NaN or infinite, which JSON does not have, become null."""
     with atomic(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n")
+        temporary.write_text(json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _without_nan(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:

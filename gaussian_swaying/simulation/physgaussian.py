@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.simulation.physgaussian_camera import read_json
+from gaussian_swaying._inputs import read_json
 from gaussian_swaying.simulation.physgaussian_space import CENTER, Normalisation, heading, tidy, up_direction
 
 FOREVER = 999.0

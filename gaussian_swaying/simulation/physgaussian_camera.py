@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._inputs import read_json
 from gaussian_swaying.rendering.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.camera_path import CameraPath
 from gaussian_swaying.simulation.frame import SimFrame
@@ -143,25 +141,4 @@ def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.
     return Camera(torch.linalg.inv(pose), torch.tensor(rows, dtype=torch.float64), width, height, near)
 
 
-def read_json(path: str | os.PathLike[str], what: str) -> Any:
-    """Read a JSON file.
-
-    Args:
-        path: The file.
-        what: What it is called in the message, for example "camera file".
-
-    Returns:
-        What it holds.
-
-    Raises:
-        ValueError: If the file cannot be read or is not JSON.
-    """
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"Cannot read the {what} `{path}` ({error.strerror}): check the path.") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"The {what} `{path}` is not valid JSON ({error}).") from error
-
-
-__all__ = ["PhysGaussianCamera", "read_json", "read_model_camera"]
+__all__ = ["PhysGaussianCamera", "read_model_camera"]

@@ -13,7 +13,6 @@ from typing import Any, NoReturn
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 import gaussian_swaying
 from gaussian_swaying._checks import check_positive
@@ -30,6 +29,8 @@ from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_rendere
 from gaussian_swaying.rendering.camera import Camera
 from gaussian_swaying.rendering.camera_path import CameraPath
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation import signals
+from gaussian_swaying.simulation.checkpoint import check_state, unreadable
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     SimulationDiverged,
@@ -39,8 +40,11 @@ from gaussian_swaying.simulation.diagnostics import (
     measure,
 )
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
+from gaussian_swaying.simulation.health import advice, extremes
+from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.recorder import Recorder, check_camera_name, frame_folder
 from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.seal import sha256
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
@@ -48,6 +52,8 @@ CFL_SAMPLES = 8  # how often a frame is looked at, as material may stiffen and s
 MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
 MAX_WIND = 1e6  # m/s; any more is a mistake, and would overflow positions
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
+MAX_SUBSTEPS = 1_000_000  # in a frame: hours of a processor, and minutes of the fastest GPU
+MAX_LOOKS = 2_000  # how many frames' cameras are looked at before a run
 
 
 class SimulationPipeline(nn.Module):
@@ -85,6 +91,8 @@ class SimulationPipeline(nn.Module):
     ) -> None:
         super().__init__()
         check_positive("frame_dt", frame_dt)
+        if not all(0 <= value <= 1 for value in background):
+            raise ValueError(f"Expected `background` within [0, 1], but got {list(background)}: 1 is white, not 255.")
         self.scene, self.solver, self.wind, self.aero, self.shader = scene, solver, wind, aero, shader
         self.camera, self.cameras, self.frame_dt = camera, dict(cameras or {}), float(frame_dt)
         for name in self.cameras:
@@ -94,7 +102,10 @@ class SimulationPipeline(nn.Module):
         self.to(device)
         self.editor = SceneEditor(scene, edits)
         self.renderer = renderer if renderer is not None else make_renderer(self.device)
-        self._most_substeps = sys.maxsize
+        self._most_substeps = MAX_SUBSTEPS
+        self._progress: RunProgress | None = None
+        self.files: list[Path] = []  # what the last run wrote
+        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self._wind_force: list[WindForce] = []  # in a list, as it is no part of the module's state
         self._wind_parts: tuple[object, ...] = ()
         self.idle = self.aero.idle  # asked once, as it makes the host wait
@@ -129,7 +140,16 @@ class SimulationPipeline(nn.Module):
         self.idle, self._force_end = self.aero.idle, self.force_scale()
         check_spacing(self.solver)
         self.solver.fused()  # what its kernels refuse is refused here
-        self._most_substeps = MAX_GROWTH * self.solver.substeps(state, self.frame_dt)
+        at_rest = self.solver.substeps(state, self.frame_dt)
+        if at_rest > MAX_SUBSTEPS:
+            remedy = "soften it (`material.E`, `material.nu`), raise its density or `solver.dx`, or shorten `frame_dt`"
+            if self.solver.substep is not None:
+                remedy = "raise `solver.substep`, set it to null for the longest that is stable, or shorten `frame_dt`"
+            raise ValueError(
+                f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
+                f"than the {MAX_SUBSTEPS:,} that are of use: {remedy}."
+            )
+        self._most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
         return state
 
@@ -166,7 +186,9 @@ class SimulationPipeline(nn.Module):
             start = torch.where(changed, start, state.internal)
         state = state.replace(internal=start)
         self.solver.fused()
-        self._most_substeps = max(self._most_substeps, MAX_GROWTH * self.solver.substeps(state, self.frame_dt))
+        self._most_substeps = max(
+            self._most_substeps, min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
+        )
         if self._tearing is not None:
             elastic = self.solver.laws.elastic_particles()
             if elastic is not None:  # what has flowed apart before is no tear
@@ -212,7 +234,7 @@ class SimulationPipeline(nn.Module):
             steps = self._substeps(state)
             for retry in range(MAX_RETRIES + 1):
                 if steps > self._most_substeps:
-                    cause = f"a frame would take {steps:,} substeps, {MAX_GROWTH} times those at rest"
+                    cause = f"a frame would take {steps:,} substeps, and {self._most_substeps:,} are the most"
                     self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
                 end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 work = (end.work - state.work).sum()
@@ -251,7 +273,9 @@ class SimulationPipeline(nn.Module):
 
     def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
         """The state some substeps later, and the largest Courant number on the way."""
-        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES)
+        progress = self._progress
+        watch = None if progress is None else lambda done: progress.substep(done, steps)
+        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch)
 
     def _drag_substeps(self, state: MPMState) -> int:
         """Substeps that keep explicit drag on light patches stable."""
@@ -433,33 +457,77 @@ class SimulationPipeline(nn.Module):
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         check_positive("frames", frames)
-        for frame in range(frames):
-            self.check_camera(frame)
+        for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
+            self.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
         state = self.start()  # what is refused is refused before anything is written
-        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt, tuple(self.cameras))
+        splat = self._splat()
+
+        def check(checkpoint: dict[str, Any]) -> None:
+            self._check_checkpoint(checkpoint, state, Path(output), frames, splat)
+
+        self.resumable = None
+        checkpoint = recorder.open(output, config, resume, 1 / self.frame_dt, tuple(self.cameras), check)
+        try:
+            return self._run(recorder, frames, config, settings, progress, state, checkpoint, splat)
+        finally:
+            if recorder.checkpoint_frame is not None:
+                self.resumable = (recorder.folder / "checkpoint.pt", recorder.checkpoint_frame)
+            recorder.release()
+
+    def _splat(self) -> str | None:
+        """Checksum of the splat's file, which tells it from another one of the same name."""
+        path = self.scene.source
+        return None if path is None else sha256(Path(path))
+
+    def _check_checkpoint(
+        self, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
+    ) -> None:
+        """Raise ValueError unless the run can go on from a checkpoint as if it had never stopped."""
+        held = checkpoint["state"].get("position")
+        if checkpoint.get("splat") != splat:
+            raise ValueError(
+                f"The splat {self.scene.source} is not the one that the run in {output} began with, its content has "
+                "changed: put that file back, or start again without --resume."
+            )
+        if isinstance(held, Tensor) and held.ndim == 2 and len(held) != self.scene.points.count:
+            raise ValueError(
+                f"The checkpoint in {output} holds {len(held)} particles, but the scene has "
+                f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
+            )
+        try:
+            check_state(checkpoint, start, self.frame_dt, self.solver.max_nodes, bool(self.editor.edits))
+        except (ValueError, TypeError, KeyError, RuntimeError) as error:
+            raise unreadable(output / "checkpoint.pt", error) from error
+        if checkpoint["frame"] >= frames:
+            raise ValueError(
+                f"The run in {output} has {checkpoint['frame'] + 1} frames already, and `frames` asks for {frames}: "
+                "ask for more, or leave out --resume."
+            )
+
+    def _run(
+        self,
+        recorder: Recorder,
+        frames: int,
+        config: str,
+        settings: dict[str, Any] | None,
+        progress: bool,
+        state: MPMState,
+        checkpoint: dict[str, Any] | None,
+        splat: str | None,
+    ) -> dict[str, Any]:
         first, log, walls, peak = 0, [], _Walls(self.device), _PeakMemory(self.device)
         if checkpoint is not None:
-            state = MPMState.from_state_dict(checkpoint["state"], self.device)
-            if state.position.shape != self.scene.points.position.shape:
-                raise ValueError(
-                    f"The checkpoint in {output} holds {len(state.position)} particles, but the scene has "
-                    f"{self.scene.points.count}: resume with the same splat, or start again without --resume."
-                )
-            state = self._edit_due(state, resumed=True)
+            state = self._edit_due(MPMState.from_state_dict(checkpoint["state"], self.device), resumed=True)
             first, log = checkpoint["frame"] + 1, checkpoint["log"]
-            if first > frames:
-                raise ValueError(
-                    f"The run in {output} has {first} frames already, and `frames` asks for {frames}: ask for more, or "
-                    "leave out --resume."
-                )
             walls.seconds.update(checkpoint["wall_s"])
         status, reason, done = "complete", None, first
-        bar = tqdm(total=frames, initial=min(first, frames), unit="frame", disable=not progress, file=sys.stderr)
+        bar = self._progress = RunProgress(frames, first, progress)
         try:
             if self.device.type == "cuda" and first < frames:
                 with walls("startup"):
                     self._warm_up(recorder, state, first)
             for frame in range(first, frames):
+                bar.begin(frame)
                 with walls("simulation"):
                     if frame > 0:
                         state, health = self.advance(state)
@@ -477,24 +545,29 @@ class SimulationPipeline(nn.Module):
                                 "log": log,
                                 "config": config,
                                 "wall_s": walls.read(),
+                                "splat": splat,
                             }
                         )
                 done = frame + 1
-                bar.update()
-                bar.set_postfix(substeps=health.substeps, moved=f"{health.displacement_mean:.3f} m")
+                bar.end(health.substeps, health.displacement_mean)
             with walls("writing"):
                 recorder.wait()
         except SimulationDiverged as error:
             status, reason = "diverged", str(error)
             raise
-        except KeyboardInterrupt:
-            status, reason = "interrupted", "stopped by the user"
+        except KeyboardInterrupt as stop:
+            status, reason = "interrupted", signals.reason(stop)
             raise
         except Exception as error:
             status, reason = "failed", str(error)
             raise
         finally:
-            bar.close()
+            with suppress(OSError):  # a terminal that has gone
+                bar.close()
+                if progress:
+                    for sentence in self.health(log[:done])[1]:
+                        print(f"warning: {sentence}", file=sys.stderr)
+            self._progress = None
             summary: dict[str, Any] = {"status": status, "reason": reason}
             summary |= self._summary(state, log[:done], frames, walls, peak) | (settings or {})
             if recorder.images and "force" in recorder.renders:
@@ -503,7 +576,7 @@ class SimulationPipeline(nn.Module):
             self.files = []
             try:
                 with walls("writing"):
-                    self.files = recorder.close(done, summary)
+                    self.files = recorder.close(done, summary, release=False)
             except OSError as error:
                 if status == "complete":
                     raise
@@ -511,6 +584,19 @@ class SimulationPipeline(nn.Module):
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
+
+    def health(self, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+        """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
+
+        Args:
+            log: Diagnostics of its frames.
+        """
+        scene, points = self.scene, self.scene.points
+        where = scene.frame.point_to_scene(points.position.double().cpu())
+        elastic = self.solver.laws.elastic_particles()
+        size = scene.size * scene.frame.metres_per_unit
+        found = extremes(log, where, size, None if elastic is None else elastic.cpu())
+        return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
 
     def _warm_up(self, recorder: Recorder, state: MPMState, frame: int) -> None:
         """Load and compile the kernels of a frame, of which nothing is kept."""
@@ -570,6 +656,7 @@ class SimulationPipeline(nn.Module):
         self, state: MPMState, log: list[dict[str, float]], frames: int, walls: _Walls, peak: _PeakMemory
     ) -> dict[str, Any]:
         moved = [entry["displacement_mean"] for entry in log]
+        found, sentences = self.health(log)
         energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
         return {
             "device": describe_device(self.device),
@@ -577,7 +664,7 @@ class SimulationPipeline(nn.Module):
             "seed": self.wind.seed,
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
-            "simulated_gaussians": len(self.scene.simulated),
+            "simulated_gaussians": len(self.scene.chosen),
             "surface_particles": self.scene.on_surface,
             "filled_particles": self.scene.filled,
             "mass_kg": float(self.solver.points.mass.sum()),
@@ -609,6 +696,8 @@ class SimulationPipeline(nn.Module):
             "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
             "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
             "displacement_mean_max_m": max(moved, default=None),
+            "extremes": found,
+            "warnings": sentences,
             "per_frame": log,
         }
 

@@ -4,27 +4,38 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-import os
 import sys
-import warnings
 from argparse import ArgumentError
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from gaussian_swaying.cli.errors import parser_sentence, run_command
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.cli.yaml_limits import check_config_files
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.simulation.config import _one_sentence, build_parser, build_pipeline
-from gaussian_swaying.simulation.cost import Cost, estimate_cost
+from gaussian_swaying.simulation.calibration import (
+    SWAY,
+    Setting,
+    apply_setting,
+    calibrate,
+    check_sway,
+    measure_motion,
+)
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
+from gaussian_swaying.simulation.cost import Cost, Stopwatch, estimate_cost
+from gaussian_swaying.simulation.doubts import doubts
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.preview import DIRECTIONS, Suggestion, bounds, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview import Suggestion, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview_capture import captured_from
 from gaussian_swaying.simulation.preview_picture import classify, conditions, mean_flow, preview_picture
-from gaussian_swaying.simulation.starter import region_dict, starter_yaml
+from gaussian_swaying.simulation.progress import duration
+from gaussian_swaying.simulation.shape import DIRECTIONS, bounds
+from gaussian_swaying.simulation.starter import draft_yaml, region_dict, starter_yaml
 
 
 @dataclass(frozen=True)
@@ -35,13 +46,13 @@ class Preview:
         report: Text for people.
         data: The same as plain numbers, for preview.json.
         picture: 8-bit RGB, shape (H, W, 3).
-        starter: The first configuration as YAML; None with ``--config``.
+        configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
     """
 
     report: str
     data: dict[str, Any]
     picture: np.ndarray
-    starter: str | None
+    configurations: dict[str, str]
 
 
 def build_options() -> argparse.ArgumentParser:
@@ -59,24 +70,32 @@ def build_options() -> argparse.ArgumentParser:
         metavar="FILE",
         help="show what this configuration does, instead of guessing one; may be given several times, as for sim.py",
     )
+    add("--capture", metavar="DIR", help="photos' cameras (COLMAP or transforms.json): they tell up and the object")
     add("--output", metavar="DIR", help="folder of the results; default: outputs/preview/<name of the splat>")
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, -x, ... or -z, instead of a guess")
     add("--region", nargs=6, type=float, metavar="V", help="box to simulate: lower and upper corner [scene units]")
     add("--longest-side", type=float, default=1.0, metavar="M", help="length of the longest side of the object [m]")
     add("--wind", type=float, default=6.0, metavar="M/S", help="speed of the wind in the configuration [m/s]")
+    add(
+        "--sway",
+        type=float,
+        default=SWAY,
+        metavar="SHARE",
+        help="largest displacement in that wind, as a share of the longest side; stiffness and thickness follow",
+    )
     add("--frames", type=int, default=250, help="frames of the configuration")
     add("--height", type=int, default=540, help="height of the picture [pixels]")
     add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
     return parser
 
 
-def preview_scene(options: argparse.Namespace, starter_path: Path) -> Preview:
-    """Guess a configuration for a splat, and look at it.
+def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
+    """Guess a configuration for a splat, try its stiffness in short runs, and look at it.
 
     Args:
         options: From :func:`build_options`.
-        starter_path: Where the configuration will be, for the report.
+        folder: Where the configurations will be, for the report.
 
     Returns:
         The preview.
@@ -85,27 +104,65 @@ def preview_scene(options: argparse.Namespace, starter_path: Path) -> Preview:
         ValueError: If the splat or an option is bad, or the configuration does not run.
         FileNotFoundError: If there is no such splat.
     """
+    check_sway(options.sway)
     cloud = read_gaussians(options.scene)
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
-    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind)
-    text = starter_yaml(found, options.scene, options.frames)
-    pipeline, settings = _pipeline(["--device", options.device], text)
+    capture = None if options.capture is None else captured_from(options.capture)
+    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture)
+    begin = Stopwatch()
+    draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
+    startup = begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
-    cost = estimate_cost(pipeline, settings.frames)
+    found = _calibrated(found, draft, options.sway)
+    texts = {
+        "draft": draft_yaml(found, options.scene),
+        "starter": starter_yaml(found, options.scene, options.frames),
+    }
+    pipeline, starter = _pipeline(["--device", options.device], texts["starter"])
+    costs = {
+        "draft": estimate_cost(draft, settings.frames, startup_seconds=startup),
+        "starter": estimate_cost(pipeline, starter.frames, startup_seconds=startup),
+    }
     data: dict[str, Any] = {
         "splat": str(options.scene),
         "bounds": bounds(cloud.means),
         "gaussians": gaussian_statistics(cloud),
         "suggestion": suggestion_dict(found),
         "run": run_dict(pipeline),
-        "cost": asdict(cost) | {"total_seconds": cost.total_seconds},
+        "cost": _cost_dict(costs["starter"]),
+        "draft_cost": _cost_dict(costs["draft"]),
     }
-    report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found), *_cost_lines(cost)]
-    name = Path(options.scene).stem
-    report += ["", f"next: python tools/sim.py --config {starter_path} --output {Path('outputs') / name}"]
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), text)
+    report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found)]
+    report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
+    report += _cost_lines(costs["starter"])
+    output, stem = Path("outputs"), splat_name(options.scene)
+    report.append("")
+    for name, what, where in (
+        ("draft", "a first look", output / f"{stem}_draft"),
+        ("starter", "the starter", output / stem),
+    ):
+        pictures = f"{_seconds_of(texts[name])}, {duration(costs[name].total_seconds)} here"
+        report.append(f"{what} ({pictures}):")
+        report.append(f"  python tools/sim.py --config {folder / name}.yaml --output {where}")
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), texts)
+
+
+def _calibrated(found: Suggestion, draft: SimulationPipeline, sway: float) -> Suggestion:
+    """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
+    if found.pin is None or not any(found.flow):
+        return found
+    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
+    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
+    apply_setting(draft, best.setting, start)
+    return replace(
+        found,
+        youngs_modulus=best.setting.E,
+        thickness=best.setting.thickness,
+        flow=tuple(round(c * best.setting.wind, 2) for c in found.flow),
+        stiffness_reason=best.reason,
+    )
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -123,8 +180,10 @@ def preview_config(options: argparse.Namespace) -> Preview:
     arguments = [*(item for file in options.config for item in ("--config", file)), "--device", options.device]
     if options.scene is not None:
         arguments += ["--scene.ply", options.scene]
+    begin = Stopwatch()
     pipeline, settings = _pipeline(arguments)
-    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images)
+    startup = begin.quiet
+    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images, startup_seconds=startup)
     cloud = pipeline.scene.model.to_cloud().to("cpu")
     data: dict[str, Any] = {
         "config": options.config,
@@ -132,23 +191,25 @@ def preview_config(options: argparse.Namespace) -> Preview:
         "bounds": bounds(cloud.means),
         "gaussians": gaussian_statistics(cloud),
         "run": run_dict(pipeline),
-        "cost": asdict(cost) | {"total_seconds": cost.total_seconds},
+        "cost": _cost_dict(cost),
     }
     report = [
         *_splat_lines(options.scene or options.config[-1], cloud, data),
         *_run_lines(data["run"]),
         *_cost_lines(cost),
     ]
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), None)
+    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), {})
 
 
 def _pipeline(arguments: list[str], text: str | None = None) -> tuple[SimulationPipeline, Any]:
     """The run of a configuration, given by options or as text, and its settings."""
     parser = build_parser()
+    check_config_files(arguments)
     try:
-        settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
+        with guessing(parser):
+            settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
     except ArgumentError as error:
-        raise ValueError(_one_sentence(str(error), arguments)) from error
+        raise ValueError(parser_sentence(str(error), arguments)) from error
     return build_pipeline(parser, settings)[0], settings
 
 
@@ -160,6 +221,19 @@ def _parse_text(parser: Any, arguments: list[str], text: str) -> Any:
         path = Path(folder) / "starter.yaml"
         path.write_text(text, encoding="utf-8")
         return parser.parse_args(["--config", str(path), *arguments])
+
+
+def splat_name(path: str | Path) -> str:
+    """What a splat is called: its file, or the folder of a ``point_cloud.ply``, as trainings write it.
+
+    A folder ``iteration_30000`` and one called ``point_cloud``, as 3DGS makes them, are passed over.
+    """
+    file = Path(path)
+    if file.stem != "point_cloud":
+        return file.stem
+    folders = [part.name for part in file.resolve().parents]
+    passed = ("point_cloud", "iteration_")
+    return next((name for name in folders if name and not name.startswith(passed)), file.stem)
 
 
 def _up(values: Sequence[str]) -> list[float] | str:
@@ -236,6 +310,7 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "mass_kg": float(scene.points.mass.sum()),
         "area_m2": float(scene.patch_area.sum()),
         "filled": scene.filled,
+        "points": scene.points.count,
         "further": scene.on_surface - len(scene.simulated),
         "dx_m": pipeline.solver.dx,
         "formulation": pipeline.solver.formulation,
@@ -287,13 +362,6 @@ def _suggestion_lines(found: Suggestion) -> list[str]:
         f"material        {_material(found)}",
         f"wind            {_numbers(found.flow)} m/s, z up",
     ]
-    if found.up.confidence == "low":
-        lines.append("warning: the up axis is a weak guess; look at the picture, and give --up if it is wrong")
-    if found.region.loose:
-        lines.append(
-            f"warning: {found.region.loose:,} specks inside the region hang on nothing and will fall; give a smaller "
-            "--region, or raise scene.opacity_threshold"
-        )
     return ["", "guesses (each can be given instead, see --help)", *(f"  {line}" for line in lines)]
 
 
@@ -317,7 +385,7 @@ def _cost_lines(cost: Cost) -> list[str]:
     frame = cost.substeps * cost.substep_seconds
     picture = ""
     if cost.picture_seconds is not None:
-        picture = f" + {_duration(cost.picture_seconds)} for its pictures"
+        picture = f" + {duration(cost.picture_seconds)} for its pictures"
     return [
         "",
         f"cost on this machine ({cost.device})",
@@ -325,8 +393,8 @@ def _cost_lines(cost: Cost) -> list[str]:
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {_duration(frame)}{picture}, from {_duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {_duration(cost.total_seconds)}",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
+        f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
 
 
@@ -335,9 +403,21 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _material(found: Suggestion) -> str:
-    if found.sheet:
-        return "a sheet: the cloth of the paper's flags"
-    return f"E = {found.youngs_modulus:.0e} Pa, {found.thickness:.3g} m thick: {found.stiffness_reason}"
+    what = "cloth" if found.sheet else "rubber"
+    return f"{what}, E = {found.youngs_modulus:.1e} Pa, {found.thickness:.2g} m thick: {found.stiffness_reason}"
+
+
+def _seconds_of(text: str) -> str:
+    """Length and picture of the video of a configuration, in words."""
+    import yaml
+
+    given = yaml.safe_load(text)
+    size = given["camera"]["init_args"]
+    return f"{given['frames'] * given['frame_dt']:.3g} s at {size['width']} x {size['height']}"
+
+
+def _cost_dict(cost: Cost) -> dict[str, Any]:
+    return asdict(cost) | {"total_seconds": cost.total_seconds}
 
 
 def _why(confidence: str, reason: str) -> str:
@@ -346,16 +426,6 @@ def _why(confidence: str, reason: str) -> str:
 
 def _short(region: dict[str, Any]) -> str:
     return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)
-
-
-def _duration(seconds: float) -> str:
-    """A duration that people read: 12 ms, 3.4 s, 5 min, 2.1 h."""
-    if not math.isfinite(seconds):
-        return "unknown"
-    for unit, size, limit in (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0)):
-        if seconds < limit:
-            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 3600:.2g} h"
 
 
 # ---- the command
@@ -371,42 +441,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With the environment variable
         ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
-    options = build_options().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
-    try:
-        if options.scene is None and options.config is None:
-            raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
-        if options.frames < 1:
-            raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
-        if not 64 <= options.height <= 4320:
-            raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
-        folder = Path(options.output or Path("outputs/preview") / Path(options.scene or options.config[-1]).stem)
-        starter = folder / "starter.yaml"
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            found = preview_scene(options, starter) if options.config is None else preview_config(options)
-        print(found.report)
-        for text in dict.fromkeys(str(entry.message) for entry in caught):  # the splat is read twice
-            print(f"warning: {text}", file=sys.stderr)
-        for path in write(found, folder):
-            print(f"wrote {path}")
-    except KeyboardInterrupt:
-        print("Stopped; nothing was written.", file=sys.stderr)
-        return 130
-    except (ValueError, TypeError, OSError, torch.OutOfMemoryError) as error:
-        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
-            raise
-        message = str(error)
-        if "Does not validate" in message:
-            message = _one_sentence(message, arguments or sys.argv[1:])
-        print(f"error: {message}", file=sys.stderr)
-        return 2
-    return 0
+    arguments = _joined(sys.argv[1:] if arguments is None else arguments)
+    parser = build_options()
+    return run_command(
+        lambda: _preview(parser.parse_args(arguments)),
+        stopped="Stopped; nothing was written.",
+        memory="a smaller --region, or fewer Gaussians",
+        arguments=arguments,
+    )
+
+
+def _preview(options: argparse.Namespace) -> None:
+    """Look, report, write."""
+    if options.scene is None and options.config is None:
+        raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
+    if options.capture is not None and options.config is not None:
+        raise ValueError("`--capture` is for guesses, but `--config` is shown as it is: leave out one of them.")
+    if options.frames < 1:
+        raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
+    if not 64 <= options.height <= 4320:
+        raise ValueError(f"Expected `--height` from 64 to 4320 pixels, but got {options.height}.")
+    folder = Path(options.output or Path("outputs/preview") / splat_name(options.scene or options.config[-1]))
+    found = preview_scene(options, folder) if options.config is None else preview_config(options)
+    print(found.report)
+    for path in write(found, folder):
+        print(f"wrote {path}")
 
 
 def write(found: Preview, folder: Path) -> list[Path]:
-    """Write preview.json, preview.png and, if it was guessed, starter.yaml.
+    """Write preview.json, preview.png and, if they were guessed, draft.yaml and starter.yaml.
 
-    A ``starter.yaml`` that is there and differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ...: someone may
+    A configuration that is there and differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ...: someone may
     have edited it.
 
     Returns:
@@ -418,13 +483,13 @@ def write(found: Preview, folder: Path) -> list[Path]:
     files = [folder / "preview.json", folder / "preview.png"]
     files[0].write_text(json.dumps(found.data, indent=1) + "\n", encoding="utf-8")
     iio.imwrite(files[1], found.picture)
-    if found.starter is not None:
-        path = folder / "starter.yaml"
-        if path.exists() and path.read_text(encoding="utf-8") != found.starter:
+    for name, text in found.configurations.items():
+        path = folder / f"{name}.yaml"
+        if path.exists() and path.read_text(encoding="utf-8") != text:
             number = 1
-            while (folder / f"starter.{number}.yaml").exists():
+            while (folder / f"{name}.{number}.yaml").exists():
                 number += 1
-            path.rename(folder / f"starter.{number}.yaml")
-        path.write_text(found.starter, encoding="utf-8")
+            path.rename(folder / f"{name}.{number}.yaml")
+        path.write_text(text, encoding="utf-8")
         files.append(path)
     return files

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
+from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.selection import Box, Region
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.rendering.camera import Camera, orbit_camera
+from gaussian_swaying.simulation.framing import SOLID, nearby, whole_box
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.preview_ticks import draw_ticks, project
+from gaussian_swaying.simulation.up import floor_mask
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -34,7 +37,7 @@ class Parts:
     """Which Gaussians are what, shape (N,) each.
 
     Attributes:
-        simulated: Material points.
+        simulated: Those that the region and the opacity choose.
         carried: Faint ones that follow them.
         pinned: Simulated ones that a condition holds.
         pushed: Simulated ones that an impulse pushes.
@@ -56,17 +59,21 @@ def classify(pipeline: SimulationPipeline) -> Parts:
     """
     scene = pipeline.scene
     simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
-    index = scene.simulated.cpu()
-    simulated[index], carried[scene.carried.cpu()] = True, True
+    index = scene.chosen.cpu()
+    carried[scene.carried.cpu()] = True
+    simulated[index], carried[index] = True, False
+    where = scene.frame.point_to_sim(scene.model.means.detach()[scene.chosen].double()).to(scene.points.position.dtype)
     names = []
     for boundary in conditions(pipeline):
-        mask = boundary.in_frame(scene.frame).particle_mask(scene.points.position)
+        moved = boundary.in_frame(scene.frame)
+        mask = moved.particle_mask(scene.points.position)
         name = type(boundary).__name__
         if mask is None:
             names.append(name)
             continue
-        own = mask.cpu()[: len(index)]
-        (pushed if boundary.held_share is None else pinned)[index[own]] = True
+        own = moved.particle_mask(where)
+        assert own is not None
+        (pushed if boundary.held_share is None else pinned)[index[own.cpu()]] = True
         names.append(f"{name}: {int(mask.sum()):,} particles")
     return Parts(simulated, carried, pinned, pushed, names)
 
@@ -74,16 +81,6 @@ def classify(pipeline: SimulationPipeline) -> Parts:
 def conditions(pipeline: SimulationPipeline) -> list[Boundary]:
     """The boundary conditions of a run, in scene units."""
     return [b for b in pipeline.solver.boundaries if isinstance(b, Boundary)]
-
-
-def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixel coordinates (N, 2) and depths (N,) [scene units] of points (N, 3), in float64; depth <= 0 is behind."""
-    check_shape("points", points, None, 3)
-    view, intrinsics = camera.world_to_camera.cpu().double(), camera.intrinsics.cpu().double()
-    inside = points.detach().cpu().double() @ view[:3, :3].T + view[:3, 3]
-    depth = inside[:, 2]
-    pixel = inside @ intrinsics.T
-    return pixel[:, :2] / torch.where(depth.abs() < 1e-12, 1e-12, depth)[:, None], depth
 
 
 def box_edges(low: Iterable[float], high: Iterable[float]) -> Tensor:
@@ -103,13 +100,19 @@ def region_box(region: Region, low: Tensor, high: Tensor) -> tuple[list[float], 
 
 
 @torch.no_grad()
-def preview_picture(pipeline: SimulationPipeline, height: int = 540, normals: int = 140) -> np.ndarray:
+def preview_picture(
+    pipeline: SimulationPipeline,
+    height: int = 540,
+    normals: int = 140,
+    whole: tuple[Sequence[float], Sequence[float]] | None = None,
+) -> np.ndarray:
     """The scene at rest from the side of its camera and from 90 degrees to the left, with a legend.
 
     Args:
         pipeline: A run that need not have started.
         height: Height of each view [pixels].
         normals: About how many normals to draw in each view.
+        whole: Corners of the box to show [scene units]; that of the object with what does not move of it if None.
 
     Returns:
         8-bit RGB, shape (H, W, 3).
@@ -120,19 +123,17 @@ def preview_picture(pipeline: SimulationPipeline, height: int = 540, normals: in
     from PIL import Image, ImageDraw, ImageFont
 
     parts = classify(pipeline)
-    scene, frame = pipeline.scene, pipeline.scene.frame
+    frame = pipeline.scene.frame
     own = pipeline.camera_at(0)
-    eye = frame.direction_to_sim((own.position.cpu() - scene.center.cpu().to(own.position.cpu())).double())
+    eye = frame.direction_to_sim(-own.world_to_camera[2, :3].cpu().double())
     azimuth = math.degrees(math.atan2(float(eye[1]), float(eye[0])))
     elevation = math.degrees(math.atan2(float(eye[2]), math.hypot(float(eye[0]), float(eye[1]))))
     elevation = max(-60.0, min(60.0, elevation))
-    low, high = (corner.cpu().double() for corner in scene.bounds)
-    reach = float((high - low).norm())  # wide enough for the arrows beside the object
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in whole or _whole(pipeline, parts))
+    center, reach = (0.5 * (low + high)).tolist(), 1.7 * float((high - low).norm())  # room for arrows and coordinates
     views = []
     for turn in (0.0, 90.0):
-        camera = orbit_camera(
-            scene.center.tolist(), frame.rotation[2], 1.55 * reach, azimuth - turn, elevation, 40.0, height, height
-        )
+        camera = orbit_camera(center, frame.rotation[2], reach, azimuth - turn, elevation, 40.0, height, height)
         views.append(_view(pipeline, parts, camera.to(pipeline.device), normals, f"azimuth {azimuth - turn:.0f}°"))
     legend = 108 if bool(parts.pushed.any()) else 84
     page = Image.new("RGB", (2 * height, height + legend), (255, 255, 255))
@@ -142,6 +143,19 @@ def preview_picture(pipeline: SimulationPipeline, height: int = 540, normals: in
     font = ImageFont.load_default(size=14)
     _legend(draw, font, parts, pipeline, height, 2 * height)
     return np.asarray(page)
+
+
+def _whole(pipeline: SimulationPipeline, parts: Parts) -> tuple[list[float], list[float]]:
+    """Corners of the box of the object with what does not move of it [scene units]."""
+    scene = pipeline.scene
+    means, opacity = scene.model.means.detach().cpu(), scene.model.opacity().detach().cpu()
+    solid = nearby(means, parts.simulated) & (opacity >= SOLID)
+    outside = torch.zeros_like(solid)
+    weight = (opacity * patch_area(scene.model.to_cloud().scales.detach().cpu())).double()
+    outside[solid] = floor_mask(
+        means[solid], scene.rest_normals.detach().cpu()[solid], weight[solid], scene.frame.rotation[2].tolist()
+    )
+    return whole_box(means, opacity, parts.simulated, outside, pipeline.solver.dx / scene.frame.metres_per_unit)
 
 
 def _view(pipeline: SimulationPipeline, parts: Parts, camera: Camera, normals: int, title: str) -> Any:
@@ -163,13 +177,14 @@ def _view(pipeline: SimulationPipeline, parts: Parts, camera: Camera, normals: i
     low, high = (corner.cpu().double() for corner in scene.bounds)
     margin = 0.02 * scene.size
     _draw_edges(draw, box_edges(low - margin, high + margin), camera, REGION)
+    font = ImageFont.load_default(size=14)
+    draw_ticks(draw, font, (low - margin).tolist(), (high + margin).tolist(), camera)
     for boundary in conditions(pipeline):
         region = getattr(boundary, "region", None)
         box = None if region is None else region_box(region, low - margin, high + margin)
         if box is not None:
             _draw_edges(draw, box_edges(*box), camera, PUSHED if boundary.held_share is None else PINNED)
     _draw_wind(draw, pipeline, camera)
-    font = ImageFont.load_default(size=14)
     up = scene.frame.rotation[2]
     base = scene.center.cpu().double() + 0.0
     _draw_up(draw, font, base, up, camera, scene.size)
@@ -303,7 +318,7 @@ def _legend(
     """What the colours mean, below the views."""
     flow = mean_flow(pipeline).tolist()
     entries = [
-        (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians (in their own colours)"),
+        (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
         (PINNED, f"held: {int(parts.pinned.sum()):,} Gaussians"),
         (WIND, f"wind {[round(v, 2) for v in flow]} m/s (z up), before gusts"),
         (NORMAL, "normals, turned to the eye"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -23,18 +24,21 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.gaussians.export import SUFFIXES, UsdFilm, export_cloud, read_usd_frame, usd_arrays
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.rendering.passes import PASSES
-from gaussian_swaying.simulation.files import atomic, write_json, write_table
+from gaussian_swaying.simulation.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.simulation.files import atomic, remove_temporaries, write_json, write_table
 from gaussian_swaying.simulation.frame import SimFrame
+from gaussian_swaying.simulation.lock import FolderLock
+from gaussian_swaying.simulation.output import MARKER, claim_folder, hold_folder, mark
+from gaussian_swaying.simulation.resume import check_frames, check_names, check_pictures, check_positions, check_shards
 from gaussian_swaying.simulation.trajectory import pack_trajectory
 from gaussian_swaying.simulation.video import VideoEncoder, encode_video
 from gaussian_swaying.simulation.writer import FrameWriter, HostCopy
 
-MARKER = "run.json"
+_FILES = ["run.json", "config.yaml", "checkpoint.pt", "trajectory.npz", "summary.json", "diagnostics.csv"]
+_FILES += ["animation.usdc"]
 # what a run writes, and so must not find in a folder that no run made
-_OURS = ["frames", "ply", "trajectory", "trajectory.npz", "checkpoint.pt", "summary.json", "diagnostics.csv"]
-_OURS += ["config.yaml", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
-_OURS += [*(name for name in SUFFIXES if name != "ply"), "animation.usdc"]
-_OURS += ["depth.mp4", "normal.mp4", "force.mp4"]
+_OURS = [*_FILES, "frames", "ply", "trajectory", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+_OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
 NORMAL_AXES = ("camera", "world")
 
 
@@ -165,6 +169,8 @@ class Recorder:
         self.renders, self.depth_step, self.normal_axes = tuple(renders), float(depth_step), normal_axes
         self.force_scale, self.export_format = force_scale, export_format
         self._films: dict[str, _Film] = {}  # by the folder of their frames
+        self._lock: FolderLock | None = None
+        self.checkpoint_frame: int | None = None
         self._real_time_fps = 25.0
 
     @property
@@ -181,6 +187,7 @@ class Recorder:
         resume: bool = False,
         real_time_fps: float = 25.0,
         cameras: Sequence[str] = (),
+        check: Callable[[dict[str, Any]], None] | None = None,
     ) -> dict[str, Any] | None:
         """Prepare the output folder.
 
@@ -193,86 +200,102 @@ class Recorder:
             resume: Continue the run in the folder.
             real_time_fps: Frames per second at which the video shows the simulated time.
             cameras: Names of the further cameras.
+            check: Called with the checkpoint before anything in the folder is changed; raises what is wrong with it.
 
         Returns:
-            The checkpoint to continue from, or None.
+            The checkpoint to continue from, or None. The folder is held until :meth:`close` or :meth:`release`.
 
         Raises:
-            ValueError: If the folder cannot be written, or there is nothing to resume or something else.
+            FolderLocked: If another run writes to the folder.
+            ValueError: If the folder cannot be written, or there is nothing to resume or something else, or what was
+                recorded so far is damaged.
             OSError: If something of an earlier folder, that was not closed, could not be written.
         """
         self.wait()
         self._give_up_video()
+        self.release()
         self._writer, self._real_time_fps = FrameWriter(), real_time_fps
         path = Path(folder)
         places = [frame_folder(render, camera) for camera in ("", *cameras) for render in self.renders]
         self._films = {place: _Film() for place in places} if self.images else {}
-        if resume:
-            checkpoint = self._load_checkpoint(path, config)
-            self._folder = path
-            self._make_folders()
-            for folder in (
-                path,
-                *(path / name for name in (self.export_format, "trajectory", *self._picture_folders())),
-            ):
-                for leftover in folder.glob(".*.*.*"):  # of a run that was killed while it wrote
-                    leftover.unlink()
-            return checkpoint
+        self.checkpoint_frame = None
         try:
-            if (path / MARKER).exists():
-                aside = _free_name(path)
-                path.rename(aside)
-                print(f"An earlier run in {path} was moved to {aside}.")
-            foreign = [name for name in _OURS if (path / name).exists()]
-            if foreign:
-                raise ValueError(
-                    f"The output folder {path} holds {', '.join(foreign)} of something else, which would be "
-                    "overwritten: choose another with --output."
-                )
-            path.mkdir(parents=True, exist_ok=True)
+            checkpoint = self._continue(path, config, check) if resume else None
+            if not resume:
+                self._lock = claim_folder(path, _OURS, "choose another with --output")
             self._folder = path
-            write_json(path / MARKER, {"made_by": "gaussian_swaying", "format": 1})
-            self._make_folders()
-            if config:
-                with atomic(path / "config.yaml") as temporary:
-                    temporary.write_text(config)
-            if self.video:  # that of a resumed run is made of its PNGs
-                for place, film in self._films.items():
-                    film.encoder = VideoEncoder(path / video_file(place), self.fps or real_time_fps)
-        except OSError as error:
-            raise ValueError(
-                f"The output folder {path} cannot be written ({error.strerror or error}): choose another with --output."
-            ) from error
-        return None
+            try:
+                self._make_folders()
+                if config and not (path / "config.yaml").exists():
+                    with atomic(path / "config.yaml") as temporary:
+                        temporary.write_text(config)
+            except OSError as error:
+                raise ValueError(
+                    f"The output folder {path} cannot be written ({error.strerror or error}): choose another with "
+                    "--output."
+                ) from error
+        except BaseException:
+            self.release()
+            raise
+        if self.video and not resume:  # that of a resumed run is made of its PNGs
+            for place, film in self._films.items():
+                film.encoder = VideoEncoder(path / video_file(place), self.fps or real_time_fps)
+        return checkpoint
+
+    def _continue(self, path: Path, config: str, check: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
+        """Hold the folder and look through all that the rest of the run builds on, before anything is changed."""
+        if not path.is_dir():
+            raise ValueError(f"There is nothing to resume in {path}: it holds no checkpoint.pt; leave out --resume.")
+        self._lock = hold_folder(path, "see to its permissions")
+        checkpoint = read_checkpoint(path / "checkpoint.pt", config)
+        if check is not None:
+            check(checkpoint)
+        told = self._check_kept(path, checkpoint)
+        for folder in (path, *(path / name for name in self._folders())):
+            remove_temporaries(folder)  # of a run that was killed while it wrote
+        if not (path / MARKER).exists():
+            mark(path)
+        for sentence in told:
+            print(f"warning: {sentence}", file=sys.stderr)
+        self.checkpoint_frame = checkpoint["frame"]
+        return checkpoint
+
+    def _check_kept(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
+        """Sentences about what is missing of the frames so far; ValueError if something is damaged."""
+        frames = checkpoint["frame"] + 1
+        videos = [video_file(place) for place in self._films] if self.video else []
+        check_names(path, [*_FILES, *videos], self._folders())
+        told = []
+        for place in self._picture_folders():
+            film = video_file(place) if self.video and place in self._films else None
+            told += check_pictures(path, place, frames, film)
+        if self.trajectory:
+            position = checkpoint["state"].get("position")
+            told += check_positions(path, frames, len(position) if isinstance(position, Tensor) else None)
+        if self.ply_every and self.export_format == "usd":
+            told += check_shards(path, range(0, frames, self.ply_every))
+        elif self.ply_every:
+            wanted = range(0, frames, self.ply_every)
+            told += check_frames(path, self.export_format, SUFFIXES[self.export_format], wanted)
+        return told
+
+    def release(self) -> None:
+        """Let other runs write to the folder."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _folders(self) -> list[str]:
+        wanted = {self.export_format: self.ply_every > 0, "trajectory": self.trajectory}
+        return [*self._picture_folders(), *(name for name, needed in wanted.items() if needed)]
 
     def _make_folders(self) -> None:
-        wanted = {self.export_format: self.ply_every > 0, "trajectory": self.trajectory}
-        for name in (*self._picture_folders(), *(name for name, needed in wanted.items() if needed)):
+        for name in self._folders():
             (self.folder / name).mkdir(parents=True, exist_ok=True)
 
     def _picture_folders(self) -> list[str]:
         raw = [raw_folder(place) for place in self._films if Path(place).name == "depth"]
         return [*self._films, *raw]
-
-    def _load_checkpoint(self, path: Path, config: str) -> dict[str, Any]:
-        file = path / "checkpoint.pt"
-        if not file.exists():
-            raise ValueError(f"There is nothing to resume in {path}: it holds no checkpoint.pt; leave out --resume.")
-        try:
-            checkpoint = dict(torch.load(file, map_location="cpu", weights_only=True))
-            missing = [name for name in ("frame", "state", "log", "config", "wall_s") if name not in checkpoint]
-            if missing:
-                raise ValueError(f"it lacks {', '.join(missing)}")
-        except Exception as error:
-            why = (str(error).splitlines() or ["empty"])[0]
-            raise ValueError(f"{file} cannot be read as a checkpoint ({why}): start again without --resume.") from error
-        if config and checkpoint["config"] != config:
-            raise ValueError(
-                f"The configuration differs from that of the run in {path} "
-                f"({_first_change(checkpoint['config'], config)}): resume with the same one, or start again without "
-                "--resume."
-            )
-        return checkpoint
 
     def write_image(self, index: int, image: Tensor, place: str = "frames") -> None:
         """Write one frame as PNG from colours in [0, 1], shape (H, W, 3), rounded to 8 bits; and add it to the video.
@@ -373,8 +396,8 @@ class Recorder:
         path, copy = self.folder / "checkpoint.pt", HostCopy(checkpoint)
 
         def write() -> None:
-            with atomic(path) as temporary:
-                torch.save(copy.get(), temporary)
+            write_checkpoint(path, copy.get())
+            self.checkpoint_frame = checkpoint["frame"]
 
         self._submit(path, write, after_all=True)
 
@@ -394,13 +417,16 @@ class Recorder:
         files = [self.folder / place / f"{index:05d}.png" for index in range(count)]
         return [file for file in files if file.exists()]
 
-    def close(self, frames: int, summary: dict[str, Any], real_time_fps: float | None = None) -> list[Path]:
+    def close(
+        self, frames: int, summary: dict[str, Any], real_time_fps: float | None = None, release: bool = True
+    ) -> list[Path]:
         """Wait for all files, pack the trajectory, finish the video and write the summary of the frames so far.
 
         Args:
             frames: Number of frames recorded.
             summary: What goes to ``summary.json``.
             real_time_fps: Frames per second at which the video shows the simulated time, if not as in :meth:`open`.
+            release: Let other runs write to the folder then.
 
         Returns:
             The files and folders of the run, for telling the user.
@@ -431,6 +457,8 @@ class Recorder:
                         made.append(self.folder / video_file(place))
         finally:
             self._give_up_video()
+            if release:
+                self.release()
         if failure is not None:
             raise failure
         return made
@@ -474,27 +502,3 @@ class Recorder:
         film.save(target)
         shutil.rmtree(shards)
         return target
-
-
-def _first_change(old: str, new: str) -> str:
-    """The first field in which two configurations differ, by its dotted name."""
-    import yaml
-
-    before, after = _flat(yaml.safe_load(old)), _flat(yaml.safe_load(new))
-    for name in [*after, *before]:
-        if before.get(name) != after.get(name):
-            return f"`{name}` was {before.get(name, 'absent')}, now {after.get(name, 'absent')}"
-    return "in its order"
-
-
-def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    found = {k: v for key, item in items for k, v in _flat(item, f"{name}.{key}" if name else str(key)).items()}
-    return found or {name: value}
-
-
-def _free_name(path: Path) -> Path:
-    number = 1
-    while (candidate := path.with_name(f"{path.name}.{number}")).exists():
-        number += 1
-    return candidate

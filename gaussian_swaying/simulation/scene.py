@@ -13,7 +13,7 @@ from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+from gaussian_swaying.gaussians.grouping import blend_weights, group_points
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
@@ -21,10 +21,12 @@ from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
     deform_all,
-    limit_stretch,
+    limit_deformed,
 )
-from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
 
 
@@ -60,8 +62,8 @@ class Material:
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it).
-        law: Constitutive law, for example ``Sand``; fixed corotated elasticity if null. All but ``FixedCorotated``,
-            ``NeoHookean``, ``SpringNetwork`` and ``StVKHencky`` flow and need ``solver.formulation: updated``.
+        law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
+            elasticity if null. Those that flow need ``solver.formulation: updated``.
         regions: Parts made of something else; later entries win.
     """
 
@@ -106,14 +108,18 @@ class Scene:
         wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
             those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
         max_stretch: How many times its size at rest a Gaussian is drawn at most (see
-            :func:`~gaussian_swaying.gaussians.surface.limit_stretch`), in pictures and exports; null for no limit,
-            which suits what is elastic. Without one, material that flows is drawn as streaks.
+            :func:`~gaussian_swaying.gaussians.surface.limit_deformed`), in pictures and exports; null for no limit.
+            Nothing changes below the limit. Beyond it a Gaussian would be a streak: there two parts of the object that
+            share cells of the grid were pulled apart, or a material flowed.
         layers: Layers of material points through the thickness: 1, a membrane that folds without resistance, or 3,
             which resists bending as a plate does (the Gaussians in the middle plane, two more points at the faces of
             the sheet, weights of Simpson's rule). Three times the points.
         particle_spacing: Largest distance of neighbouring material points on the surface [m]: Gaussians larger than
             that get further points (see :func:`~gaussian_swaying.gaussians.subdivision.subdivide`), as a splat that
             was trained without a limit on sizes needs; 0.45 ``solver.dx`` or less. Null for one point a Gaussian.
+        sampling: Which points carry the material: ``gaussian`` (every simulated Gaussian), or ``grid`` (one for each
+            cube of side ``solver.dx`` / 2.2, with the mass and the area of all in it; the other Gaussians follow the
+            points around them). ``grid`` is many times faster where the splat is much finer than the grid.
     """
 
     def __init__(
@@ -129,10 +135,12 @@ class Scene:
         area: str = "coverage",
         filling: InteriorFilling | None = None,
         wind_on: str = "surface",
-        max_stretch: float | None = None,
+        max_stretch: float | None = 2.0,
         layers: int = 1,
         particle_spacing: float | None = None,
+        sampling: str = "gaussian",
     ) -> None:
+        check_choice("scene.sampling", sampling, ("gaussian", "grid"))
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
         check_choice("scene.area", area, ("coverage", "paper", "equal"))
@@ -152,6 +160,8 @@ class Scene:
             check_positive("scene.particle_spacing", particle_spacing)
             if filling is not None:
                 raise ValueError("Expected `scene.particle_spacing` null with `scene.filling`, which fills in points.")
+        if sampling == "grid" and filling is not None:
+            raise ValueError('Expected `scene.sampling` "gaussian" with `scene.filling`, which chooses points itself.')
         if ply is None and generator is None:
             raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
         self.ply, self.generator, self.region = ply, generator, region or Everything()
@@ -159,7 +169,7 @@ class Scene:
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
         self.max_stretch = None if max_stretch is None else float(max_stretch)
-        self.layers, self.particle_spacing = layers, particle_spacing
+        self.layers, self.particle_spacing, self.sampling = layers, particle_spacing, sampling
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -169,6 +179,8 @@ class Scene:
         return self.generator.generate()
 
 
+POINTS_PER_CELL = 2.2  # and direction, of ``sampling: grid``; more is finer than the grid can show
+FOLLOWED = 6  # points that a Gaussian without one of its own follows
 _SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 
 
@@ -176,9 +188,10 @@ class SimulatedScene(nn.Module):
     """Gaussians, material points and patches of one scene, and how the first follow the second.
 
     Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
-    simulated one, static ones stay. The points that fill a solid, and those at the faces of a sheet of three layers,
-    are material only: no Gaussian belongs to them, and their patch area is zero. The further points of large Gaussians
-    (``particle_spacing``) are patches of their own, but no Gaussian is drawn where they are.
+    simulated one (with ``sampling: grid`` the nearest few), static ones stay. The points that fill a solid, and those
+    at the faces of a sheet of three layers, are material only: no Gaussian belongs to them, and their patch area is
+    zero. The further points of large Gaussians (``particle_spacing``) are patches of their own, but no Gaussian is
+    drawn where they are.
 
     Args:
         scene: Where the Gaussians come from.
@@ -187,6 +200,8 @@ class SimulatedScene(nn.Module):
         dtype: Precision of the simulation.
 
     Attributes:
+        chosen: Indices of the Gaussians that the region and the opacity choose; with ``sampling: gaussian`` these are
+            the simulated ones, with ``grid`` the others of them are carried.
         points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
         filled: Number of points within a solid.
         on_surface: Number of points on the surface, which are the first: the simulated Gaussians, then the further
@@ -199,11 +214,13 @@ class SimulatedScene(nn.Module):
         moving: Indices of the Gaussians that move, the simulated and then the carried ones, shape (M,).
         all_move: Whether these are all, in their order.
         rest_facing: Normals at rest of those that move, in the z-up frame, shape (M, 3).
+        source: The .ply file; None for a scene made in code.
     """
 
     def __init__(self, scene: Scene, material: Material, dx: float, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
         cloud = scene.cloud()
+        self.source = scene.ply
         opacity = torch.sigmoid(cloud.opacities)
         chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold)
         faint = scene.region.contains(cloud.means) & ~chosen
@@ -213,6 +230,7 @@ class SimulatedScene(nn.Module):
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
         means = cloud.means[simulated]
+        check_extent(means, self.frame.metres_per_unit, dx, simulated)
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
@@ -238,14 +256,28 @@ class SimulatedScene(nn.Module):
         for group in (outer, ~outer):  # what lies within takes no area from the surface
             areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
         self.max_stretch = scene.max_stretch
+        carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
+        followed = 1
+        if scene.sampling == "grid":
+            kept, group = group_points(position, areas, dx / POINTS_PER_CELL, preferred=len(simulated))
+            areas = areas.new_zeros(len(kept)).index_add_(0, group, areas)
+            position, normal_of = position[kept], simulated[source[kept]]
+            followed, carried = FOLLOWED, carried | chosen
+            simulated = simulated[kept[kept < len(simulated)]]
+            carried[simulated] = False
+            self.on_surface, outer = len(kept), outer[kept]
+        else:
+            normal_of = simulated[source]
+        carried = carried.nonzero()[:, 0]
+        self.register_buffer("chosen", chosen.nonzero()[:, 0], persistent=False)
         self.register_buffer("simulated", simulated)
-        carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
         self.register_buffer("carried", carried)
-        _, anchor = nearest_neighbours(cloud.means[simulated].double(), 1, cloud.means[carried])
-        self.register_buffer("anchor", anchor[:, 0])
+        anchor, share = blend_weights(cloud.means[simulated], cloud.means[carried], followed)
+        self.register_buffer("anchor", anchor)
+        self.register_buffer("share", share.to(cloud.means.dtype), persistent=False)
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
-        facing = self.frame.direction_to_sim(normals[simulated[source]].double())
+        facing = self.frame.direction_to_sim(normals[normal_of].double())
         area = self.frame.area_to_sim(areas)
         body_area, area = area, area if scene.wind_on == "all" else torch.where(outer, area, 0)
         if filling is not None:  # a filled point is a patch of no area
@@ -258,14 +290,16 @@ class SimulatedScene(nn.Module):
         moving = torch.cat([simulated, carried])
         self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
         self.register_buffer("moving", moving, persistent=False)
-        arm = cloud.means[carried] - cloud.means[simulated[self.anchor]]
+        arm = cloud.means[carried][:, None] - cloud.means[simulated[self.anchor]]
         self.register_buffer("arm", arm, persistent=False)
         facing = self.frame.direction_to_sim(normals[moving].double()).to(normals.dtype)
         self.register_buffer("rest_facing", facing, persistent=False)
         self.register_buffer("identity", torch.eye(3, dtype=cloud.means.dtype), persistent=False)
+        self.chosen: Tensor
         self.simulated: Tensor
         self.carried: Tensor
         self.anchor: Tensor
+        self.share: Tensor
         self.rest_covariances: Tensor
         self.rest_normals: Tensor
         self.patch_normal: Tensor
@@ -284,7 +318,11 @@ class SimulatedScene(nn.Module):
         for entry in material.regions:
             inside = entry.region.contains(where)
             if not bool(inside.any()):
-                raise ValueError(f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian.")
+                low, high = entry.region.bounds(where)
+                raise ValueError(
+                    f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie between "
+                    f"{low} and {high}{entry.region.axes}; move or enlarge it."
+                )
             for name in _MATERIAL_FIELDS:
                 if getattr(entry, name) is not None:
                     fields[name][inside] = getattr(entry, name)
@@ -354,8 +392,9 @@ class SimulatedScene(nn.Module):
         F = self.frame.gradient_to_scene(state.F_total[:count].to(kind))
         if len(self.carried):
             near = F[self.anchor]
-            turned = (near * self.arm[:, None, :]).sum(-1) - self.arm  # a difference, so that nothing moves at rest
-            move, F = torch.cat([move, move[self.anchor] + turned]), torch.cat([F, near])
+            turned = (near * self.arm[..., None, :]).sum(-1) - self.arm  # a difference, so that nothing moves at rest
+            along = self._blend(move[self.anchor] + turned)
+            move, F = torch.cat([move, along]), torch.cat([F, self._blend(near)])
         if self.all_move:
             covariances, normals, turns = self._deform(F, rest.covariances, rest.normals, rotations)
             return DeformedGaussians(
@@ -374,10 +413,26 @@ class SimulatedScene(nn.Module):
         self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """``deform_all`` and the limit of the scene."""
-        deformed, normals, turns = deform_all(F, covariances, normals, rotations)
+        # the limit needs the rotations; on a GPU they cost next to nothing, and all of them are computed
+        wanted = rotations or (self.max_stretch is not None and F.device.type == "cuda")
+        deformed, normals, turns = deform_all(F, covariances, normals, wanted)
         if self.max_stretch is not None:
-            deformed = limit_stretch(deformed, covariances, self.max_stretch)
-        return deformed, normals, turns
+            deformed = limit_deformed(F, deformed, covariances, self.max_stretch, self._solid(), turns)
+        return deformed, normals, turns if rotations else None
+
+    def _solid(self) -> Tensor:
+        """Which of the Gaussians that move keep their shape, as their law has no return map; bool, shape (M,)."""
+        laws, index = self.points.laws, self.points.law_index
+        count = len(self.simulated)
+        solid = torch.stack([self.simulated.new_full((), not law.plastic, dtype=torch.bool) for law in laws])
+        own = solid[:1].expand(count) if index is None else solid[index[:count]]
+        return torch.cat([own, own[self.anchor[:, 0]]])
+
+    def _blend(self, values: Tensor) -> Tensor:
+        """Values (C, K, ...) of what each carried Gaussian follows, as one, shape (C, ...)."""
+        if values.shape[1] == 1:
+            return values[:, 0]
+        return (values * self.share.reshape(self.share.shape + (1,) * (values.ndim - 2))).sum(1)
 
     def on_gaussians(self, values: Tensor) -> Tensor:
         """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.
@@ -390,7 +445,7 @@ class SimulatedScene(nn.Module):
         """
         own = values[: len(self.simulated)].to(self.model.means.dtype)
         found = own.new_zeros(len(self.model.means))
-        return found.index_copy(0, self.moving, torch.cat([own, own[self.anchor]]))
+        return found.index_copy(0, self.moving, torch.cat([own, self._blend(own[self.anchor])]))
 
 
 def _areas(

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gaussian_swaying.gaussians.selection import Box, Cylinder, Not, Region, Union
-from gaussian_swaying.simulation.lean import SHELL_AERO
-from gaussian_swaying.simulation.preview import Suggestion
+from gaussian_swaying.simulation.preview import DRAFT_CELLS, Suggestion, suggest_spacing
 
-_CLOTH = """\
-material:
-  E: 6.0e+3                     # Pa; the paper's flags have 3e3 to 6e3
-  nu: 0.3                       # the paper's flags
-  density: 30.0                 # kg/m^3; the paper's flags
-  thickness: 0.01               # m; with the density the cloth weighs 0.3 kg/m^2
-"""
+DRAFT_FRAMES = 51  # 2 s
+DRAFT_PICTURE = (480, 270)
+STARTER_PICTURE = (960, 540)
 _CLOTH_AERO = """\
 aero:
   C_D: 0.1                      # the paper's flags
@@ -28,24 +25,27 @@ aero:
 """
 
 
-def _shell(s: Suggestion) -> str:
-    return f"""\
-material:
-  E: {s.youngs_modulus:<27.1e}# Pa; {s.stiffness_reason}; more of it bends less and takes more substeps
-  nu: 0.3
-  density: 400.0                # kg/m^3; lighter things follow the gusts faster
-  thickness: {s.thickness:<19.4g}# m; a shell; the mass of a patch is density x thickness x area
+_SHELL_AERO = """\
+aero:
+  C_D: 0.5                      # the paper's captures
+  C_F: 0.4
+  C_L: 0.01
+  air_density: 1.225            # kg/m^3
+  law: projected                # a captured shell shows patches to the wind at every angle
 """
 
 
-def _shell_aero() -> str:
+def _material(s: Suggestion) -> str:
+    density, why = (400.0, "lighter things follow the gusts faster")
+    if s.sheet:
+        density, why = (30.0, "the paper's flags, whose E is 3e3 to 6e3")
     return f"""\
-aero:
-  C_D: {SHELL_AERO["drag"]:<25g}# the paper's captures
-  C_F: {SHELL_AERO["friction"]}
-  C_L: {SHELL_AERO["lift"]}
-  air_density: 1.225            # kg/m^3
-  law: {SHELL_AERO["law"]:<25}# a captured shell shows patches to the wind at every angle
+material:
+  # {s.stiffness_reason}
+  E: {s.youngs_modulus:<27.1e}# Pa; more of it bends less and takes more substeps
+  nu: 0.3
+  density: {density:<21}# kg/m^3; {why}
+  thickness: {s.thickness:<19.4g}# m; a shell; the mass of a patch is density x thickness x area
 """
 
 
@@ -77,6 +77,14 @@ def region_dict(region: Region) -> dict[str, Any]:
     return {"class_path": type(region).__name__, "init_args": arguments}
 
 
+def draft_yaml(suggestion: Suggestion, ply: str | Path) -> str:
+    """A configuration for a first look, as :func:`starter_yaml`: a coarser grid, 2 s, a small picture."""
+    dx = max(suggest_spacing(suggestion.longest_side, suggestion.spacing, DRAFT_CELLS), suggestion.dx)
+    fill = None if suggestion.fill_spacing is None else float(f"{0.45 * dx:.2g}")
+    coarse = replace(suggestion, dx=dx, fill_spacing=fill)
+    return _yaml(coarse, ply, DRAFT_FRAMES, DRAFT_PICTURE, "# A first look: the same motion on a coarser grid, 2 s.")
+
+
 def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> str:
     """The configuration as text.
 
@@ -88,6 +96,10 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
     Returns:
         YAML for ``tools/sim.py --config``.
     """
+    return _yaml(suggestion, ply, frames, STARTER_PICTURE, "# A first configuration.")
+
+
+def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int, int], title: str) -> str:
     s = suggestion
     path = json.dumps(str(Path(ply).resolve()), ensure_ascii=False)
     region = s.region.region()
@@ -95,16 +107,17 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
     boundaries = " []               # nothing holds it: it will fall"
     if s.pin is not None:
         boundaries = f"""
-    # {s.hold.reason}
+{_comment(s.hold.reason, 4)}
     - class_path: PinnedRegion
       init_args:
         region: {json.dumps(region_dict(s.pin))}"""
-    hangs = s.hold.end != "bottom" or s.sheet
-    gravity = "[0.0, 0.0, -9.8]" if hangs else "[0.0, 0.0, 0.0] "
-    why = "it hangs" if hangs else "what stands was captured in balance with its weight"
+    falls = s.sheet or s.pin is None
+    gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "
+    why = "cloth and what nothing holds" if falls else "it was captured in balance with its weight"
     return f"""\
-# A first configuration, guessed from the splat; every number may be changed. What was not guessed is the material: it
-# is that of the paper's flags for a sheet, and soft rubber for anything else.
+{title}
+# Guessed from the splat; every number may be changed. A splat does not tell what it is made of: E and thickness are
+# such that it sways visibly in this wind.
 #   python tools/sim.py --config THIS_FILE
 frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
 frame_dt: 0.04                  # s
@@ -114,14 +127,15 @@ scene:
   ply: {path}
   up: {_padded(json.dumps([round(c, 6) for c in s.up.direction]), 26)}# scene axes; confidence: {s.up.confidence}
   longest_side: {s.longest_side:<16.6g}# m; the real one, if you know it
-  # {s.region.reason}
+{_comment(s.region.reason, 2)}
   region: {where}
   opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
   faint: carry
   area: coverage
   particle_spacing: {_fill(s)}
+  sampling: grid                # as many points as the grid can use, which all Gaussians follow; gaussian: one for each
 
-{_CLOTH if s.sheet else _shell(s)}
+{_material(s)}
 solver:
   formulation: total            # keeps its neighbours: cannot tear
   dx: {s.dx:<26.6g}# m; {s.longest_side / s.dx:.0f} cells along the longest side
@@ -139,7 +153,7 @@ wind:
     - class_path: GaussianGust
       init_args: {{std: 0.3}}
 
-{_CLOTH_AERO if s.sheet else _shell_aero()}
+{_CLOTH_AERO if s.sheet else _SHELL_AERO}
 shader:
   class_path: DiffuseShader
   init_args:
@@ -151,12 +165,13 @@ shader:
 camera:
   class_path: OrbitCamera
   init_args:
-    width: 960
-    height: 540
+    width: {size[0]}
+    height: {size[1]}
     fov_y: 40.0                 # degrees
     azimuth: {s.azimuth:<19.6g}# degrees about up; onto the broad side
     elevation: 8.0
-    radius: 1.9                 # times the longest side of what moves
+    radius: {s.camera_radius:<20.6g}# times the longest side of what moves; shows all of the object
+    target_offset: {json.dumps(list(s.camera_offset))}  # scene axes, likewise; from the centre of what moves
 
 recorder:
   trajectory: false             # positions of all particles in each frame
@@ -166,3 +181,9 @@ recorder:
 def _padded(text: str, width: int) -> str:
     """Text with blanks up to a width, at least one."""
     return f"{text:<{width - 1}} "
+
+
+def _comment(text: str, indent: int) -> str:
+    """Text as comment lines of at most 120 characters."""
+    begin = " " * indent + "# "
+    return textwrap.fill(text, 120, initial_indent=begin, subsequent_indent=begin, break_long_words=False)

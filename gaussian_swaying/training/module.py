@@ -396,9 +396,10 @@ class SplatTrainer(lightning.LightningModule):
         """Raise if the last loss was not finite: on a GPU one step later, so that nothing waits for it."""
         step = None if self._pending is None else self._pending.step
         if self._pending is not None and step is not None and not math.isfinite(self._pending.take()):
-            raise TrainingDiverged(step, "the loss", self._last_checkpoint())
+            raise TrainingDiverged(step, "the loss", self.last_checkpoint())
 
-    def _last_checkpoint(self) -> str | None:
+    def last_checkpoint(self) -> str | None:
+        """The newest checkpoint of this training, or the one that it continues; None if there is none."""
         folders = [getattr(callback, "dirpath", None) for callback in self.trainer.checkpoint_callbacks]
         files = [file for folder in folders if folder for file in Path(folder).glob("*.ckpt")]
         files = [file for file in files if file.stat().st_mtime_ns >= self._begun - _CLOCK_STEP]  # of this run
@@ -413,7 +414,7 @@ class SplatTrainer(lightning.LightningModule):
         self._check_pending()
         for name in PARAMETERS:
             if not bool(torch.isfinite(getattr(self.splat, name)).all()):
-                raise TrainingDiverged(self.global_step, f"a value of `{name}`", self._last_checkpoint())
+                raise TrainingDiverged(self.global_step, f"a value of `{name}`", self.last_checkpoint())
         checkpoint["splat_training"] = {
             "densification": self.densification.state_dict(),
             "kind": type(self.densification).__name__,

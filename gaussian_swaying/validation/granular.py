@@ -20,8 +20,9 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.mpm.boundary import Boundary, Nodes, Plane
-from gaussian_swaying.mpm.constitutive import lame_parameters
-from gaussian_swaying.mpm.materials import ConstitutiveLaw, Sand
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.validation.settings import Axial, Result, Settings, follow, lattice
@@ -137,7 +138,7 @@ def inclined_layer(
         settings: The numerics under test.
         cells: Grid cells over the depth of 0.1 m.
         friction_angle: Friction angle of the law [degrees].
-        volume_correction: See :class:`~gaussian_swaying.mpm.materials.Sand`.
+        volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
         seconds: Time [s].
         compression: Weight of the layer over Young's modulus.
 
@@ -235,7 +236,7 @@ def tossed_layer(
         settings: The numerics under test.
         cells: Grid cells over the depth of 0.1 m.
         friction_angle: Friction angle of the law [degrees].
-        volume_correction: See :class:`~gaussian_swaying.mpm.materials.Sand`.
+        volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
         rise: How far the surface would fly, over the depth.
         seconds: Time [s].
         compression: Weight of the layer over Young's modulus.
@@ -348,7 +349,7 @@ def column_collapse(
         cells: Grid cells along the half width; ``aspect * cells`` must be a whole number.
         planar: Plane strain, or else a round column.
         friction_angle: Friction angle of the law [degrees].
-        volume_correction: See :class:`~gaussian_swaying.mpm.materials.Sand`.
+        volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
         floor_friction: Coulomb coefficient of the floor, or None for a floor that holds what touches it.
         compression: Weight of the column over Young's modulus, about the compression at its foot.
         duration: Time over :math:`\sqrt{H_0 / g}`; in experiments a column rests after about 3.

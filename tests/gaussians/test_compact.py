@@ -161,5 +161,5 @@ def test_bad_splat(tmp_path):
             read_gaussians(path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(ValueError, match="is not a regular file"):
+    with pytest.raises(ValueError, match="is a directory"):
         read_gaussians(path)

@@ -1,5 +1,6 @@
 """The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained."""
 
+import os
 import re
 import warnings
 
@@ -314,3 +315,58 @@ def test_cloud_rejects_other_degrees():
     cloud = _cloud()
     with pytest.raises(ValueError, match="Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
         GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.zeros(7, 5, 3))
+
+
+# ---- headers that lie
+
+
+def _header(*lines, data=b""):
+    return "\n".join(("ply", "format binary_little_endian 1.0", *lines, "end_header", "")).encode() + data
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["element vertex 4000000000", "property list uchar float x"], "is truncated"),
+        (["element vertex 4", "property list uchar float x"], "property `x` is a list"),
+        (["element face 3", "property list uchar int at", "element vertex 1", "property float x"], "`at` is a list"),
+        (["element vertex -200", "property float x"], "'element vertex -200'"),
+        (["element vertex 9223372036854775808", "property float x"], "broken .ply header"),
+        (["element vertex 999999999999999999", "property float x"], "is truncated"),
+        (["element vertex 1", "property quad x"], "'property quad x'"),
+        (["element vertex 1", "property float x", "property float x"], "a property twice"),
+        (["property float x"], "'property float x'"),
+        (["element face 1", "property float x"], "no element `vertex`"),
+        (["comment " + "long " * 20_000], "no `end_header`"),
+    ],
+)
+def test_a_header_that_lies_is_refused_before_the_data(lines, words, tmp_path):
+    """A hundred bytes that announce terabytes take no memory."""
+    import resource
+
+    path = tmp_path / "bad.ply"
+    path.write_bytes(_header(*lines, data=b"\x01" * 20))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    _assert_rejected(path, words)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # KiB
+
+
+def test_a_pipe_is_refused(tmp_path):
+    """Reading it would wait for ever."""
+    os.mkfifo(tmp_path / "pipe.ply")
+    _assert_rejected(tmp_path / "pipe.ply", "no regular file")
+
+
+def test_only_the_element_of_the_gaussians_is_read(tmp_path):
+    """Elements before and after it are passed over, lists too if they come after."""
+    from gaussian_swaying.data.procedural import FlagScene
+
+    cloud = FlagScene(spacing=0.3).generate()
+    write_ply(tmp_path / "flag.ply", cloud)
+    head, mark, body = (tmp_path / "flag.ply").read_bytes().partition(b"end_header\n")
+    head = head.replace(b"element vertex", b"element camera 2\nproperty double fx\nelement vertex")
+    head += b"element face 1\nproperty list uchar int vertex_indices\n"
+    (tmp_path / "more.ply").write_bytes(head + mark + bytes(16) + body + b"\x01\0\0\0\0")
+    again = read_ply(tmp_path / "more.ply")
+    assert torch.equal(again.means, cloud.means)
+    assert torch.equal(again.opacities, cloud.opacities)

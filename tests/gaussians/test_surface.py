@@ -18,6 +18,7 @@ from gaussian_swaying.gaussians.surface import (
     deform_covariance,
     deform_normal,
     deform_patch,
+    limit_deformed,
     limit_stretch,
     quat_to_rotation,
     rotation_to_quat,
@@ -234,6 +235,28 @@ def test_the_limit_on_stretch_is_reached_without_a_jump():
     torch.testing.assert_close(close[0], close[1], rtol=0, atol=1e-7)
 
 
+def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
+    """A needle torn out a thousandfold stays a needle, turned with the material, where a grain becomes a ball."""
+    rest = torch.diag(torch.tensor([4.0, 1.0, 0.01])).expand(4, 3, 3).to(device, dtype)
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], device=device, dtype=dtype)
+    stretch = torch.tensor([[1.9, 1.0, 1.0], [1.0, 1e3, 1.0], [1.0, 1e3, 1.0], [3.0, 3.0, 3.0]]).to(rest)
+    f = turn * stretch[:, None, :]
+    drawn = deform_covariance(f, rest)
+    solid = torch.tensor([True, True, False, True], device=device)
+    kept = limit_deformed(f, drawn, rest, 2.0, solid)
+    assert torch.equal(kept[0], drawn[0])
+    assert torch.equal(limit_deformed(f, drawn, rest, 2.0, ~solid)[2], kept[1])
+    torch.testing.assert_close(limit_deformed(f, drawn, rest, 2.0, solid, polar_rotation(f)), kept)
+    size, size_at_rest = kept.diagonal(dim1=-2, dim2=-1).sum(-1), rest.diagonal(dim1=-2, dim2=-1).sum(-1)
+    torch.testing.assert_close(size[1:], 4 * size_at_rest[1:])
+    # turned, x and y change places; the thin axis stays thin, and what was torn out is 3 sizes long, not a thousand
+    own, grain = (kept[k].diagonal().cpu().double() for k in (1, 2))
+    torch.testing.assert_close(own, torch.tensor([3 * 5.01 + 1.0, 4.0, 0.01]).double(), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(grain, torch.tensor([3 * 5.01 + 1.67, 1.67, 1.67]).double(), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(kept[3], 4 * turn @ rest[3] @ turn.T, rtol=1e-5, atol=1e-6)
+    assert torch.equal(limit_deformed(f[:0], drawn[:0], rest[:0], 2.0, solid[:0]), drawn[:0])
+
+
 def test_gradcheck(device):
     f = _gradients(20, device)[:4].requires_grad_()
     normal = _unit(4, 3, device=device).requires_grad_()
@@ -273,6 +296,9 @@ def test_patch_area_takes_the_two_larger_scales(device, dtype):
         (lambda z: deform_covariance(z(2, 3, 3), z(2, 6)), "covariances"),
         (lambda z: limit_stretch(z(2, 6), z(2, 3, 3), 2.0), "covariances"),
         (lambda z: limit_stretch(z(2, 3, 3), z(2, 6), 2.0), "rest"),
+        (lambda z: limit_stretch(z(2, 3, 3), z(2, 3, 3), 2.0, z(2, 6)), "shape"),
+        (lambda z: limit_deformed(z(2, 3, 3), z(3, 3, 3), z(2, 3, 3), 2.0, z(2)), "covariances"),
+        (lambda z: limit_deformed(z(2, 3, 3), z(2, 3, 3), z(2, 3, 3), 2.0, z(3)), "solid"),
         (lambda z: deform_normal(z(2, 3, 3), z(2, 2)), "normals"),
         (lambda z: deform_area(z(2, 3), z(2, 3), z(2)), "deformation_gradient"),
         (lambda z: patch_area(z(2, 2)), "log_scales"),

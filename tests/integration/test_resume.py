@@ -12,7 +12,9 @@ import imageio.v3 as iio
 import pytest
 import torch
 
+from gaussian_swaying.simulation.checkpoint import write_checkpoint
 from gaussian_swaying.simulation.config import main
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.trajectory import load_trajectory
 
@@ -120,7 +122,61 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
     assert not (folder / "summary.json").exists()
-    (folder / "trajectory" / ".00004.1234.npz").write_bytes(b"half")
+    (folder / "trajectory" / ".00004.gs-writing-1234.npz").write_bytes(b"half")
+    (folder / ".my.notes.txt").write_text("precious")
+    (folder / "frames" / ".a.b.c").write_text("precious")
+    assert main(_arguments(folder, "--resume")) == 0
+    assert (folder / ".my.notes.txt").read_text() == "precious"
+    assert sorted(path.name for path in folder.rglob(".*")) == [".a.b.c", ".my.notes.txt"]
+    (folder / "frames" / ".a.b.c").unlink()
+    _same_as_uninterrupted(folder, whole)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends SIGTERM")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
+    """It holds its folder while it lives; then it ends in order, with its video, and names the command to go on."""
+    folder, slow = tmp_path / "run", tmp_path / "slow"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    code = (
+        "import pathlib, signal, sys, time\n"
+        "from gaussian_swaying.simulation import config, pipeline\n"
+        f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
+        "advance = pipeline.SimulationPipeline.advance\n"
+        "def slow(self, state):\n"
+        "    if float(state.time) > 0.1:\n"
+        f"        pathlib.Path({str(slow)!r}).touch()\n"
+        "        while True: time.sleep(0.05)\n"
+        "    return advance(self, state)\n"
+        "pipeline.SimulationPipeline.advance = slow\n"
+        "sys.exit(config.main(sys.argv[1:]))\n"
+    )
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", code, *_arguments(folder)], env=environment, **pipes)
+    try:
+        deadline = time.monotonic() + 120
+        while not slow.exists() and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.05)
+        assert slow.exists()
+        while not (folder / "frames/00003.png").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.5)  # until it is in the checkpoint too
+        for more in ([], ["--resume"]):
+            check_refused(_arguments(folder, *more), tmp_path, capsys, f"process {process.pid} on this host", "stop it")
+        process.send_signal(getattr(signal, name))
+        error = process.communicate(timeout=120)[1]
+        assert process.returncode == 128 + getattr(signal, name)
+    finally:
+        process.kill()
+        process.wait()
+    assert "Traceback" not in error
+    assert f"{folder}/checkpoint.pt holds the run up to frame 3; to go on:\n" in error
+    assert error.endswith(" --resume\n")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["status"], summary["reason"]) == ("interrupted", f"stopped by {name}")
+    assert summary["frames"] == 4
+    assert len(iio.imread(folder / "video.mp4")) == 4
+    assert not [path for path in folder.rglob(".*")]
     assert main(_arguments(folder, "--resume")) == 0
     _same_as_uninterrupted(folder, whole)
 
@@ -131,7 +187,9 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
     folder, full, go_on = tmp_path / "run", tmp_path / "full", tmp_path / "go_on"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     code = (
-        "import functools, pathlib, sys, time\n"
+        "import functools, pathlib, signal, sys, time\n"
+        # ignored where a script starts the tests in the background
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import imageio.v3 as iio\n"
         "from gaussian_swaying.simulation import config, recorder\n"
         f"full, go_on = pathlib.Path({str(full)!r}), pathlib.Path({str(go_on)!r})\n"
@@ -222,6 +280,26 @@ def test_another_configuration_is_refused_by_name(change, words, stopped, capsys
     )
 
 
+def test_the_end_of_a_run_names_its_checkpoint(tmp_path, monkeypatch, capsys):
+    """After a failure with the command, after a divergence without, as it would diverge again; a refusal names none."""
+    folder = tmp_path / "run"
+    for frame, error, words in (
+        (0, OSError("the disk is full"), None),
+        (2, OSError("the disk is full"), "frame 1; to go on:\n  python tools/sim.py --config"),
+        (3, SimulationDiverged(0.12, 0, "broken", "mend it"), "frame 2; going on from it would diverge again"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", ["tools/sim.py"])
+            _stop_after(patch, frame, lambda _, error=error: error)
+            assert main(_arguments(folder)) == 2
+        said = capsys.readouterr().err
+        assert said.count("checkpoint.pt holds") == (words is not None)
+        assert words is None or words in said
+        assert ("error: the disk is full" if frame < 3 else "mend it") in said
+    assert main(_arguments(folder, "--frames", "1", "--resume")) == 2
+    assert "checkpoint.pt holds" not in capsys.readouterr().err
+
+
 def test_nothing_to_resume(tmp_path, capsys):
     check_refused(_arguments(tmp_path / "none", "--resume"), tmp_path, capsys, "nothing to resume", "checkpoint.pt")
     assert not (tmp_path / "none").exists()
@@ -245,7 +323,7 @@ def test_another_splat_under_the_same_name_is_refused(stopped, capsys):
     checkpoint = torch.load(file, weights_only=True)
     for name in ("position", "velocity", "affine", "F_elastic", "lost"):
         checkpoint["state"][name] = checkpoint["state"][name][:50]
-    torch.save(checkpoint, file)
+    write_checkpoint(file, checkpoint)
     check_refused(_arguments(stopped, "--resume"), stopped, capsys, "holds 50 particles", "has 96")
 
 

@@ -5,25 +5,13 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.mpm import constitutive
-from gaussian_swaying.mpm.constitutive import (
-    FLUID_LIMIT,
-    LOG_LIMIT,
-    continued_log,
-    fixed_corotated_energy,
-    fixed_corotated_kirchhoff,
-    fixed_corotated_pk1,
-    fluid_energy,
-    fluid_pk1,
-    fluid_pressure,
-    lame_parameters,
-    neo_hookean_energy,
-    neo_hookean_pk1,
-    snow_lame,
-    spring_network_energy,
-    spring_network_pk1,
-    stvk_hencky_energy,
-)
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated, fixed_corotated_energy, fixed_corotated_pk1
+from gaussian_swaying.mpm.laws.fluid import FLUID_LIMIT, Fluid, fluid_energy, fluid_pk1, fluid_pressure
+from gaussian_swaying.mpm.laws.hencky import StVKHencky, stvk_hencky_energy
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean, neo_hookean_energy, neo_hookean_pk1
+from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, continued_log, lame_parameters
+from gaussian_swaying.mpm.laws.snow import Snow, snow_lame
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork, spring_network_energy, spring_network_pk1
 
 E, NU = torch.tensor(3000.0, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
 MU, LAM = lame_parameters(E, NU)
@@ -47,7 +35,7 @@ def test_stress_is_the_derivative_of_the_energy():
 
 def test_kirchhoff_is_symmetric_and_consistent():
     F = _gradients(spread=0.2)
-    tau = fixed_corotated_kirchhoff(F, MU, LAM)
+    tau = FixedCorotated().kirchhoff(F, MU, LAM)
     torch.testing.assert_close(tau, fixed_corotated_pk1(F, MU, LAM) @ F.mT)
     # round-off times the condition number
     torch.testing.assert_close(tau, tau.mT, rtol=0, atol=1e-12 * float(E))
@@ -58,7 +46,7 @@ def test_rotation_costs_nothing_and_turns_the_stress():
     Q = torch.linalg.qr(torch.randn(50, 3, 3, dtype=torch.float64))[0]
     Q = Q * torch.linalg.det(Q)[:, None, None]
     assert float(fixed_corotated_pk1(Q, MU, LAM).abs().max()) < 1e-8 * float(E)
-    turned, plain = fixed_corotated_kirchhoff(Q @ F, MU, LAM), fixed_corotated_kirchhoff(F, MU, LAM)
+    turned, plain = (FixedCorotated().kirchhoff(G, MU, LAM) for G in (Q @ F, F))
     torch.testing.assert_close(turned, Q @ plain @ Q.mT, rtol=0, atol=1e-8 * float(E))
 
 
@@ -91,8 +79,15 @@ def test_inverted_element_is_pushed_back():
 
 SNOW_VOLUME = torch.tensor(0.95, dtype=torch.float64)
 LAWS = {
-    name: tuple(getattr(constitutive, f"{name}_{kind}") for kind in ("energy", "pk1", "kirchhoff"))
-    for name in ("fixed_corotated", "neo_hookean", "spring_network", "stvk_hencky", "fluid", "snow")
+    name: (law.energy, law.pk1, law.kirchhoff)
+    for name, law in {
+        "fixed_corotated": FixedCorotated(),
+        "neo_hookean": NeoHookean(),
+        "spring_network": SpringNetwork(),
+        "stvk_hencky": StVKHencky(),
+        "fluid": Fluid(),
+        "snow": Snow(hardening=10.0),
+    }.items()
 }
 
 

@@ -14,9 +14,20 @@ pytest.importorskip("triton", reason="needs triton, which there is for Linux onl
 import triton
 import triton.language as tl
 
-from gaussian_swaying.mpm import fused, linalg, materials, materials_triton
+from gaussian_swaying.mpm import fused, laws, linalg
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
+from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin, shared, twin_of
 from gaussian_swaying.mpm.linalg_triton import polar_rotation, svd3
-from gaussian_swaying.mpm.materials_triton import energy_density, energy_kind, kirchhoff, law_row, pk1, wave_modulus
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
 
@@ -56,27 +67,24 @@ def _decompose(F_in, rotation, left, stretch, axes, count, BLOCK: tl.constexpr):
 
 
 @triton.jit
-def _elastic(F_in, out, mu, lam, count, KINDS: tl.constexpr, BLOCK: tl.constexpr):
+def _elastic(F_in, out, mu, lam, row, count, LAWS: tl.constexpr, BLOCK: tl.constexpr):
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = place < count
     F = _matrix(F_in, place * 9, mask)
-    stress = pk1(F, F[0] * 0 + mu, F[0] * 0 + lam, KINDS, KINDS)
+    stress = pk1(F, F[0] * 0 + mu, F[0] * 0 + lam, row, LAWS)
     for k in tl.static_range(9):
         tl.store(out + place * 9 + k, stress[k], mask)
 
 
 @triton.jit
-def _plastic(F_in, internal_in, F_out, internal_out, out, mu, lam, dt, row, count, KINDS: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip # noqa: E501
+def _plastic(F_in, internal_in, F_out, internal_out, out, mu, lam, dt, row, count, LAWS: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip # noqa: E501
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = place < count
     F = _matrix(F_in, place * 9, mask)
     mu = F[0] * 0 + mu
     lam = F[0] * 0 + lam
     internal = tl.load(internal_in + place, mask, 0.0)
-    p0 = tl.load(row)
-    p1 = tl.load(row + 1)
-    p2 = tl.load(row + 2)
-    F, internal, stress = kirchhoff(F, mu, lam, internal, KINDS, p0, p1, p2, dt, KINDS, True)
+    F, internal, stress = kirchhoff(F, mu, lam, internal, row, dt, LAWS, True)
     tl.store(internal_out + place, internal, mask)
     for k in tl.static_range(9):
         tl.store(out + place * 9 + k, stress[k], mask)
@@ -84,14 +92,14 @@ def _plastic(F_in, internal_in, F_out, internal_out, out, mu, lam, dt, row, coun
 
 
 @triton.jit
-def _scalars(F_in, wave, energy, mu, lam, count, KIND: tl.constexpr, BLOCK: tl.constexpr):
+def _scalars(F_in, wave, energy, mu, lam, count, WAVE: tl.constexpr, ENERGY: tl.constexpr, BLOCK: tl.constexpr):
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = place < count
     F = _matrix(F_in, place * 9, mask)
     mu = F[0] * 0 + mu
     lam = F[0] * 0 + lam
-    tl.store(wave + place, wave_modulus(F, mu, lam, KIND), mask)
-    tl.store(energy + place, energy_density(F, mu, lam, KIND), mask)
+    tl.store(wave + place, WAVE(F, mu, lam), mask)
+    tl.store(energy + place, ENERGY(F, mu, lam), mask)
 
 
 def _matrices(device, unique=False):
@@ -164,22 +172,28 @@ def test_nearest_rotation(kernel_device):
 
 
 LAWS = [
-    materials.FixedCorotated(),
-    materials.NeoHookean(),
-    materials.StVKHencky(),
-    materials.SpringNetwork(),
-    materials.Sand(),
-    materials.Sand(35.0, volume_correction=True),
-    materials.Metal(2e2),
-    materials.Metal(2e2, 5e3),
-    materials.Plasticine(1e3, 2e3, 1e2),
-    materials.Plasticine(1e3, 5e4, 1e2),
-    materials.Foam(1e2, 4.0),
-    materials.Foam(1e2, 1e4),
-    materials.Foam(0.0, 0.0),
-    materials.Snow(),
-    materials.Fluid(),
+    FixedCorotated(),
+    NeoHookean(),
+    StVKHencky(),
+    SpringNetwork(),
+    Sand(),
+    Sand(35.0, volume_correction=True),
+    Metal(2e2),
+    Metal(2e2, 5e3),
+    Plasticine(1e3, 2e3, 1e2),
+    Plasticine(1e3, 5e4, 1e2),
+    Foam(1e2, 4.0),
+    Foam(1e2, 1e4),
+    Foam(0.0, 0.0),
+    Snow(),
+    Fluid(),
 ]
+
+
+def _body(law, device):
+    """A body of one law, and the law's row in the table."""
+    body = BodyLaws([law])
+    return body, torch.tensor(body.table, device=device)
 
 
 def _close(found, exact, what):
@@ -193,7 +207,8 @@ def _close(found, exact, what):
 def test_elastic_stress(kernel_device, law):
     F = _matrices(kernel_device, unique=True)
     out = torch.empty_like(F)
-    _launch(_elastic, len(F), F, out, MU, LAM, KINDS=law_row(law)[0])
+    body, row = _body(law, kernel_device)
+    _launch(_elastic, len(F), F, out, MU, LAM, row, LAWS=body)
     wide = F.double()
     mu, lam = (torch.full_like(wide[:, 0, 0], value) for value in (MU, LAM))
     exact = law.pk1(wide, mu, lam)
@@ -208,13 +223,12 @@ def test_flow_and_stress(kernel_device, k):
     """Stretches, internal variable and Kirchhoff stress after the return map; all plastic kinds at once on a GPU."""
     law = LAWS[k]
     F = _matrices(kernel_device, unique=True)
-    kind, values = law_row(law)
+    body, row = _body(law, kernel_device)
     generator = torch.Generator().manual_seed(1)
     start = 0.0 if law.internal is None else law.internal
     internal = (start + 0.02 * torch.rand(len(F), generator=generator)).to(kernel_device)
     F_out, stress, inner = torch.empty_like(F), torch.empty_like(F), torch.empty_like(internal)
-    row = torch.tensor(values, device=kernel_device)
-    _launch(_plastic, len(F), F, internal, F_out, inner, stress, MU, LAM, DT, row, KINDS=kind)
+    _launch(_plastic, len(F), F, internal, F_out, inner, stress, MU, LAM, DT, row, LAWS=body)
     mu, lam = (torch.full(F.shape[:1], value, dtype=torch.float64, device=kernel_device) for value in (MU, LAM))
     given = None if law.internal is None else internal.double()
     exact, memory = law.return_map(F.double(), mu, lam, given, DT)
@@ -227,7 +241,7 @@ def test_flow_and_stress(kernel_device, k):
     assert float((F_out - F).abs().max()) > 1e-2
 
 
-ENERGIES = [materials.FixedCorotated(), materials.SpringNetwork(), materials.StVKHencky()]
+ENERGIES = [FixedCorotated(), SpringNetwork(), StVKHencky()]
 LAME = {"equal": (4e3, 4e3), "mu": (6e3, 2e3), "lambda": (2e3, 8e3), "auxetic": (5e3, -1e3), "steel": (8e10, 1.2e11)}
 CASES = [(law, ratio) for law in ENERGIES for ratio in LAME if (law, ratio) != (ENERGIES[0], "auxetic")]
 
@@ -259,17 +273,17 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
     mu, lam = LAME[ratio]
     F = _strained(kernel_device)
     wave, energy = F.new_empty(len(F)), F.new_empty(len(F))
-    _launch(_scalars, len(F), F, wave, energy, mu, lam, KIND=energy_kind([law]))
+    _launch(_scalars, len(F), F, wave, energy, mu, lam, WAVE=twin_of(law).wave, ENERGY=twin_of(law).energy)
     wide = F.double()
     parameters = [torch.full_like(wide[:, 0, 0], value) for value in (mu, lam)]
     values = linalg.svd3(wide)[1]
     expected = law.moduli(wide, *parameters)[0]
     rounding = 1.2e-5 + 5e-7 * values[:, 0] / (values[:, 1] + values[:, 2]).abs()
-    if not isinstance(law, materials.StVKHencky):
+    if not isinstance(law, StVKHencky):
         rounding = rounding.clamp(min=5e-4)
     error = (wave - expected).abs() / expected
     assert bool((error <= rounding).all()), f"{float((error / rounding).max()):.1e}"
-    if lam > 0 or isinstance(law, materials.StVKHencky):  # or there is no network, and nothing stiffens
+    if lam > 0 or isinstance(law, StVKHencky):  # or there is no network, and nothing stiffens
         assert int((expected > 1.01 * (2 * mu + lam)).sum()) > 500
     exact = law.energy(wide, *parameters)
     slope = (exact * expected).sqrt()
@@ -284,37 +298,77 @@ def test_what_is_not_finite_has_no_modulus(kernel_device, law):
     F.view(18, 9)[range(9), range(9)] = math.nan
     F.view(18, 9)[range(9, 18), range(9)] = math.inf
     wave, energy = F.new_zeros(len(F)), F.new_zeros(len(F))
-    _launch(_scalars, len(F), F, wave, energy, MU, LAM, KIND=energy_kind([law]))
+    _launch(_scalars, len(F), F, wave, energy, MU, LAM, WAVE=twin_of(law).wave, ENERGY=twin_of(law).energy)
     assert not bool(torch.isfinite(wave).any())
 
 
 def test_which_energy_holds_for_a_body():
     """One kernel per energy: all laws on Hencky's share it, whatever flows in them."""
-    corotated, network, hencky = (energy_kind([law]) for law in ENERGIES)
-    assert 0 < corotated != network != hencky != corotated
-    on_hencky = [law for law in LAWS if isinstance(law, materials.StVKHencky)]
-    assert {type(law) for law in on_hencky} == {
-        materials.StVKHencky, materials.Sand, materials.Metal, materials.Plasticine, materials.Foam,
-    }  # fmt: skip
-    assert energy_kind(on_hencky) == hencky
-    assert energy_kind([materials.SpringNetwork(), materials.SpringNetwork()]) == network
-    for others in ([ENERGIES[0], ENERGIES[1]], [ENERGIES[1], ENERGIES[2]], *([law] for law in LAWS[-2:]), [LAWS[1]]):
-        assert energy_kind(others) == 0
+    for name in ("energy", "wave"):
+        corotated, network, hencky = (shared([law], name) for law in ENERGIES)
+        assert None is not corotated is not network is not hencky is not corotated
+        on_hencky = [law for law in LAWS if isinstance(law, StVKHencky)]
+        assert {type(law) for law in on_hencky} == {StVKHencky, Sand, Metal, Plasticine, Foam}
+        assert shared(on_hencky, name) is hencky
+        assert shared([SpringNetwork(), SpringNetwork()], name) is network
+        others = [[ENERGIES[0], ENERGIES[1]], [ENERGIES[1], ENERGIES[2]], *([law] for law in LAWS[-2:]), [LAWS[1]]]
+        for body in [*others, [OwnLaw()], [OwnLaw(), ENERGIES[0]]]:
+            assert shared(body, name) is None
 
 
-def test_every_law_of_the_package_has_a_form():
-    """A new one must be added to the kernels, or here."""
-    laws = {
-        law for law in vars(materials).values() if isinstance(law, type) and issubclass(law, materials.ConstitutiveLaw)
-    }
-    concrete = {law for law in laws if not law.__name__.startswith("_") and law is not materials.ConstitutiveLaw}
-    assert {type(law) for law in LAWS} == concrete
+class OwnLaw(NeoHookean):
+    """It may have another stress than the law that it is made from."""
+
+
+def test_every_twin_of_the_package_is_compared():
+    """Each is in the list of this file, which the tests above go through."""
+    assert {type(law) for law in LAWS} == {law for law in laws.LAWS.values() if law.twin is not None}
     for law in LAWS:
-        kind = law_row(law)[0]
-        assert kind.bit_count() == 1
-        assert bool(kind & materials_triton.PLASTIC_KINDS.value) == law.plastic
+        assert (twin_of(law).flow is not None) == law.plastic
+    assert twin_of(OwnLaw()) is None
 
-    class Own(materials.NeoHookean):
-        pass
 
-    assert law_row(Own()) is None
+def test_what_a_body_asks_of_a_kernel():
+    """No decomposition where none is needed, and what laws have in common once."""
+    direct = BodyLaws([FixedCorotated(), NeoHookean()])
+    assert (direct.spectral, len(direct.principals), len(direct.matrices), len(direct.flows)) == (False, 0, 2, 0)
+    assert [row[:2] for row in direct.table] == [[0, -1], [1, -1]]
+    mixed = BodyLaws([NeoHookean(), Sand(), FixedCorotated(), StVKHencky(), Metal(5.0, 6.0), Plasticine(7.0, 8.0, 1.0)])
+    assert (mixed.spectral, len(mixed.principals), len(mixed.matrices), len(mixed.flows)) == (True, 2, 1, 2)
+    assert [row[:2] for row in mixed.table] == [[2, -1], [0, 0], [1, -1], [0, -1], [0, 1], [0, 1]]
+    assert mixed.table[4][2:] == [5.0, 6.0, 0.0, 0.0]
+    assert not mixed.all_flow
+    flowing = BodyLaws([Sand(), Fluid()])
+    assert flowing.all_flow
+    keys = {repr(body) for body in (direct, mixed, flowing, BodyLaws([Sand()]), BodyLaws([FixedCorotated()]))}
+    assert len(keys) == 5
+    if not fused.INTERPRETED:
+        assert repr(BodyLaws([Fluid(3.0)])) == repr(BodyLaws([Fluid()]))
+
+
+def test_a_twin_needs_a_stress():
+    function = object()
+    for given in ({}, {"flow": function}, {"kirchhoff": function}, {"pk1": function}):
+        with pytest.raises(ValueError, match="give `principal`, or `kirchhoff` and"):
+            LawTwin(**given)
+    LawTwin(kirchhoff=function, flow=function)
+
+
+@pytest.mark.parametrize("name", ["no_such_module", "gaussian_swaying.mpm.laws.shared"])
+def test_a_twin_that_is_not_there(name):
+    class Lost(Sand):
+        twin = name
+
+    with pytest.raises(ValueError, match=f"`twin` of Lost to be a module that holds a `TWIN`.*'{name}' is not"):
+        twin_of(Lost())
+
+
+def test_a_table_row_has_room_for_four_numbers():
+    class Many(Sand):
+        twin = Sand.twin
+
+        def coefficients(self):
+            return (1.0, 2.0, 3.0, 4.0, 5.0)
+
+    with pytest.raises(ValueError, match="at most four `coefficients` of Many, but got 5"):
+        BodyLaws([Many()])

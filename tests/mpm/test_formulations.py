@@ -4,20 +4,19 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.mpm import dispatch, linalg, materials
+from gaussian_swaying.mpm import dispatch, linalg
 from gaussian_swaying.mpm.boundary import PinnedRegion
-from gaussian_swaying.mpm.materials import (
-    FixedCorotated,
-    Fluid,
-    Foam,
-    Metal,
-    NeoHookean,
-    Plasticine,
-    Sand,
-    Snow,
-    SpringNetwork,
-    StVKHencky,
-)
+from gaussian_swaying.mpm.laws import law as law_module
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.validation.flags import flag
@@ -198,7 +197,7 @@ def test_an_elastic_run_computes_no_svd_and_no_return_map(law, formulation, monk
 
     for home, name in (
         (linalg, "spectrum"),
-        (materials, "spectrum"),
+        (law_module, "spectrum"),
         (linalg, "symmetric_eigen"),
         (dispatch.LawDispatch, "return_map"),
         (torch.linalg, "svd"),

@@ -18,7 +18,6 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.selection import Box, Everything
-from gaussian_swaying.mpm import materials
 from gaussian_swaying.mpm.boundary import (
     Boundary,
     EnclosingBox,
@@ -30,6 +29,16 @@ from gaussian_swaying.mpm.boundary import (
     VelocityBox,
 )
 from gaussian_swaying.mpm.forces import Force, Twin
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
@@ -51,20 +60,20 @@ FORMULATIONS = ["total", "updated"]
 FIELDS = ["position", "velocity", "affine", "F_elastic", "F_total", "internal", "node_displacement", "node_velocity"]
 WIND = WindField([5.0, 2.0, -1.0])
 ELASTIC = {
-    "corotated": materials.FixedCorotated(),
-    "neo-hookean": materials.NeoHookean(),
-    "springs": materials.SpringNetwork(),
-    "hencky": materials.StVKHencky(),
+    "corotated": FixedCorotated(),
+    "neo-hookean": NeoHookean(),
+    "springs": SpringNetwork(),
+    "hencky": StVKHencky(),
 }
 PLASTIC = {
-    "sand": materials.Sand(),
-    "sand that swells": materials.Sand(volume_correction=True),
-    "metal": materials.Metal(5e2, 1e3),
-    "foam": materials.Foam(2e2, 5.0),
-    "foam without viscosity": materials.Foam(2e2, 0.0),
-    "plasticine": materials.Plasticine(1e3, 2e4, 1e2),
-    "snow": materials.Snow(),
-    "fluid": materials.Fluid(),
+    "sand": Sand(),
+    "sand that swells": Sand(volume_correction=True),
+    "metal": Metal(5e2, 1e3),
+    "foam": Foam(2e2, 5.0),
+    "foam without viscosity": Foam(2e2, 0.0),
+    "plasticine": Plasticine(1e3, 2e4, 1e2),
+    "snow": Snow(),
+    "fluid": Fluid(),
 }
 
 
@@ -203,7 +212,7 @@ def test_laws_in_updated(kernel_device, law):
     law = (ELASTIC | PLASTIC)[law]
     ends = _wind_case(_points(kernel_device, law), "updated", steps=2)
     _agree(ends)
-    if law.plastic and not isinstance(law, materials.Fluid):
+    if law.plastic and not isinstance(law, Fluid):
         assert float((ends[1].F_elastic - ends[1].F_total).abs().max()) > 0.01
 
 
@@ -434,7 +443,7 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
         F[5] = 0.0
         return state.replace(F_total=F)
 
-    points = _points(kernel_device, materials.Sand())
+    points = _points(kernel_device, Sand())
     _agree(_wind_case(points, "updated", start=start))
 
 
@@ -1266,7 +1275,7 @@ def test_boundaries_that_change(kernel_device, formulation):
 def test_laws_that_change(kernel_device):
     ends = []
     for transfer in ("torch", "triton"):
-        law = materials.Metal(5e2, 1e3)
+        law = Metal(5e2, 1e3)
         points, solver = _points(kernel_device, law, count=12), _solver(transfer)
         state = _start(solver, points)
         solver.rollout(state, DT, 1)
@@ -1345,7 +1354,7 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
         assert not only.rollout(start, DT, 1, load).position.requires_grad
 
 
-class OwnLaw(materials.FixedCorotated):
+class OwnLaw(FixedCorotated):
     """A law of a user's own, which may be anything."""
 
 

@@ -12,7 +12,8 @@ from gaussian_swaying.aero.force import aero_force
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.gaussians.surface import deform_patch
 from gaussian_swaying.mpm.boundary import PinnedRegion
-from gaussian_swaying.mpm.materials import FixedCorotated, NeoHookean
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.transfer import bspline_stencil, scatter

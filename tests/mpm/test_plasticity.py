@@ -5,16 +5,13 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.mpm.constitutive import lame_parameters, stvk_hencky_kirchhoff
+from gaussian_swaying.mpm.laws.fluid import fluid_flow
+from gaussian_swaying.mpm.laws.foam import viscoplastic
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.sand import cone_slope, drucker_prager
+from gaussian_swaying.mpm.laws.shared import lame_parameters, von_mises
+from gaussian_swaying.mpm.laws.snow import snow_plasticity
 from gaussian_swaying.mpm.linalg import from_principal, spectrum
-from gaussian_swaying.mpm.plasticity import (
-    cone_slope,
-    drucker_prager,
-    fluid,
-    snow_plasticity,
-    viscoplastic,
-    von_mises,
-)
 
 E, NU = torch.tensor(3000.0, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
 MU, LAM = lame_parameters(E, NU)
@@ -32,7 +29,7 @@ MAPS = {
     "foam": lambda a, x, mu, lam: viscoplastic(a, mu, lam, None, YIELD, ETA, DT),
     "rigid-plastic foam": lambda a, x, mu, lam: viscoplastic(a, mu, lam, None, YIELD, 0.0, DT),
     "snow": lambda a, x, mu, lam: snow_plasticity(a, mu, lam, 1 + x, 0.025, 0.0075),
-    "fluid": lambda a, x, mu, lam: fluid(a, mu, lam, None),
+    "fluid": lambda a, x, mu, lam: fluid_flow(a, mu, lam, None),
 }
 
 
@@ -120,7 +117,7 @@ def test_simple_shear_of_sand_mobilises_its_friction():
     for _ in range(150):
         parts = spectrum(step @ F)
         F = from_principal(parts, lambda a: drucker_prager(a, MU, LAM, None, 30.0)[0], rotated=True)
-    tau = stvk_hencky_kirchhoff(F, MU, LAM)
+    tau = StVKHencky().kirchhoff(F, MU, LAM)
     ratio = float(-tau[0, 1] / tau[1, 1])
     slope = 6 * 0.5 / (3 - 0.5) / math.sqrt(3)
     assert ratio == pytest.approx(0.6906, abs=5e-4)
@@ -206,10 +203,10 @@ def test_snow_moves_volume_to_its_plastic_part():
 
 def test_fluid_keeps_only_the_volume():
     trial = _stretches()
-    new, _ = fluid(trial, MU, LAM, None)
+    new, _ = fluid_flow(trial, MU, LAM, None)
     torch.testing.assert_close(new.prod(-1), trial.prod(-1), rtol=1e-13, atol=0)
     assert bool((new == new[:, :1]).all())
-    crushed, _ = fluid(torch.tensor([1.0, 0.5, -0.5], dtype=torch.float64), MU, LAM, None)
+    crushed, _ = fluid_flow(torch.tensor([1.0, 0.5, -0.5], dtype=torch.float64), MU, LAM, None)
     torch.testing.assert_close(crushed.prod(), torch.tensor(0.05, dtype=torch.float64))
 
 

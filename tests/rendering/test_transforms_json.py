@@ -79,7 +79,7 @@ def test_bad_transforms_are_named(tmp_path, change, frame, message):
 
 
 def test_unreadable_transforms_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"missing\.json.*check `path`"):
+    with pytest.raises(ValueError, match=r"missing\.json.*check the path"):
         camera_from_transforms(tmp_path / "missing.json", 0)
     (tmp_path / "broken.json").write_text("{frames")
     with pytest.raises(ValueError, match=r"broken\.json.*not valid JSON"):

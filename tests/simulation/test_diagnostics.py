@@ -6,7 +6,8 @@ import warnings
 import pytest
 import torch
 
-from gaussian_swaying.mpm.materials import FixedCorotated, Sand
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge, check_state, diagnose

@@ -10,7 +10,11 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
-from gaussian_swaying.mpm.materials import FixedCorotated, Foam, NeoHookean, Plasticine, Sand
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
 from gaussian_swaying.simulation.recorder import Recorder

@@ -14,8 +14,12 @@ import yaml
 from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.gaussians.selection import Box
 from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, SequentialRelease, VelocityBox
-from gaussian_swaying.mpm.constitutive import lame_parameters
-from gaussian_swaying.mpm.materials import Foam, Metal, Plasticine, Sand, Snow
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.shared import lame_parameters
+from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.simulation.config import build_parser, build_pipeline, main
 from gaussian_swaying.simulation.physgaussian import convert, to_yaml
 from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera, read_model_camera
@@ -522,6 +526,26 @@ def test_a_pin_that_holds_nothing_says_where_the_particles_are_in_its_own_units(
         pipeline.start()
     found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("lie between")[1])]
     assert found == pytest.approx([*low, *high], abs=1e-4)
+
+
+def test_a_region_that_selects_nothing_says_where_the_splat_is_in_its_own_axes(tmp_path):
+    write_ply(tmp_path / "bar.ply", _body(_bar()))
+    turned = _bar() @ rotation_matrix([135.0], [0]).T
+    low, high = (corner.tolist() for corner in (turned.amin(0), turned.amax(0)))
+    config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "sim_area": [90, 91, 90, 91, 90, 91]}
+    settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
+    with pytest.raises(ValueError, match=r"No Gaussian is selected.*in the axes of the region, 0 lie in Box") as caught:
+        build_pipeline(PARSER, settings)
+    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("span")[1].split(" in ")[0])]
+    assert found == pytest.approx([*low, *high], abs=1e-4)
+    far = {"E": 1e5, "nu": 0.3, "density": 100, "point": [9, 9, 9], "size": [0.1, 0.1, 0.1]}
+    config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "additional_material_params": [far]}
+    settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
+    with pytest.raises(ValueError, match="regions` holds no simulated Gaussian: they lie between") as caught:
+        build_pipeline(PARSER, settings)
+    place = _normalised(_bar(), rotation_matrix([135.0], [0]), 1.0)
+    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("between")[1])]
+    assert found == pytest.approx([*place.amin(0).tolist(), *place.amax(0).tolist()], abs=1e-4)
 
 
 def test_normalisation_sets_the_scale_alone(tmp_path):

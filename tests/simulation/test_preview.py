@@ -13,25 +13,20 @@ from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
-from gaussian_swaying.simulation.lean import LEAN, SHELL_E
+from gaussian_swaying.simulation import calibration
+from gaussian_swaying.simulation.hold import PIN_DEPTH, end_region
 from gaussian_swaying.simulation.preview import (
     CELLS,
-    CONVENTION,
+    CLOTH_E,
+    DRAFT_CELLS,
     KEPT_AREA,
     MAX_BOXES,
-    PIN_DEPTH,
-    SHEET,
-    bounds,
+    SHELL_E,
     broad_side,
     connected_parts,
-    end_region,
-    floor_mask,
     gaussian_statistics,
     given_region,
-    guess_hold,
-    guess_up,
     particle_spacing,
-    sheet_normal,
     suggest,
     suggest_fill,
     suggest_region,
@@ -39,7 +34,9 @@ from gaussian_swaying.simulation.preview import (
     suggest_threshold,
     visible_weight,
 )
-from gaussian_swaying.simulation.starter import starter_yaml
+from gaussian_swaying.simulation.shape import SHEET, bounds, sheet_normal
+from gaussian_swaying.simulation.starter import DRAFT_FRAMES, draft_yaml, starter_yaml
+from gaussian_swaying.simulation.up import CONVENTION, floor_mask, guess_up
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
@@ -180,9 +177,18 @@ def test_origin_at_the_lower_end_and_longest_side_are_evidence():
     column = torch.rand(2000, 3) * torch.tensor([1.0, 4.0, 1.0]) + torch.tensor([3.0, -4.0, 3.0])  # y from -4 to 0
     found = up_of(splat(column, torch.full((2000, 3), -4.0)))
     assert found.direction == (0, -1, 0)
-    # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next
-    assert found.scores["-y"] == pytest.approx(3.25)
-    assert found.scores["+y"] == pytest.approx(2.0)
+    # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next, 0.5 for a base, which the top is too
+    assert found.scores["-y"] == pytest.approx(3.75)
+    assert found.scores["+y"] == pytest.approx(2.5)
+
+
+def test_a_base_tells_which_end_is_down():
+    """A cone, off the origin: it does not stand on its tip."""
+    height = torch.rand(3000, 1, generator=torch.Generator().manual_seed(0)).sqrt()
+    cone = torch.cat([0.6 * height * (torch.rand(3000, 2) - 0.5), 1 - height], -1) + 5
+    found = up_of(splat(cone, torch.full((3000, 3), -4.0)))
+    assert found.scores["+z"] - found.scores["-z"] == pytest.approx(0.75 + 1 + 0.5)
+    assert any("base" in reason for reason in found.reasons)
 
 
 @pytest.mark.parametrize("change", ["narrow", "table", "rough"])
@@ -274,25 +280,6 @@ def test_a_long_chain_is_one_part():
 # ---- pins
 
 
-def _cone(upside_down):
-    height = torch.rand(3000, 1) ** 0.5
-    radius = torch.cat([0.3 * height * (torch.rand(3000, 2) - 0.5), height], -1)
-    return radius if not upside_down else radius * torch.tensor([1, 1, -1.0])
-
-
-def test_thin_end_is_held():
-    weight = torch.ones(3000)
-    stalk = guess_hold(_cone(False), weight, (0, 0, 1), ground=False)
-    assert (stalk.end, stalk.direction, stalk.confidence) == ("bottom", (0, 0, -1), "medium")
-    lamp = guess_hold(_cone(True), weight, (0, 0, 1), ground=False)
-    assert (lamp.end, lamp.direction, lamp.confidence) == ("top", (0, 0, 1), "low")
-    assert guess_hold(_cone(True), weight, (0, 0, 1), ground=True).end == "bottom"  # a cone on a floor
-    column = torch.rand(3000, 3)
-    assert guess_hold(column, weight, (0, 0, 1), ground=False).confidence == "low"
-    curtain = torch.rand(3000, 3) * torch.tensor([1, 0.01, 1]) + 5
-    assert guess_hold(curtain, weight, (0, 0, 1), ground=False).end == "top"
-
-
 def test_end_region_of_a_tilted_axis_holds_that_end():
     points = torch.rand(2000, 3, dtype=torch.float64) * 2 - 1
     axis = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
@@ -374,9 +361,13 @@ def test_page_states_the_numbers_of_the_rules():
         f"z up (Blender), y down (COLMAP) | {CONVENTION['+z']:g} |",
         f"y up (glTF) | {CONVENTION['+y']:g} |",
         f"up to {MAX_BOXES} small boxes",
-        f"longest side over {CELLS},",
+        f"longest side over {CELLS} (in the draft over {DRAFT_CELLS})",
         f"{KEPT_AREA:.0%}".replace("%", " % of the visible area"),
-        f"leans by {LEAN:.0%}".replace("%", " %"),
+        f"default is {calibration.SWAY:.0%}".replace("%", " %"),
+        f"from {calibration.SOFTEST:.0e} to {calibration.STIFFEST:.0e} Pa".replace("e+0", "e"),
+        f"{100 * calibration.THINNEST:g} to {100 * calibration.THICKEST:g} % of the longest side",
+        f"first {calibration.SECONDS:g} s",
+        f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
         f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
         f"below {SHEET:g} of the next",
     ):
@@ -386,10 +377,30 @@ def test_page_states_the_numbers_of_the_rules():
     exec(compile(example, "own_scene.md", "exec"), {})
 
 
-def test_only_what_stands_gets_another_stiffness():
-    standing = suggest(tree())
-    assert standing.youngs_modulus > SHELL_E  # a thin trunk
-    assert math.hypot(*standing.flow) < 6
-    hanging = suggest(tree(), hold="top")
-    assert hanging.youngs_modulus == SHELL_E
-    assert math.hypot(*hanging.flow) == pytest.approx(6, abs=0.01)
+def test_draft_is_the_starter_on_a_coarser_grid():
+    found = suggest(FlagScene(spacing=0.0125).generate())
+    starter, draft = (yaml.safe_load(make(found, "flag.ply")) for make in (starter_yaml, draft_yaml))
+    assert draft["solver"]["dx"] == float(f"{1 / DRAFT_CELLS:.2g}") > starter["solver"]["dx"]
+    assert draft["frames"] == DRAFT_FRAMES < starter["frames"]
+    assert draft["camera"]["init_args"]["height"] < starter["camera"]["init_args"]["height"]
+    assert draft["scene"]["sampling"] == starter["scene"]["sampling"] == "grid"
+    for part in ("material", "wind", "aero", "shader"):
+        assert draft[part] == starter[part]
+    assert draft["solver"]["boundaries"] == starter["solver"]["boundaries"]
+    coarse = suggest(FlagScene(spacing=0.1).generate())  # too few Gaussians for a coarser grid to be any
+    assert yaml.safe_load(draft_yaml(coarse, "flag.ply"))["solver"]["dx"] == coarse.dx
+
+
+def test_only_cloth_and_what_falls_has_weight():
+    """All else was captured in balance with its weight."""
+
+    def gravity(found):
+        return yaml.safe_load(starter_yaml(found, "it.ply"))["solver"]["gravity"][2]
+
+    flag = suggest(FlagScene(spacing=0.05).generate())
+    assert (flag.youngs_modulus, gravity(flag)) == (CLOTH_E, -9.8)
+    for hold, weight in (("bottom", 0.0), ("top", 0.0), ("none", -9.8)):
+        found = suggest(tree(), hold=hold)
+        assert found.youngs_modulus == SHELL_E
+        assert gravity(found) == weight
+        assert math.hypot(*found.flow) == pytest.approx(6, abs=0.01)

@@ -630,6 +630,7 @@ def test_a_run_that_diverges_by_itself_is_kept(make_pipeline, tmp_path):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["status"] == "diverged"
     assert 3 <= summary["frames"] < 40
+    json.loads((tmp_path / "run" / "summary.json").read_text(), parse_constant=lambda name: pytest.fail(name))
     assert "Remedy" in summary["reason"]
     assert math.isfinite(summary["largest_cfl"])
     assert len(iio.imread(tmp_path / "run" / "video.mp4")) == summary["frames"]
@@ -647,6 +648,22 @@ def test_an_earlier_run_is_moved_aside(make_pipeline, tmp_path, capsys):
     assert (tmp_path / "run.1" / "mine.txt").read_text() == "precious"
     assert len(list((tmp_path / "run.2" / "frames").glob("*.png"))) == 1
     assert "run.1" in capsys.readouterr().out
+
+
+def test_a_folder_behind_a_link(make_pipeline, tmp_path):
+    """A run through it, one that continues there, and one that moves both aside."""
+    disk, link = tmp_path / "disk", tmp_path / "link"
+    disk.mkdir()
+    link.symlink_to(disk / "flag")
+    recorder = Recorder(video=False, ply_every=1)
+    _run(make_pipeline(), link, 2, recorder)
+    _run(make_pipeline(), link, 3, recorder, resume=True)
+    _run(make_pipeline(), link, 1, recorder)
+    assert link.is_symlink()
+    assert len(list((disk / "flag.1" / "frames").iterdir())) == 3
+    assert len(list((disk / "flag" / "frames").iterdir())) == 1
+    assert sorted(path.name for path in disk.iterdir()) == ["flag", "flag.1"]
+    load_trajectory(disk / "flag.1" / "trajectory.npz", 2)
 
 
 def test_foreign_files_are_left_alone(make_pipeline, tmp_path):

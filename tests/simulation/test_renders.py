@@ -108,7 +108,7 @@ def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     values = torch.arange(1.0, 1 + len(scene.simulated))
     found = scene.on_gaussians(values)
     assert torch.equal(found[scene.simulated], values)
-    assert torch.equal(found[scene.carried], values[scene.anchor])
+    assert torch.equal(found[scene.carried], values[scene.anchor[:, 0]])
     static = torch.ones(len(cloud), dtype=torch.bool)
     static[scene.moving] = False
     assert bool(static.any())

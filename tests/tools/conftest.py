@@ -1,22 +1,17 @@
-"""tools/bench.py as a module."""
+"""The folder tools/ is where tests of the benchmarks import from, as ``python tools/bench.py`` does."""
 
-import importlib.util
 import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "tools"))  # last, so that nothing that is installed is shadowed
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def bench():
-    """tools/bench.py with the modules beside it."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    try:
-        spec = importlib.util.spec_from_file_location("bench", ROOT / "tools/bench.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        yield module
-    finally:
-        sys.path.remove(str(ROOT / "tools"))
+    """The command line of tools/bench.py: a function of its arguments."""
+    from bench.command import main
+
+    return lambda *arguments: main("bench.py", [str(argument) for argument in arguments])

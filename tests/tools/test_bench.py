@@ -1,101 +1,117 @@
-"""The pages are what the recorded JSON says, and the measurements run."""
+"""The accuracy and the sweep of settings are measured, recorded and told."""
 
 import json
 import math
-import shutil
-import sys
-from pathlib import Path
 
 import pytest
+from bench.cases import accuracy, pareto
+from bench.tables import accuracy as tables
+from bench.tables import pareto as sweep
+from bench.tables.rows import order
 
-ROOT = Path(__file__).parents[2]
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.simulation.config import build_parser
 
+PAGE = """# Validation
 
-def _run(bench, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["bench.py", *map(str, arguments)])
-    bench.main()
-
-
-def test_the_pages_are_made_from_the_recorded_json(bench, monkeypatch, tmp_path):
-    """No number in them is typed by hand: made again they are the same, and the plots are there."""
-    shutil.copytree(ROOT / "docs/results", tmp_path / "docs/results")
-    _run(bench, monkeypatch, "pages", "--results", tmp_path / "docs/results")
-    for name in ("validation.md", "benchmarks.md"):
-        assert (tmp_path / "docs" / name).read_text() == (ROOT / "docs" / name).read_text(), name
-    text = (ROOT / "docs/validation.md").read_text()
-    for picture in ("convergence.png", "pareto_cpu.png", "pareto_cuda.png"):
-        assert f"(pictures/{picture})" in text
-        assert (ROOT / "docs/pictures" / picture).exists()
-        assert (tmp_path / "docs/pictures" / picture).stat().st_size > 10_000
+<!-- begin: accuracy.goals -->
+<!-- end -->
+<!-- begin: accuracy.sand_angles -->
+<!-- end -->
+"""
 
 
-def test_accuracy_replaces_only_what_it_was_asked_for(bench, monkeypatch, tmp_path):
+def test_accuracy_replaces_only_what_it_was_asked_for(bench, tmp_path):
     results = tmp_path / "docs/results"
     results.mkdir(parents=True)
+    (tmp_path / "docs/validation.md").write_text(PAGE)
     kept = {"problem": "vortex", "parameters": {"variant": "total", "cells": 8}, "result": {"error": 0.5}}
     (results / "accuracy_cpu.json").write_text(json.dumps({"rows": [kept]}))
-    _run(bench, monkeypatch, "accuracy", "--device", "cpu", "--only", "sand element", "--results", results)
+    bench("accuracy", "--device", "cpu", "--only", "sand element", "--results", results)
     found = json.loads((results / "accuracy_cpu.json").read_text())
     assert [row["problem"] for row in found["rows"]] == ["vortex", "sand element"]
     assert found["rows"][1]["result"]["triaxial_deg"] == pytest.approx(30.0, abs=0.1)
     assert found["versions"]["torch"]
-    assert "30.0 in triaxial compression" in (tmp_path / "docs/validation.md").read_text()
+    text = (tmp_path / "docs/validation.md").read_text()
+    assert "| simple shear | 34.7 | 34.7 |" in text
+    assert "| triaxial compression | 30.0 | 30.0 |" in text
+    assert "| plane strain | 43.9 | 43.9 |" in text
 
 
 def test_a_case_that_fails_is_recorded(bench, monkeypatch, tmp_path):
     def broken(**_):
         raise ValueError("no such sand")
 
-    monkeypatch.setattr(bench.accuracy_cases, "_elements", broken)
-    _run(bench, monkeypatch, "accuracy", "--device", "cpu", "--only", "sand element", "--results", tmp_path / "d/r")
-    assert "failed: sand element" in (tmp_path / "d/validation.md").read_text()
-    assert "no such sand" in (tmp_path / "d/validation.md").read_text()
+    (tmp_path / "validation.md").write_text(PAGE)
+    monkeypatch.setattr(accuracy, "_elements", broken)
+    bench("accuracy", "--device", "cpu", "--only", "sand element", "--results", tmp_path / "results")
+    assert "failed: sand element" in (tmp_path / "validation.md").read_text()
+    assert "no such sand" in (tmp_path / "validation.md").read_text()
 
 
-def test_a_goal_that_is_missed_says_no(bench, tmp_path):
+def test_without_a_page_beside_them_results_are_recorded_all_the_same(bench, tmp_path):
+    bench("accuracy", "--device", "cpu", "--only", "sand element", "--results", tmp_path / "results")
+    assert [path.name for path in tmp_path.iterdir()] == ["results"]
+    assert len(json.loads((tmp_path / "results/accuracy_cpu.json").read_text())["rows"]) == 1
+
+
+def test_a_goal_that_is_missed_says_no():
     rows = [
         {"problem": "hinged plate", "parameters": {"variant": "total", "law": "paper", "k": 1}, "result": result}
         for result in ({"error": 0.1, "angle": 1.0, "exact": 0.9}, {"error": -1.5, "angle": 1.0, "exact": 2.5})
     ]
-    lines = bench.accuracy_cases.page([{"rows": rows, "device": "x", "versions": {}}], tmp_path)
+    lines = tables.goals(rows)
     (goal,) = [line for line in lines if line.startswith("| hinged plate")]
     assert goal.endswith("| 1.50 degrees at worst | **no** |")
 
 
 @pytest.mark.parametrize("problem", ["bar", "cantilever", "hinged plate", "flag"])
-def test_the_sweep_covers_what_it_should(bench, problem):
+def test_the_sweep_covers_what_it_should(problem):
     """Four sizes, CFL 0.1 to 0.8, both precisions, three formulations, the default, and a fixed substep."""
-    rows = [row for row, _ in bench.pareto_cases.settings_of(problem, "cpu")]
+    rows = [row for row, _ in pareto.settings_of(problem, "cpu")]
     assert len({row["size"] for row in rows}) == 4
     assert {row["cfl"] for row in rows} >= {0.1, 0.2, 0.4, 0.8}
     assert {row["dtype"] for row in rows} == {"float32", "float64"}
     assert {row["variant"] for row in rows} == {"total", "updated", "MLS"}
-    assert sum(bench.pareto_cases.is_default(row) for row in rows) == 4
+    assert sum(pareto.is_default(row) for row in rows) == 4
     assert problem == "cantilever" or any(row["substep"] for row in rows)
 
 
-def test_the_default_is_that_of_the_solver(bench):
+def test_the_default_is_that_of_the_solver():
     """The star of the plots is what a user gets who sets nothing."""
-    solver = bench.MPMSolver()
-    default = bench.pareto_cases.DEFAULT
+    solver = MPMSolver()
+    default = pareto.DEFAULT
     assert (solver.formulation, solver.cfl, solver.substep) == (default["variant"], default["cfl"], default["substep"])
     assert solver.mls is False
-    parser = bench.build_parser()
+    parser = build_parser()
     assert parser.get_default("dtype") == default["dtype"]
 
 
-def test_the_front(bench):
+def test_the_front():
     def row(error, wall):
         return {"error": error, "wall_per_simulated_s": wall}
 
     rows = [row(1.0, 1.0), row(0.5, 2.0), row(0.6, 3.0), row(0.1, 8.0), row(None, 0.1), row(0.1, 7.8)]
-    assert bench.pareto_cases.front(rows) == [rows[0], rows[1], rows[5]]
-    good = [bench.pareto_cases.on_front(r, rows) for r in rows if r["error"]]
+    assert pareto.front(rows) == [rows[0], rows[1], rows[5]]
+    good = [pareto.on_front(r, rows) for r in rows if r["error"]]
     # the dearer of two equals is within the noise of the clock
     assert good == [True, True, False, True, True]
 
 
-def test_the_observed_order(bench):
+def test_the_observed_order():
     coarse, fine = ({"parameters": {"cells": n}, "result": {"error": 3.0 / n**2}} for n in (8, 12))
-    assert bench.accuracy_cases.order(coarse, fine) == pytest.approx(2.0)
-    assert math.isfinite(bench.accuracy_cases.order(coarse, fine))
+    assert order(coarse, fine) == pytest.approx(2.0)
+    assert math.isfinite(order(coarse, fine))
+
+
+def test_what_a_longer_substep_costs():
+    """The median over pairs that are alike but for the CFL number; fixed substeps and float64 do not count."""
+
+    def row(size, cfl, wall, **more):
+        base = {"problem": "bar", "size": size, "variant": "total", "dtype": "float32", "cfl": cfl, "substep": None}
+        return base | {"error": 0.1, "wall_per_simulated_s": wall} | more
+
+    rows = [row(1, 0.4, 1.0), row(1, 0.8, 0.5), row(2, 0.4, 2.0), row(2, 0.8, 1.2), row(3, 0.4, 4.0), row(3, 0.8, 2.8)]
+    rows += [row(4, 0.4, 1.0), row(1, 0.8, 9.0, dtype="float64"), row(2, 0.8, 9.0, substep=1e-3)]
+    rows += [row(5, 0.4, 1.0), row(5, 0.8, 9.0, error=None)]
+    assert sweep.time_at({"rows": rows}, "0.8") == "0.60"

@@ -1,21 +1,10 @@
 """The moving picture of the README."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+from bench import films
 from imageio.v3 import imwrite
 from PIL import Image
-
-ROOT = Path(__file__).parents[2]
-
-
-def _films():
-    specification = importlib.util.spec_from_file_location("films_tool", ROOT / "tools/films.py")
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
 
 
 def _run(folder, colour, shape=(40, 60, 3), frames=4):
@@ -30,7 +19,7 @@ def _run(folder, colour, shape=(40, 60, 3), frames=4):
 
 def test_runs_side_by_side(tmp_path):
     runs = [_run(tmp_path / "a", (200, 0, 0)), _run(tmp_path / "b", (0, 0, 200), (60, 40, 3))]
-    _films().film(runs, tmp_path / "film.webp", range(0, 4, 2), (16, 16), 80, quality=90)
+    films.film(runs, tmp_path / "film.webp", range(0, 4, 2), (16, 16), 80, quality=90)
     with Image.open(tmp_path / "film.webp") as film:
         assert (film.size, film.n_frames, film.info["loop"]) == ((32, 16), 2, 0)
         film.seek(1)
@@ -43,5 +32,5 @@ def test_runs_side_by_side(tmp_path):
 def test_a_missing_frame_is_named(tmp_path):
     run = _run(tmp_path / "a", (0, 200, 0), frames=2)
     with pytest.raises(ValueError, match=r"00002\.png is missing: give --frames_shown"):
-        _films().film([run], tmp_path / "film.webp", range(3), (8, 8), 40)
+        films.film([run], tmp_path / "film.webp", range(3), (8, 8), 40)
     assert not (tmp_path / "film.webp").exists()

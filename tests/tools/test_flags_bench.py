@@ -1,12 +1,13 @@
 """The flag benchmark: command lines that parse, a row from a run, and the page."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from bench.cases import flags
+from bench.tables import flags as tables
 from imageio.v3 import imread, imwrite
 
 from gaussian_swaying.simulation.config import build_parser
@@ -16,16 +17,7 @@ PIXEL = imwrite("<bytes>", np.zeros((4, 6, 3), np.uint8), extension=".png")
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture
-def flags(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import flags
-
-    yield flags
-    sys.modules.pop("flags", None)
-
-
-def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
+def test_every_row_is_a_command_line_that_parses(tmp_path):
     parser = build_parser()
     for name, variant in flags.VARIANTS.items():
         for pattern in variant.patterns:
@@ -47,7 +39,7 @@ def test_every_row_is_a_command_line_that_parses(flags, tmp_path):
                     assert sheets[0] == pytest.approx(sheets[1])
 
 
-def test_pictures_have_the_size_of_the_reference(flags, tmp_path):
+def test_pictures_have_the_size_of_the_reference(tmp_path):
     video = tmp_path / "pattern2" / "video"
     video.mkdir(parents=True)
     (video / "camera.json").write_text(json.dumps({"w": 320, "h": 180}))
@@ -55,7 +47,7 @@ def test_pictures_have_the_size_of_the_reference(flags, tmp_path):
     assert (settings.camera.init_args.width, settings.camera.init_args.height) == (320, 180)
 
 
-def test_gaussians_turned_to_the_reference(flags, tmp_path):
+def test_gaussians_turned_to_the_reference(tmp_path):
     """Normals are those of the nearest vertex, the normal's own axis is the one that was turned, sizes stay."""
     from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
     from gaussian_swaying.gaussians.surface import smallest_axis_normal
@@ -79,7 +71,7 @@ def test_gaussians_turned_to_the_reference(flags, tmp_path):
     assert torch.equal(turned.means, cloud.means)
 
 
-def test_a_row_is_simulated_and_compared(flags, tmp_path):
+def test_a_row_is_simulated_and_compared(tmp_path):
     """A flag in still air that cannot fall, against one at rest: what is left is the spacing of the points."""
     u, v = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 1, 17), indexing="ij")
     x, z = 1.2 * u.ravel(), 0.8 * v.ravel()
@@ -103,14 +95,14 @@ def test_a_row_is_simulated_and_compared(flags, tmp_path):
     assert "solver.dx" in flags.run_row(1, "ours", options, None, tmp_path / "again")["failed"]
 
 
-def test_the_line_that_names_the_error(flags):
+def test_the_line_that_names_the_error():
     told = "Traceback\nRuntimeError: CUDA error: out\nCompile with `X` to enable assertions.\n\n"
     assert flags.what_failed(told) == "RuntimeError: CUDA error: out"
     assert flags.what_failed("one\ntwo\n") == "two"
     assert flags.what_failed("") == "no message"
 
 
-def test_a_figure_needs_all_pictures(flags, tmp_path):
+def test_a_figure_needs_all_pictures(tmp_path):
     frames = {"reference": tmp_path / "reference/video/frames", "ours": tmp_path / "ours/frames"}
     frames["particle"] = tmp_path / "particle/frames"
     for folder in frames.values():
@@ -125,7 +117,7 @@ def test_a_figure_needs_all_pictures(flags, tmp_path):
     assert imread(target).shape[1] > 1000
 
 
-def test_the_page_tells_what_was_and_what_was_not(flags):
+def test_the_page_tells_what_was_and_what_was_not():
     mean = {"psnr_db": 22.5, "chamfer_m": 0.0213 * 1.2}
     row = {"status": "complete", "frames": 250, "torn_particles": 0, "chamfer_share": 0.0213, "mean": mean}
     row["chamfer_per_frame_m"] = [0.012, 0.012, 0.024, 0.024, 0.048, 0.048]
@@ -136,7 +128,8 @@ def test_the_page_tells_what_was_and_what_was_not(flags):
     result |= {"more": "--solver.dx=0.03", "note": "Other work ran beside these."}
     known = {"cells": 60, "quality": 16, "frames_compared": 250, "chamfer": 0.034}
     result["uncertainty"] = {"1": {"coarser": known, "hardly bending": known | {"chamfer": 0.082}}}
-    text = "\n".join(flags.page([result]))
+    parts = [tables.device(result), tables.rows_table(result), tables.goal_table(result), tables.reference([result])]
+    text = "\n".join(line for part in parts for line in part)
     ours = flags.VARIANTS["ours"].title
     assert f"| {ours} | 2.13 % | 22.50 | - | - | stopped at frame 31 | 22.50 |" in text
     assert "| PhysGaussian's way | failed | - | - | - | - | - |" in text
@@ -145,10 +138,23 @@ def test_the_page_tells_what_was_and_what_was_not(flags):
     assert "coarser (60 cells, 16 steps, 250 frames) 3.40 %" in text
     assert "a fiftieth of its bending stiffness 8.20 %" in text
     assert "(reference itself: 3.40 %)" in text
-    assert "| Gaussian Swaying | 21.44 | 0.0178 |" in text
+    assert tables.costs(result)[2:] == [f"| {ours}, pattern {p} | 1,000 | 5,000 | 12.3 | 1.00 |" for p in (1, 3)]
+    assert tables.distance(result, "ours", "1") == "2.13 %"
+    assert tables.reference_distance([result], "hardly_bending", "1") == "8.20 %"
 
 
-def test_goals_and_what_one_change_does(flags):
+def test_the_page_quotes_the_paper():
+    assert "| Gaussian Swaying | 21.44 | 0.0178 |" in (ROOT / "docs/flag_benchmark.md").read_text()
+
+
+def test_numbers_of_the_prose_are_those_of_the_reference():
+    """The wind of pattern 2, (2.5, 0.5, 0) m/s, along a flag in the x-z plane: atan(0.2), and a degree over tan."""
+    assert tables.ripple([], "1") == "3 mm"
+    assert tables.incidence([], "2") == "11 degrees"
+    assert tables.per_degree([], "2") == "9 %"
+
+
+def test_goals_and_what_one_change_does():
     def row(share, psnr, **more):
         return {"status": "complete", "chamfer_share": share, "mean": {"psnr_db": psnr, "chamfer_m": 2 * share}} | more
 
@@ -156,7 +162,7 @@ def test_goals_and_what_one_change_does(flags):
     rows = {"ours": {"3": ours}, "particle": {"3": row(0.1, 18.0)}, "no_surface": {"3": row(0.03, 18.0)}}
     rows |= {"no_shading": {"3": row(0.02, 23.0)}, "undamped": {"3": row(0.025, 22.0)}, "thin": {"3": row(0.018, 22.0)}}
     result = {"rows": rows, "uncertainty": {"3": {"coarser": {"chamfer": 0.0067}}}}
-    found = {goal: (value, ok) for goal, value, ok in flags.goals(result)}
+    found = {goal: (value, ok) for goal, value, ok in tables.goals(result)}
     assert found == {
         "pattern 3: Chamfer distance within 3 % of the longer side": ("2.00 % (reference itself: 0.67 %)", True),
         "pattern 3: Chamfer distance 0.25 times that of PhysGaussian's way": ("0.20 times", True),
@@ -164,14 +170,14 @@ def test_goals_and_what_one_change_does(flags):
         "pattern 3: without surface modelling at least twice the Chamfer distance": ("1.50 times", False),
         "pattern 3: without shading a lower PSNR": ("+1.00 dB", False),
     }
-    lines = flags.pattern_lines(rows, 3)
+    lines = tables.pattern_lines(rows, 3)
     assert lines[0].endswith("0.50 %, 1.00 %, 3.00 %")
     assert "half the thickness, twice E and density -0.20; no shading +0.00; without the" in lines[1]
     assert lines[1].endswith("damping +0.50")
-    assert flags.pattern_lines(rows, 1) == []
+    assert tables.pattern_lines(rows, 1) == []
 
 
-def test_a_training_that_is_there_is_kept_with_its_account(flags, tmp_path, monkeypatch):
+def test_a_training_that_is_there_is_kept_with_its_account(tmp_path, monkeypatch):
     """And one that is not is run, and its account written."""
     target = tmp_path / "all_losses"
 

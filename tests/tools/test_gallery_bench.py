@@ -1,6 +1,5 @@
 """The gallery: each scene has its files, a run is pictured, and the page says what was lost."""
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,12 +9,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
-def gallery(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import gallery
+def gallery():
+    from bench.cases import gallery
 
-    yield gallery
-    sys.modules.pop("gallery", None)
+    return gallery
 
 
 def test_each_scene_has_its_files(gallery):
@@ -58,9 +55,14 @@ def test_whole_means_all_of_it(gallery):
     }
     row |= {"peak_memory_bytes": {"host": 2**30, "device": None}, "preset": "preview"}
     result = {"device": "CPU", "versions": {}, "seed": 0, "scenes": {"ficus": row, "sand": {"failed": "x"}}}
-    text = "\n".join(gallery.page([result]))
+    text = "\n".join(gallery.scenes(result))
     shown = "| Ficus, preset `preview` | 1,000 | `total` | 250 | 10 | 10.0 | 4 | 1.00 | - | 10.0 % | yes |"
     assert shown in text
     assert "| Sand | failed" in text
-    assert "gallery_ficus.png" in text
-    assert "gallery_sand.png" not in text
+
+
+def test_the_page_shows_each_scene(gallery):
+    text = (ROOT / "docs/gallery.md").read_text()
+    for name, title in gallery.SCENES.items():
+        assert f"### {title}\n\n![Five frames of {title}](pictures/gallery_{name}.png)" in text
+        assert (ROOT / f"docs/pictures/gallery_{name}.png").exists()

@@ -16,13 +16,13 @@ import torch
 from gaussian_swaying.data.capture import read_capture
 from gaussian_swaying.rendering.camera_path import TransformsCamera
 
-TOOLS = Path(__file__).parents[2] / "tools"
+TOOLS = Path(__file__).parents[2] / "tools" / "datasets"
 NAMES = ("blender_cloth", "blender_checks", "blender_images", "flag_reference", "make_flag_dataset")
 
 
 @pytest.fixture(scope="module")
 def tool():
-    """tools/make_flag_dataset.py with the modules beside it."""
+    """tools/datasets/make_flag_dataset.py with the modules beside it."""
     sys.path.insert(0, str(TOOLS))
     try:
         import make_flag_dataset

@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
 from gaussian_swaying.simulation import config
 from gaussian_swaying.simulation.preview_cli import main
 
@@ -44,12 +45,15 @@ def test_starter_runs_unchanged(splat, tmp_path, capsys):
     out = tmp_path / "out"
     assert preview(splat, out, "--frames", "3") == 0
     report = capsys.readouterr().out
-    assert sorted(path.name for path in out.iterdir()) == ["preview.json", "preview.png", "starter.yaml"]
+    assert sorted(path.name for path in out.iterdir()) == ["draft.yaml", "preview.json", "preview.png", "starter.yaml"]
     data = json.loads((out / "preview.json").read_text())
     assert data["suggestion"]["up"]["direction"] == [0, 0, 1]
     assert data["suggestion"]["hold"]["end"] == "side"
     assert data["run"]["held"] == 30  # three columns of ten
     assert data["cost"]["frames"] == 3
+    assert data["draft_cost"]["total_seconds"] > data["draft_cost"]["startup_seconds"] > 0
+    assert report.index("a first look (2.04 s") < report.index("the starter (0.12 s")
+    assert f"--config {out / 'draft.yaml'}" in report
     for words in ("150 Gaussians", "confidence medium", "dx = 0.14 m", f"--config {out / 'starter.yaml'}"):
         assert words in report
     assert "a floor" not in report
@@ -59,6 +63,28 @@ def test_starter_runs_unchanged(splat, tmp_path, capsys):
     assert summary["frames"] == 3
     assert summary["lost_particles"] == 0
     assert summary["displacement_mean_max_m"] > 1e-4
+    short = [*small, "--frames", "2"]
+    assert config.main(["--config", str(out / "draft.yaml"), "--output", str(tmp_path / "draft"), *short]) == 0
+
+
+def test_more_sway_is_softer(tmp_path):
+    """A post of a few large patches, held at its foot."""
+    means = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 0.2, 1.0])
+    scales = torch.tensor([0.05, 0.05, 0.005]).log().expand(200, 3)
+    quats = torch.randn(200, 4, generator=torch.Generator().manual_seed(1))
+    path = tmp_path / "post.ply"
+    write_ply(path, GaussianCloud(means, quats, scales, torch.full((200,), 3.0), torch.zeros(200, 1, 3)))
+    hold, motions = [], []
+    for sway in ("0.04", "0.16"):
+        out = tmp_path / sway
+        assert preview(path, out, "--up", "+z", "--hold", "bottom", "--sway", sway, "--frames", "2") == 0
+        starter = yaml.safe_load((out / "starter.yaml").read_text())
+        flow = starter["wind"]["flow"]
+        hold.append(starter["material"]["E"] * starter["material"]["thickness"] / (flow[0] ** 2 + flow[1] ** 2))
+        reason = json.loads((out / "preview.json").read_text())["suggestion"]["stiffness_reason"]
+        motions.append(float(reason.split("at most ")[1].split(" of the longest")[0]))
+    assert motions == [pytest.approx(0.04, rel=0.25), pytest.approx(0.16, rel=0.25)]
+    assert hold[0] > 2 * hold[1]
 
 
 def test_edited_starter_is_kept(splat, tmp_path):
@@ -139,8 +165,12 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--longest-side", "-1"], "`--longest-side`"),
         (splat, ["--wind", "nan"], "`--wind`"),
         (splat, ["--frames", "0"], "`--frames`"),
+        (splat, ["--sway", "0"], "`--sway`"),
+        (splat, ["--sway", "nan"], "`--sway`"),
         (splat, ["--height", "7"], "`--height`"),
         (splat, ["--config", str(typo)], "dxx"),
+        (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for guesses, but"),
+        (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
     ):
         check_refused(scene, tmp_path, capsys, *options, words=words)

@@ -1,10 +1,14 @@
 """``bench.py speed`` measures all it should, keeps what it has, and its page and goals say what was recorded."""
 
 import json
-import sys
 
 import pytest
 import torch
+from bench import problems
+from bench.cases import speed
+from bench.tables import goals, speed_goals
+
+from gaussian_swaying.mpm.solver import MPMSolver
 
 SPREAD = {"median_ms", "quartile_low_ms", "quartile_high_ms", "repeats"}
 ROLLOUT = SPREAD | {"formulation", "asked", "particles", "grid_nodes", "nodes", "substeps", "path", "graph_ms", "bytes"}
@@ -25,19 +29,38 @@ FRAME = SPREAD | {"dx_m", "main", "simulation_ms", "shading_ms", "rendering_ms",
 FRAME |= {"substeps", "renderer", "memory_bytes", "build_memory_bytes"}
 
 
-def _run(bench, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["bench.py", *map(str, arguments)])
-    bench.main()
+PAGE = """# Benchmarks
+
+<!-- begin: speed.device speed_cpu -->
+<!-- end -->
+<!-- begin: speed.substeps speed_cpu -->
+<!-- end -->
+<!-- begin: speed.batches speed_cpu -->
+<!-- end -->
+<!-- begin: speed.frames speed_cpu -->
+<!-- end -->
+<!-- begin: speed.fewest_numbers -->
+<!-- end -->
+<!-- begin: goals.table -->
+<!-- end -->
+"""
 
 
-def _speed(bench, monkeypatch, results, *arguments):
-    _run(bench, monkeypatch, "speed", "--device", "cpu", "--quick", "--results", results, *arguments)
+def _speed(bench, results, *arguments):
+    bench("speed", "--device", "cpu", "--quick", "--results", results, *arguments)
     return json.loads((results / "speed_cpu.json").read_text())
 
 
-def test_everything_is_measured_and_shown(bench, monkeypatch, tmp_path):
+def _pages(bench, results):
+    """The page that shows what was recorded."""
+    (results.parent / "benchmarks.md").write_text(PAGE)
+    bench("pages", "--results", results)
+    return (results.parent / "benchmarks.md").read_text()
+
+
+def test_everything_is_measured_and_shown(bench, tmp_path):
     results = tmp_path / "docs/results"
-    found = _speed(bench, monkeypatch, results)
+    found = _speed(bench, results)
     assert found["device"].endswith("threads")
     assert found["versions"]["torch"]
     assert (found["seed"], found["kind"], found["quick"], found["dt_s"]) == (0, "cpu", True, 1e-4)
@@ -62,14 +85,13 @@ def test_everything_is_measured_and_shown(bench, monkeypatch, tmp_path):
     (frame,) = found["frame"]
     assert (frame["particles"], frame["width"], frame["height"], frame["main"]) == (1536, 64, 36, True)
 
-    _run(bench, monkeypatch, "pages", "--results", results)
-    text = (tmp_path / "docs/benchmarks.md").read_text()
+    text = _pages(bench, results)
     assert text.count("| `total`, sheet in wind, ") == 2
     assert "| `updated`, block of sand, 64 particles, 4 substeps |" in text
     assert "| 2 of 64 particles, `updated`, gusts, 4 substeps |" in text
     assert "| dx = 0.1 m, 1,536 Gaussians, 64x36 |" in text
-    assert "per particle, position and deformation gradient (12) are read and written" in text
-    assert "(pictures/speed_cpu.png)" in text
+    assert "| `updated`, a particle | 16 | 12 |" in text
+    assert "Made with `--quick`" in text
     assert (tmp_path / "docs/pictures/speed_cpu.png").stat().st_size > 10_000
     assert "failed" not in text
 
@@ -78,56 +100,52 @@ def test_a_run_that_is_killed_keeps_what_it_has(bench, monkeypatch, tmp_path):
     def killed(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench.speed_cases, "bench_frame", killed)
+    monkeypatch.setattr(speed, "bench_frame", killed)
     with pytest.raises(KeyboardInterrupt):
-        _speed(bench, monkeypatch, tmp_path / "d/r", "--only", "sand,frame")
+        _speed(bench, tmp_path / "d/r", "--only", "sand,frame")
     found = json.loads((tmp_path / "d/r/speed_cpu.json").read_text())
     assert found["partial"] is True
     assert len(found["sand"]) == 1
     assert found["frame"] == []
-    _run(bench, monkeypatch, "pages", "--results", tmp_path / "d/r")
-    assert "The run was stopped before its end" in (tmp_path / "d/benchmarks.md").read_text()
+    assert "The run was stopped before its end" in _pages(bench, tmp_path / "d/r")
 
 
 def test_a_case_without_memory_is_recorded_and_the_others_are_measured(bench, monkeypatch, tmp_path):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr(bench.speed_cases, "bench_rollout", full)
-    found = _speed(bench, monkeypatch, tmp_path / "d/r", "--only", "sand,batch")
+    monkeypatch.setattr(speed, "bench_rollout", full)
+    found = _speed(bench, tmp_path / "d/r", "--only", "sand,batch")
     assert found["sand"] == [{"formulation": "updated", "asked": 64, "failed": "out of memory"}]
     assert all("ratio" in row for row in found["batch"])
-    _run(bench, monkeypatch, "pages", "--results", tmp_path / "d/r")
-    assert (
-        "| `updated`, block of sand, 64 particles | failed: out of memory |"
-        in (tmp_path / "d/benchmarks.md").read_text()
-    )
+    text = _pages(bench, tmp_path / "d/r")
+    assert "| `updated`, block of sand, 64 particles | failed: out of memory |" in text
 
 
 def test_an_error_that_cannot_be_measured_does_not_cost_the_time(bench, monkeypatch, tmp_path):
     def full(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes")
 
-    monkeypatch.setattr(bench.speed_cases, "error_of", full)
-    (row,) = _speed(bench, monkeypatch, tmp_path / "d/r", "--only", "sand")["sand"]
+    monkeypatch.setattr(speed, "error_of", full)
+    (row,) = _speed(bench, tmp_path / "d/r", "--only", "sand")["sand"]
     assert row["error"] == {"failed": "out of memory"}
     assert row["median_ms"] > 0
 
 
-def test_only_keeps_the_other_sections(bench, monkeypatch, tmp_path):
+def test_only_keeps_the_other_sections(bench, tmp_path):
     results = tmp_path / "d/r"
-    first = _speed(bench, monkeypatch, results, "--only", "substep", "--counts", "36")
+    first = _speed(bench, results, "--only", "substep", "--counts", "36")
     assert [row["particles"] for row in first["substep"]] == [36, 36]
-    both = _speed(bench, monkeypatch, results, "--only", "sand")
+    both = _speed(bench, results, "--only", "sand")
     assert both["substep"] == first["substep"]
     assert len(both["sand"]) == 1
     with pytest.raises(SystemExit, match="not sandd"):
-        _speed(bench, monkeypatch, results, "--only", "sandd")
+        _speed(bench, results, "--only", "sandd")
 
 
-def test_the_fewest_bytes(bench):
+def test_the_fewest_bytes():
     """Ten particles and four nodes, by hand: four bytes times the numbers that go in and out."""
-    count = bench.speed_cases.fewest_bytes
+    count = problems.fewest_bytes
     # rest position 3, volume, mu, lambda; of a node u and v in and out, and its mass
     assert count("total", 10, 4) == 4 * (10 * (3 + 3) + 4 * (6 + 6 + 1))
     assert count("total", 10, 4, wind=True) - count("total", 10, 4) == 4 * 10 * (3 + 1)
@@ -137,8 +155,8 @@ def test_the_fewest_bytes(bench):
     assert count("updated", 1000, 0, wind=True) == 128_000
 
 
-def test_nodes_in_reach(bench):
-    count = bench.speed_cases.nodes_in_reach
+def test_nodes_in_reach():
+    count = problems.nodes_in_reach
     position = torch.tensor([[0.5, 0.5, 0.5], [0.51, 0.49, 0.52], [0.61, 0.5, 0.5], [0.91, 0.5, 0.5]])
     assert count(position[:1], 0.1) == 27
     assert count(position[:2], 0.1) == 27  # the same cell
@@ -146,14 +164,13 @@ def test_nodes_in_reach(bench):
     assert count(position, 0.1) == 63  # those from 4 to 7 along x, and from 8 to 10
 
 
-def test_the_error_is_that_of_the_end(bench):
+def test_the_error_is_that_of_the_end():
     """One hundredth of the largest displacement beside the truth is an error of one hundredth."""
-    speed = bench.speed_cases
     with torch.inference_mode():
-        points = speed.sheet(64, torch.device("cpu"))
-        load = speed.wind_load(points, speed.wind(0, True, torch.device("cpu")))
-        solver = bench.MPMSolver(dx=0.05)
-        start = solver.init_state(points, speed.waves(points.position))
+        points = problems.sheet(64, torch.device("cpu"))
+        load = problems.wind_load(points, problems.wind(0, True, torch.device("cpu")))
+        solver = MPMSolver(dx=0.05)
+        start = solver.init_state(points, problems.waves(points.position))
         end = solver.rollout(start, 1e-4, 32, load)
         assert max(speed.error_of(end, solver, start, 32, load).values()) < 1e-4
         moved = (end.position - start.position).abs().amax()
@@ -163,15 +180,16 @@ def test_the_error_is_that_of_the_end(bench):
     assert error["velocity"] == pytest.approx(0.02, rel=0.01)
 
 
-def _recorded(speed, factor):
+def _recorded(factor):
     """A run on a GPU that needs so many times what the goals ask for."""
     rows = [
         {"formulation": name, "asked": asked, "median_ms": factor * limit}
-        for (name, asked), (limit, _) in speed.SUBSTEP_GOALS.items()
+        for (name, asked), (limit, _) in speed_goals.SUBSTEP_GOALS.items()
     ]
+    million = {name: speed_goals.SUBSTEP_GOALS[name, 10**6][0] for name in ("total", "updated")}
     rows += [
-        {"formulation": name, "asked": 10_000_000, "median_ms": factor**2 * 11 * speed.SUBSTEP_GOALS[name, 10**6][0]}
-        for name in ("total", "updated")
+        {"formulation": name, "asked": 10_000_000, "median_ms": factor**2 * 11 * limit}
+        for name, limit in million.items()
     ]
     frame = {"main": True, "median_ms": factor * 8.0, "memory_bytes": int(factor * 0.3 * 2**30)}
     batch = [{"formulation": f, "gusts": g, "ratio": 20 / factor} for f in ("total", "updated") for g in (False, True)]
@@ -182,32 +200,38 @@ def _recorded(speed, factor):
 @pytest.mark.parametrize(
     ("factor", "reached", "stretched"), [(0.4, True, True), (0.99, True, False), (2, False, False)]
 )
-def test_goals_are_reached_or_not(bench, factor, reached, stretched):
-    found = bench.speed_cases.goals(_recorded(bench.speed_cases, factor))
+def test_goals_are_reached_or_not(factor, reached, stretched):
+    found = speed_goals.goals(_recorded(factor))
     assert len(found) == 13
     assert {goal[2] for goal in found} == {reached}
     assert {goal[4] for goal in found} - {None} == {stretched}
-    lines = [bench._goal_row(*goal) for goal in found]
+    lines = goals.goals([_recorded(factor) | {"copy": {}}])[2:]
+    assert len(lines) == 13
     assert all(line.split(" | ")[2] == ("yes" if reached else "no") for line in lines)
     assert all(line.count(" | ") == 4 for line in lines)
 
 
-def test_goals_of_what_is_missing_or_failed(bench):
-    speed = bench.speed_cases
-    assert {goal[1:3] for goal in speed.goals({"kind": "cuda"})} == {("not measured", None)}
-    failed = _recorded(speed, 0.5)
+def test_goals_of_what_is_missing_or_failed():
+    assert {goal[1:3] for goal in speed_goals.goals({"kind": "cuda"})} == {("not measured", None)}
+    failed = _recorded(0.5)
     for section in ("substep", "sand", "batch", "frame"):
         failed[section] = [row | {"failed": "out of memory"} for row in failed[section]]
-    assert {goal[1:3] for goal in speed.goals(failed)} == {("out of memory", False)}
-    assert speed.goals({"kind": "cpu"}) == []
+    assert {goal[1:3] for goal in speed_goals.goals(failed)} == {("out of memory", False)}
+    assert speed_goals.goals({"kind": "cpu"}) == []
 
 
-def test_goals_of_the_other_runs(bench):
+def test_goals_of_the_other_runs():
     """The substep on a CPU, and the captured object on a GPU."""
     slow = {"device": "a CPU", "substep": [{"particles": 19_881, "formulation": "updated", "median_ms": 41.0}]}
-    assert bench._goals(slow)[0].endswith("within 40 ms | 41.0 ms (`updated`) | no | - | - |")
+    assert goals.goals([slow])[2].endswith("within 40 ms | 41.0 ms (`updated`) | no | - | - |")
     wall = {"simulation": 3.0, "shading": 1.0, "rendering": 1.0}
     run = {"name": "guitar, 1920x1080", "frames": 250, "wall_s": wall, "peak_memory_bytes": {"device": 10**8}}
     run |= {"lost_particles": 0, "stretch_min": 0.9, "stretch_max": 1.1}
-    rows = [row for row in bench._goals({"device": "NVIDIA H200", "runs": [run]}) if "within 6 s" in row]
+    rows = [row for row in goals.goals([{"device": "NVIDIA H200", "runs": [run]}]) if "within 6 s" in row]
     assert [row.split(" | ", 1)[1] for row in rows] == ["5.0 s | yes | 3 s | no |"]
+
+
+def test_goals_of_rollouts_are_not_those_of_a_single_substep():
+    row = {"particles": 19_881, "formulation": "total", "median_ms": 1.0}
+    rollouts = {"device": "a CPU", "kind": "cpu", "copy": {}, "substep": [row]}
+    assert len(goals.goals([rollouts])) == 2

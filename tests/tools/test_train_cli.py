@@ -2,7 +2,12 @@
 
 import csv
 import json
+import logging
 import os
+import re
+import shlex
+import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,13 +15,20 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 
+from gaussian_swaying.cli.errors import parser_sentence
 from gaussian_swaying.data.generated_capture import GeneratedCapture
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.simulation.config import main as simulate
-from gaussian_swaying.training import cli as training_cli
+from gaussian_swaying.simulation.lock import FolderLock
+from gaussian_swaying.simulation.preview_cli import main as preview
+from gaussian_swaying.simulation.seal import seal
+from gaussian_swaying.simulation.signals import StoppedBySignal
 from gaussian_swaying.training.cli import main, make_cli
 from gaussian_swaying.training.densification import PARAMETERS
+from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
+from gaussian_swaying.training.quiet import silence_advertisements
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args", "ignore:skip_none", "ignore:.*LeafSpec")
 ROOT = Path(__file__).parents[2]
@@ -76,7 +88,16 @@ def test_the_quick_training(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
     start = make_cli(["validate", "--config", str(QUICK), *quiet]).trainer.callback_metrics
     assert main(["fit", "--config", str(QUICK), *quiet]) == 0
-    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "wrote outputs/train/quick_cpu/point_cloud.ply" in printed
+    command = re.search("^next: python tools/preview.py (.*)$", printed, re.MULTILINE)[1].split()
+    assert command == ["outputs/train/quick_cpu/point_cloud.ply", "--capture", "outputs/captures/flag_64"]
+    assert preview([*command, "--height", "96", "--device", "cpu", "--frames", "2"]) == 0
+    out = capsys.readouterr().out
+    starter = "outputs/preview/quick_cpu/starter.yaml"  # the folder of the training, not its point_cloud.ply
+    assert f"--config {starter} --output outputs/quick_cpu" in out
+    guessed = yaml.safe_load((tmp_path / starter).read_text())
+    assert guessed["scene"]["up"] == [0, 0, 1]  # the photos' cameras stand upright with z up
     folder = tmp_path / "outputs/train/quick_cpu"
     with (folder / "csv/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -87,16 +108,7 @@ def test_the_quick_training(tmp_path, monkeypatch, capsys):
     assert (folder / "panels/val_00_000200.png").stat().st_size > 0
     cloud = read_ply(folder / "point_cloud.ply")
     assert int(float(rows[-1]["val/gaussians"])) == len(cloud)
-    arguments = [
-        "--config",
-        str(ROOT / "configs/sim/hanging_object.yaml"),
-        "--scene.ply",
-        str(folder / "point_cloud.ply"),
-    ]
-    arguments += ["--frames", "2", "--device", "cpu", "--recorder.video", "false", "--scene.up", "[0, 0, 1]"]
-    region = {"class_path": "Box", "init_args": {"min": [None, None, 0.4], "max": [None, None, None]}}
-    pin = [{"class_path": "PinnedRegion", "init_args": {"region": region}}]
-    arguments += ["--solver.boundaries", json.dumps(pin), "--camera.init_args.width", "64", "--solver.dx", "0.1"]
+    arguments = ["--config", starter, "--device", "cpu", "--recorder.video", "false", "--camera.init_args.width", "64"]
     assert simulate([*arguments, "--camera.init_args.height", "36", "--output", str(tmp_path / "sim")]) == 0
     assert json.loads((tmp_path / "sim/summary.json").read_text())["frames"] == 2
 
@@ -117,7 +129,7 @@ def test_the_last_image_is_in_a_checkpoint(capture, tmp_path):
     main(["fit", *_arguments(capture, tmp_path, **{"trainer.max_steps": 13, "checkpoint.save_top_k": 1})])
     names = sorted(path.name for path in (tmp_path / "checkpoints").glob("*.ckpt"))
     assert "step_000013.ckpt" in names
-    state = torch.load(tmp_path / "checkpoints/step_000013.ckpt", weights_only=False)
+    state = torch.load(tmp_path / "checkpoints/step_000013.ckpt", weights_only=True)
     assert state["global_step"] == 13
 
 
@@ -127,25 +139,193 @@ def test_a_second_run_in_the_same_folder_keeps_its_own_last_state(capture, tmp_p
         given = {"path": str(capture), "point_count": count, "workers": 1}
         data = {"class_path": "CaptureDataModule", "init_args": given}
         more = {"data": json.dumps(data), "model.densification.init_args.start": 99}
-        assert main(["fit", *_arguments(capture, tmp_path, **options, **more)]) == 0
-    state = torch.load(tmp_path / "checkpoints/step_000013.ckpt", weights_only=False)["state_dict"]
+        assert main(["fit", *_arguments(capture, tmp_path / "run", **options, **more)]) == 0
+    state = torch.load(tmp_path / "run/checkpoints/step_000013.ckpt", weights_only=True)["state_dict"]
     assert len(state["model.means"]) == 500
 
 
-def test_ctrl_c(capture, tmp_path, monkeypatch, capsys):
-    """Lightning turns it into an exit with 1."""
+def _rows(folder):
+    with (folder / "csv/metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
 
-    def stopped(*_):
-        raise SystemExit(1)
 
-    monkeypatch.setattr("gaussian_swaying.training.cli.make_cli", stopped)
-    assert main(["fit"]) == 130
-    assert "--ckpt_path" in capsys.readouterr().err
+def _contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def _interrupts():
+    """Lightning ignores Ctrl-C once it has heard it, to the end of the process."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def _stop_at(monkeypatch, step, error):
+    train = SplatTrainer.training_step
+
+    def stop(self, batch, batch_idx):
+        if self.global_step == step:
+            raise error
+        return train(self, batch, batch_idx)
+
+    monkeypatch.setattr(SplatTrainer, "training_step", stop)
+
+
+@pytest.mark.usefixtures("_interrupts")
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (KeyboardInterrupt(), 130, "Stopped."),
+        (StoppedBySignal(15), 143, "Stopped."),
+        (ValueError("a broken image"), 2, "error: a broken image"),
+        (TrainingDiverged(12, "the loss", None), 2, "error: Training diverged"),
+    ],
+    ids=["Ctrl-C", "SIGTERM", "failure", "divergence"],
+)
+def test_a_training_that_ends_early_names_its_checkpoint(error, code, words, capture, tmp_path, monkeypatch, capsys):
+    """And the command that continues it, which does; the log goes on, and the folder is free again."""
+    monkeypatch.setattr(sys, "argv", ["tools/train.py"])
+    monkeypatch.chdir(tmp_path)
+    folder, steps = Path("run"), {"trainer.max_steps": 16, "model.log_every": 4}
+    with monkeypatch.context() as patch:
+        _stop_at(patch, 12, error)
+        assert main(["fit", *_arguments(capture, folder, **steps)]) == code
+    said = capsys.readouterr().err
+    path = "run/checkpoints/step_000010.ckpt"
+    assert words in said
+    assert f"{path} is the last checkpoint; to go on:\n  python tools/train.py fit --config" in said
+    assert said.endswith(f" --ckpt_path {path}\n")
+    assert [row["step"] for row in _rows(folder)] == ["1", "5", "9"]
+    assert not [path for path in folder.rglob(".*")]
+    again = shlex.split(said.splitlines()[-1])[2:]
+    assert main(again) == 0
+    assert [row["step"] for row in _rows(folder) if row["train/loss"]] == ["1", "5", "9", "13", "16"]
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
+    """Whatever it is refused for: data, checkpoint, the training itself, or another one that is running."""
+    folder = tmp_path / "run"
+    few = {"trainer.max_steps": 3, "checkpoint.every_n_train_steps": 2}
+    assert main(["fit", *_arguments(capture, folder, **few)]) == 0
+    assert not [path for path in folder.rglob(".*")]
+    before = _contents(tmp_path)
+    assert {"metrics.csv", "config.yaml", "point_cloud.ply", "step_000003.ckpt"} <= {path.name for path in before}
+    broken = tmp_path / "broken.ckpt"
+    shutil.copytree(capture, tmp_path / "cut")
+    for image in (tmp_path / "cut" / "images").iterdir():
+        image.write_bytes(image.read_bytes()[:60])
+    last = folder / "checkpoints/step_000003.ckpt"
+    content = bytearray(last.read_bytes())
+    content[len(content) // 2] ^= 1
+    broken.write_bytes(content)
+    data = {"class_path": "CaptureDataModule", "init_args": {"path": str(tmp_path / "cut"), "workers": 1}}
+    before = _contents(tmp_path)
+    for options, words in (
+        ({"data.init_args.path": "nowhere"}, "nowhere does not exist"),
+        ({"data": json.dumps(data)}, ""),
+        ({"ckpt_path": broken}, "checksum does not fit its content"),
+        ({"ckpt_path": folder / "csv"}, "it is a folder"),
+        ({"ckpt_path": last}, "has seen 3 images already, and `trainer.max_steps` asks for 3"),
+        ({"trainer.precision": "16-mixed"}, "precision"),
+    ):
+        assert main(["fit", *_arguments(capture, folder, **few), *(f"--{k}={v}" for k, v in options.items())]) == 2
+        said = capsys.readouterr().err
+        assert words in said, said
+        assert "error: " in said
+        assert "to go on" not in said
+        assert _contents(tmp_path) == before, options
+    lock = FolderLock(folder)
+    assert main(["fit", *_arguments(capture, folder, **few)]) == 2
+    assert f"process {os.getpid()} on this host" in capsys.readouterr().err
+    lock.release()
+    assert _contents(tmp_path) == before
+    # looking at it adds to its log
+    rows = _rows(folder)
+    assert main(["validate", *_arguments(capture, folder), f"--ckpt_path={last}"]) == 0
+    *old, new = _rows(folder)
+    assert [{name: row[name] for name in rows[0]} for row in old] == rows
+    assert float(new["val/psnr"]) > 0
+    assert (folder / "csv/config.yaml").read_bytes() == before[folder / "csv/config.yaml"]
+
+
+def test_a_second_training_moves_the_first_aside(capture, tmp_path, capsys):
+    folder, steps = tmp_path / "run", {"trainer.max_steps": 2}
+    assert main(["fit", *_arguments(capture, folder, **steps)]) == 0
+    first = _contents(folder)
+    assert main(["fit", *_arguments(capture, folder, **steps)]) == 0
+    assert f"An earlier run in {folder} was moved to {tmp_path / 'run.1'}." in capsys.readouterr().out
+    assert {path.name: content for path, content in first.items()} == {
+        path.name: content for path, content in _contents(tmp_path / "run.1").items()
+    }
+    # its checkpoint from elsewhere is read, and it stays where it is
+    old = tmp_path / "run.1/checkpoints/step_000002.ckpt"
+    more = {"trainer.max_steps": 3, "ckpt_path": old, "model.init_ply": tmp_path / "run/point_cloud.ply"}
+    assert main(["fit", *_arguments(capture, folder, **more)]) == 2
+    assert "point_cloud.ply is in it and is needed now: choose another with --trainer.default_root_dir" in (
+        capsys.readouterr().err
+    )
+    del more["model.init_ply"]
+    assert main(["fit", *_arguments(capture, folder, **more)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "run.1", "run.2"}
+    assert old.exists()
+
+
+class _Fuse:
+    """Executes code when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.mark.parametrize("command", ["fit", "validate", "test"])
+@pytest.mark.parametrize("suffix", [".ckpt", ""])
+def test_a_checkpoint_executes_no_code(command, suffix, capture, tmp_path, capsys):
+    """Neither in the check before nor by Lightning, which is asked alone too."""
+    file, burnt = tmp_path / f"evil{suffix}", tmp_path / "burnt"
+    torch.save({"splat_training": {}, "state_dict": {}, "fuse": _Fuse(burnt)}, file)
+    for sealed in (False, True):
+        if sealed:
+            seal(file)
+        assert main([command, *_arguments(capture, tmp_path / "run"), f"--ckpt_path={file}"]) == 2
+        assert "cannot be read as a checkpoint" in capsys.readouterr().err
+        cli = make_cli([*_arguments(capture, tmp_path / "run")], run=False)
+        with pytest.raises(ValueError, match="cannot be read as a checkpoint"):
+            getattr(cli.trainer, command)(cli.model, datamodule=cli.datamodule, ckpt_path=file)
+    assert not burnt.exists()
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.timeout(60)
+def test_a_pipe_as_checkpoint_keeps_nobody_waiting(capture, tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.ckpt")
+    assert main(["fit", *_arguments(capture, tmp_path / "run"), f"--ckpt_path={tmp_path / 'pipe.ckpt'}"]) == 2
+    assert "is a named pipe" in capsys.readouterr().err
+
+
+def test_lightning_does_not_advertise(caplog):
+    """Its tips are left out, what it has to say is not."""
+    silence_advertisements()
+    silence_advertisements()
+    with caplog.at_level("INFO"):
+        logging.getLogger("lightning.fabric.utilities.rank_zero").addHandler(caplog.handler)
+        rank_zero_info("💡 Tip: try installing [litlogger]")
+        rank_zero_info("GPU available: False")
+        rank_zero_warn("something is wrong")
+        logging.getLogger("lightning.fabric.utilities.rank_zero").removeHandler(caplog.handler)
+    said = {record.getMessage() for record in caplog.records}
+    assert "GPU available: False" in said
+    assert not any("litlogger" in message for message in said)
 
 
 def test_the_message_of_a_worker_is_one_sentence():
     text = 'Caught ValueError in DataLoader worker process 0.\nOriginal\n  File "x"\nValueError: The image is cut.\n'
-    assert training_cli._sentence(ValueError(text)) == "The image is cut."
+    assert parser_sentence(text) == "The image is cut."
 
 
 OWN = """
@@ -182,7 +362,7 @@ def test_a_loss_of_ones_own_from_a_yaml(capture, tmp_path, monkeypatch):
         ({"model.sh_degree": 7}, ["`sh_degree`", "7"]),
         ({"trainer.gradient_clip_val": 1}, ["gradient"]),
         ({"ckpt_path": "README.ckpt"}, ["README.ckpt"]),
-        ({"ckpt_path": str(QUICK)}, ["quick_cpu.yaml is no checkpoint", "`--ckpt_path`"]),
+        ({"ckpt_path": str(QUICK)}, ["quick_cpu.yaml cannot be read as a checkpoint", "`--ckpt_path`"]),
         ({"model.loss_weights.siz": 1.0}, ["`loss_weights`", "siz"]),
         ({"model.densification.init_args.every": 0}, ["`densification.every`"]),
         ({"model.bogus": 1}, ["bogus"]),

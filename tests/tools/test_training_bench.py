@@ -1,20 +1,11 @@
 """The page of the training benchmark says what the JSON says."""
 
-import sys
 from pathlib import Path
 
-import pytest
+from bench.cases import training
+from bench.tables import training as tables
 
-ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def training(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    import training
-
-    yield training
-    sys.modules.pop("training", None)
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def _row(**values):
@@ -26,23 +17,23 @@ def _result(**sections):
     return {"device": "a GPU", "versions": {"torch": "2"}, "seed": 0} | sections
 
 
-def test_goals_are_judged_from_the_medians(training):
+def test_goals_are_judged_from_the_medians():
     pair = {
         "bare": [_row(), _row(seconds=44.0), _row(seconds=39.0, psnr_db=25.2)],
         "lightning": [_row(seconds=43.9, psnr_db=24.95), _row(seconds=43.0, psnr_db=24.8), _row(seconds=60.0)],
     }
-    found = {goal: (value, reached) for goal, value, reached in training.goals(_result(pair=pair))}
+    found = {goal: (value, reached) for goal, value, reached in tables.goals(_result(pair=pair))}
     assert found["capture: test PSNR within 0.1 dB of the bare loop"] == ("-0.05 dB", True)
     assert found["capture: at most 1.10 times the time of the bare loop"] == ("1.10 times", True)
     assert found["capture: GPU memory within 1 GiB"] == ("0.50 GiB", True)
     pair["lightning"] = [_row(seconds=44.1, psnr_db=24.89, memory_bytes=2**31)]
-    assert [reached for _, _, reached in training.goals(_result(pair=pair))] == [False, False, False]
+    assert [reached for _, _, reached in tables.goals(_result(pair=pair))] == [False, False, False]
     variants = {"mcmc": _row(psnr_db=25.4), "absgrad": {"failed": "x"}, "surface": _row(psnr_db=24.0)}
-    best = training.goals(_result(pair=pair, variants=variants))[3]
+    best = tables.goals(_result(pair=pair, variants=variants))[3]
     assert best[1:] == ("+0.40 dB (MCMC, 300,000 Gaussians)", True)
 
 
-def test_the_page_shows_every_row_that_did_not_fail(training):
+def test_the_page_shows_every_row_that_did_not_fail():
     quality = {
         "round_share": 0.9,
         "decided_share": 0.8,
@@ -54,18 +45,25 @@ def test_the_page_shows_every_row_that_did_not_fail(training):
     flag = {"flag:size": _row(**quality, steps=30_000), "flag:none": {"failed": "x"}}
     pair = {"bare": [_row(psnr_db=24.0), _row(psnr_db=24.4)], "lightning": []}
     variants = {"surface": {"failed": "x"}, "degree_1": _row(psnr_db=24.1), "mcmc": _row()}
-    text = "\n".join(training.page([_result(flag=flag, pair=pair, variants=variants)]))
-    assert "0.40 dB among themselves:\n\n- +0.80 dB MCMC, 300,000 Gaussians\n- -0.10 dB harmonics" in text
+    result = _result(flag=flag, pair=pair, variants=variants)
+    assert tables.spread(result, "bare") == "0.40 dB"
+    assert tables.gains(result) == ["- +0.80 dB MCMC, 300,000 Gaussians", "- -0.10 dB harmonics of degree 1"]
+    text = "\n".join(tables.flag(result))
     assert (
         "| + size (all) | 90.0 % | 80.0 % | 70.0 % | 4.0, 9.0 | 1.00, 2.00 | 2.00 | 1.10 | 25.00 | 1,000 | 40 |" in text
     )
-    assert "training_flag_size.png" in text
-    assert "training_flag_none.png" not in text
-    assert "| all surface losses, paper's weights | failed |" in text
-    assert "| flag, all losses: PSNR of 35 dB | 25.0 dB | no |" in text
+    assert "photometric alone" not in text
+    assert "| all surface losses, paper's weights | failed |" in "\n".join(tables.capture(result))
+    assert "| flag, all losses: PSNR of 35 dB | 25.0 dB | no |" in tables.goal_table(result)
 
 
-def test_every_run_is_a_command_line_that_parses(training, tmp_path, monkeypatch):
+def test_the_page_has_a_picture_of_each_row():
+    text = (DOCS / "training.md").read_text()
+    for name, (title, _) in training.FLAG_ROWS.items():
+        assert f"![{title}](pictures/training_flag_{name}.png)" in text
+
+
+def test_every_run_is_a_command_line_that_parses(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, (_, more) in training.FOX_VARIANTS.items():
         cli = training.make_cli(
@@ -83,7 +81,7 @@ def test_every_run_is_a_command_line_that_parses(training, tmp_path, monkeypatch
         assert cli.model.densification.stop == (5000 if name == "settled" else 15_000)
 
 
-def test_runs_are_spread_over_the_gpus(training, tmp_path, monkeypatch):
+def test_runs_are_spread_over_the_gpus(tmp_path, monkeypatch):
     """Each process sees one of those that the parent sees."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     monkeypatch.setattr(training.torch.cuda, "device_count", lambda: 2)
@@ -106,7 +104,7 @@ def test_runs_are_spread_over_the_gpus(training, tmp_path, monkeypatch):
     assert [row["runs_per_device"] for row in found.values()] == [2, 2, 2, 2]
 
 
-def test_a_run_of_its_own_fails_with_its_message(training, tmp_path):
+def test_a_run_of_its_own_fails_with_its_message(tmp_path):
     found = {}
     training.run_apart([("bare", str(tmp_path / "none"), 3, None)], tmp_path, 2, found.__setitem__)
     assert "does not exist" in found["bare"]["failed"]

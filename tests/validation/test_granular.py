@@ -2,7 +2,7 @@
 
 import pytest
 
-from gaussian_swaying.mpm.materials import Sand
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.validation import granular
 from gaussian_swaying.validation.settings import Settings
 

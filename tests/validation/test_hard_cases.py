@@ -22,18 +22,16 @@ from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Everything
 from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, VelocityBox
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.linalg import determinant, singular_values
-from gaussian_swaying.mpm.materials import (
-    FixedCorotated,
-    Fluid,
-    Foam,
-    Metal,
-    NeoHookean,
-    Plasticine,
-    Sand,
-    Snow,
-    StVKHencky,
-)
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.rendering.camera_path import OrbitCamera

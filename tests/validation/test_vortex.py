@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from gaussian_swaying.mpm.constitutive import fixed_corotated_pk1
+from gaussian_swaying.mpm.laws.fixed_corotated import fixed_corotated_pk1
 from gaussian_swaying.validation.settings import Settings
 from gaussian_swaying.validation.vortex import annulus, body_force, placement, vortex
 

@@ -10,11 +10,13 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.data.scenes.patches import Patches, check_spacing, facing, join, to_cloud, tube
 from gaussian_swaying.data.scenes.plant_parts import Draw, bezier, leaf, pot
+from gaussian_swaying.data.scenes.stage import cast, floor
 from gaussian_swaying.gaussians.ply import GaussianCloud
 
 
 class AlocasiaScene(ProceduralScene):
-    """An alocasia (elephant's ear) about 1.1 m tall in a pot, z up, the pot standing on z = 0, its earth at 0.20 m.
+    """An alocasia (elephant's ear) about 1.1 m tall in a pot, z up, the pot standing on a floor at z = 0, its earth at
+    0.20 m.
 
     Bent stalks that carry one broad blade of 38 cm each.
 
@@ -32,7 +34,9 @@ class AlocasiaScene(ProceduralScene):
     def generate(self) -> GaussianCloud:
         """Make the plant."""
         h, draw = self.spacing, Draw(self.seed)
-        parts = [pot(0.22, 0.13, 0.17, max(h, 0.01), (0.86, 0.84, 0.80))]
+        shade = (cast((0.0, 0.0, 0.8), 0.50, 0.22), cast((0.0, 0.0, 0.1), 0.22, 0.5), (0.0, 0.0, 0.19, 0.55))
+        ground = floor(max(2 * h, 0.02), (0.86, 0.82, 0.76), shade, fade=(0.9, 3.5))
+        parts = [ground, pot(0.22, 0.13, 0.17, max(h, 0.01), (0.86, 0.84, 0.80))]
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
         for number in range(self.leaves):
             share = (number + 0.5) / self.leaves

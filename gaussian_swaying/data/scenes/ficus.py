@@ -10,11 +10,12 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.data.scenes.patches import check_spacing, copies, facing, join, to_cloud, tube
 from gaussian_swaying.data.scenes.plant_parts import Draw, bezier, leaf, pot, tints
+from gaussian_swaying.data.scenes.stage import cast, floor
 from gaussian_swaying.gaussians.ply import GaussianCloud
 
 
 class FicusScene(ProceduralScene):
-    """A ficus tree 2 m tall in a pot, z up, the pot standing on z = 0 and its earth at z = 0.30 m.
+    """A ficus tree 2 m tall in a pot, z up, the pot standing on a floor at z = 0 and its earth at z = 0.30 m.
 
     The trunk rises from the earth to z = 1.25 m and carries branches, twigs and leaves of 8 cm.
 
@@ -36,7 +37,9 @@ class FicusScene(ProceduralScene):
         bark = (0.42, 0.33, 0.25)
         trunk = bezier([[0, 0, 0.28], [0.10, 0.02, 0.6], [-0.10, -0.03, 0.95], [0.02, 0.0, 1.25]])
         thick = torch.linspace(0.055, 0.026, len(trunk), dtype=torch.float64)
-        parts = [pot(0.32, 0.15, 0.20, max(h, 0.012)), tube(trunk, thick, min(h, 0.03), bark)]
+        shade = (cast((0.0, 0.0, 1.4), 0.85, 0.28), cast((0.0, 0.0, 0.15), 0.26, 0.5), (0.0, 0.0, 0.22, 0.6))
+        ground = floor(max(2 * h, 0.03), (0.84, 0.82, 0.78), shade)
+        parts = [ground, pot(0.32, 0.15, 0.20, max(h, 0.012)), tube(trunk, thick, min(h, 0.03), bark)]
         twigs = []
         for number in range(16):
             share = 0.55 + 0.45 * number / 15

@@ -21,7 +21,7 @@ WOOD = (
 
 
 class LeavesScene(ProceduralScene):
-    """A leafy branch about 1.8 m long in the x-z plane, z up, cut off at its left end.
+    """A leafy branch about 1.8 m long in the x-z plane, z up, whose bare wood goes on to the left of x = -0.9 m.
 
     A straight branch with four straight twigs (:data:`WOOD`) and leaves of 17 cm.
 
@@ -51,6 +51,8 @@ class LeavesScene(ProceduralScene):
         for piece, count in zip(ends, counts.tolist(), strict=True):
             if count > 0:
                 parts.append(self._leaves(draw, piece, count))
+        # on from the cut, out of the picture: what stands behind the pins, without leaves
+        parts.append(tube([[-2.4, 0.05, -0.30], [-0.90, 0.0, 0.0]], [0.030, 0.016], max(h, 0.01), (0.36, 0.26, 0.18)))
         return to_cloud(join(parts), overlap=0.45)
 
     def _leaves(self, draw: Draw, piece: Tensor, count: int) -> Patches:

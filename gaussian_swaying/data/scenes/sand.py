@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.data.procedural import ProceduralScene
-from gaussian_swaying.data.scenes.patches import Patches, check_spacing, disc, join, to_cloud
+from gaussian_swaying.data.scenes.patches import Patches, check_spacing, join, to_cloud
 from gaussian_swaying.data.scenes.plant_parts import Draw
+from gaussian_swaying.data.scenes.stage import floor
 from gaussian_swaying.gaussians.ply import GaussianCloud
 
 # mounds (x, y, foot radius, stretch along x, stretch along y, height of the foot) [m]: belly, head, muzzle, ears, arms,
@@ -27,12 +28,16 @@ MOUNDS = (
 )
 
 
+OPEN = 3  # layers of grains that the wind reaches: they share the area of the surface
+
+
 class SandScene(ProceduralScene):
     """A bear of sand lying on a beach, 2.3 m from head to foot, z up, the beach at z = 0.
 
     Dry sand has no cohesion, so the bear is heaped up of mounds (:data:`MOUNDS`) nowhere steeper than ``slope``, which
-    stand by themselves. It is solid: Gaussians on its surface are patches of it, and those inside are specks on a
-    lattice, too small to be seen or to feel the wind.
+    stand by themselves. It is solid. The wind reaches :data:`OPEN` layers of grains, which share the area of the surface,
+    so that it finds grains to take where it has taken some; deeper ones are specks on a lattice, too small to be seen or
+    to feel the wind.
 
     Args:
         spacing: Distance between Gaussians [m], on the surface and inside.
@@ -72,7 +77,8 @@ class SandScene(ProceduralScene):
         zy = (self.height(x, y + step) - self.height(x, y - step)) / (2 * step)
         one, nil = torch.ones_like(x), torch.zeros_like(x)
         colour = torch.tensor([0.86, 0.70, 0.46], dtype=torch.float64) * (1 + 0.08 * draw.normal(len(x), 1))
-        across, along = h * torch.stack([one, nil, zx], -1), h * torch.stack([nil, one, zy], -1)
+        g = h / math.sqrt(OPEN)  # a grain's share of the surface
+        across, along = g * torch.stack([one, nil, zx], -1), g * torch.stack([nil, one, zy], -1)
         skin = Patches(torch.stack([x, y, z], -1), across, along, colour)
         skin = skin.painted(0.82 * colour, self._in(x, y, 0.0, 0.02, 0.30))  # the damp belly
         skin = skin.painted((0.16, 0.11, 0.08), self._in(x, y, 0.0, 0.72, 0.065))
@@ -80,16 +86,20 @@ class SandScene(ProceduralScene):
             skin = skin.painted((0.13, 0.10, 0.08), self._in(x, y, 0.17 * side, 0.93, 0.05))
             skin = skin.painted(0.75 * colour, self._in(x, y, 0.36 * side, 1.14, 0.09))
             skin = skin.painted(0.75 * colour, self._in(x, y, 0.42 * side, -0.76, 0.12))
-        parts = [skin, disc((0.0, 0.1, -0.01), 2.6, max(2 * h, 0.04), (0.80, 0.66, 0.45))]
+        beach = floor(max(h, 0.04), (0.66, 0.55, 0.39), flat=2.2, fade=(3.0, 9.0), ambient=0.35)
+        parts = [skin, beach.mapped(shift=(0.0, 0.1, -0.02))]
         if self.interior:
             layers = torch.arange(int(float(z.max()) / h) + 1, dtype=torch.float64) * h + 0.5 * h
             column, level = torch.meshgrid(torch.arange(len(x)), torch.arange(len(layers)), indexing="ij")
             inside = layers[level] < z[column] - 0.9 * h
             column, level = column[inside], level[inside]
             center = torch.stack([x[column], y[column], layers[level]], -1)
-            speck = torch.tensor([[0.02 * h, 0.0, 0.0], [0.0, 0.02 * h, 0.0]], dtype=torch.float64)
-            across, along = (edge.expand(len(center), 3) for edge in speck)
-            parts.append(Patches(center, across, along, colour[column]))
+            center[:, :2] += 0.5 * h * (level % 2)[:, None]  # between those of the layers above and below
+            near = (z[column] - layers[level] < (OPEN - 0.1) * h)[:, None]
+            side = torch.where(near, g, 0.02 * h) * torch.ones_like(near, dtype=torch.float64)
+            along_x, along_y = torch.eye(3, dtype=torch.float64)[:2]
+            shade = torch.tensor([0.80, 0.64, 0.41], dtype=torch.float64) * (1 + 0.10 * draw.normal(len(center), 1))
+            parts.append(Patches(center, side * along_x, side * along_y, shade))
         return to_cloud(join(parts), overlap=0.55, ambient=0.35, two_sided=False)
 
     @staticmethod

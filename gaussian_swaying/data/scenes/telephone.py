@@ -28,16 +28,17 @@ RED, CREAM, DARK = (0.72, 0.10, 0.09), (0.90, 0.87, 0.80), (0.13, 0.13, 0.14)
 
 
 class TelephoneScene(ProceduralScene):
-    """A red telephone on a wall, z up, seen from -y: the handset on its hook, and a coiled cord that hangs in a loop.
+    """A red telephone on a tiled wall, z up, seen from -y: the handset is off the hook and hangs on a coiled cord.
 
-    The wall is the plane y = 0.10 m; telephone and handset end at z = 0 and the cord hangs below, to z = -0.5 m.
+    The wall is the plane y = 0.10 m; the telephone ends at z = 0. The cord hangs below it to z = -0.36 m, and from its end
+    the handset, to z = -0.79 m.
 
     Args:
         spacing: Distance between Gaussians along the cord [m]; elsewhere at least 8 mm.
         turns: Turns of the coil.
     """
 
-    def __init__(self, spacing: float = 0.004, turns: int = 46) -> None:
+    def __init__(self, spacing: float = 0.004, turns: int = 16) -> None:
         self.spacing = check_spacing(spacing, 0.2)
         check_positive("generator.turns", turns)
         self.turns = int(turns)
@@ -46,27 +47,27 @@ class TelephoneScene(ProceduralScene):
         """Make the telephone."""
         h = self.spacing
         coarse = min(max(h, 0.008), 0.04)
-        parts = [self._wall(coarse), *self._body(coarse), *self._handset(coarse), self.cord()]
+        parts = [self._wall(coarse), *self._body(coarse), *self.handset(coarse), self.cord()]
         return to_cloud(join(parts), overlap=0.5, two_sided=False)
 
     def cord(self) -> Patches:
-        """The coiled cord: straight for 3 cm at its ends."""
-        loop = bezier([[-0.19, -0.05, 0.01], [-0.24, -0.07, -0.72], [0.16, -0.08, -0.72], [0.10, 0.0, 0.01]], 121)
-        count = 16 * self.turns + 1
-        line = resample(loop, count)
+        """The coiled cord: straight for some centimetres at its ends."""
+        hang = bezier([[-0.03, 0.01, 0.01], [-0.05, -0.02, -0.10], [-0.10, -0.06, -0.24], [-0.10, -0.06, -0.37]], 121)
+        count = 20 * self.turns + 1
+        line = resample(hang, count)
         axes = frames_along(line)
         share = torch.linspace(0, 1, count, dtype=torch.float64)
-        coil = 0.016 * ((share - 0.04) / 0.04).clamp(0, 1) * ((0.96 - share) / 0.04).clamp(0, 1)
+        coil = 0.022 * ((share - 0.06) / 0.08).clamp(0, 1) * ((0.94 - share) / 0.08).clamp(0, 1)
         angle = 2 * math.pi * self.turns * share
         path = line + coil[:, None] * (angle.cos()[:, None] * axes[..., 0] + angle.sin()[:, None] * axes[..., 1])
-        return tube(path, torch.full((count,), 0.0045), self.spacing, DARK)
+        return tube(path, torch.full((count,), 0.006), self.spacing, DARK)
 
     def _wall(self, h: float) -> Patches:
         def surface(v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-            return torch.stack([-1.3 + 2.6 * u, torch.full_like(u, 0.10), -0.91 + 1.69 * v], dim=-1)
+            return torch.stack([-1.82 + 3.64 * u, torch.full_like(u, 0.10), -1.30 + 2.34 * v], dim=-1)
 
-        wall = sheet(surface, steps(1.69, 2 * h), steps(2.6, 2 * h), (0.78, 0.80, 0.74))
-        line = ((wall.center[:, 2] + 0.91) % 0.26 < 2 * h) | ((wall.center[:, 0] + 1.3) % 0.26 < 2 * h)
+        wall = sheet(surface, steps(2.34, 2 * h), steps(3.64, 2 * h), (0.78, 0.80, 0.74))
+        line = ((wall.center[:, 2] + 1.30) % 0.26 < 2 * h) | ((wall.center[:, 0] + 1.82) % 0.26 < 2 * h)
         return wall.painted((0.66, 0.68, 0.62), line)  # tiles
 
     def _body(self, h: float) -> list[Patches]:
@@ -80,13 +81,18 @@ class TelephoneScene(ProceduralScene):
         parts.append(box((-0.26, -0.02, 0.24), (-0.09, 0.02, 0.28), h, DARK))  # the hook
         return parts
 
-    def _handset(self, h: float) -> list[Patches]:
-        grip = bezier([[-0.19, -0.03, 0.02], [-0.19, -0.11, 0.10], [-0.19, -0.11, 0.36], [-0.19, -0.03, 0.42]], 33)
+    def handset(self, h: float) -> list[Patches]:
+        """The handset, upside down, its cups half turned away from the wall; ``h`` is the spacing [m]."""
+        grip = bezier([[0.0, -0.04, -0.20], [0.0, 0.05, -0.12], [0.0, 0.05, 0.12], [0.0, -0.04, 0.20]], 33)
         parts = [tube(grip, torch.full((33,), 0.024), h, RED)]
-        # the cups open towards the wall: solids of revolution laid on their side
+        # the cups are solids of revolution laid on their side
         cup = revolution(
             [[0.0, -0.05], [0.030, -0.045], [0.048, -0.02], [0.050, 0.02], [0.044, 0.03], [0.0, 0.032]], h, RED
         )
         lying = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
-        parts += [cup.mapped(lying, (-0.19, -0.04, z)) for z in (0.035, 0.405)]
-        return parts
+        parts += [cup.mapped(lying, (0.0, -0.03, z)).painted(RED) for z in (-0.185, 0.185)]
+        turn, lean = math.radians(55.0), math.radians(4.0)
+        about_z = [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+        about_y = [[math.cos(lean), 0.0, math.sin(lean)], [0.0, 1.0, 0.0], [-math.sin(lean), 0.0, math.cos(lean)]]
+        matrix = torch.tensor(about_y, dtype=torch.float64) @ torch.tensor(about_z, dtype=torch.float64)
+        return [part.mapped(matrix, (-0.11, -0.06, -0.57)) for part in parts]

@@ -1,0 +1,108 @@
+"""Files that users give: refused before they are read if they are no regular file, or far too large."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import zipfile
+from pathlib import Path
+from typing import Any
+
+LARGEST_JSON = 1 << 28  # bytes; a capture of 10,000 images takes 10 MB
+LONGEST_NUMBER = 32  # digits of a whole number
+
+
+def check_regular(path: str | os.PathLike[str], what: str = "the file", largest: int | None = None) -> Path:
+    """A path, if there is a regular file: no folder, device or pipe, which may never end.
+
+    Args:
+        path: The path.
+        what: What it should be, for the message.
+        largest: Largest size [bytes].
+
+    Raises:
+        FileNotFoundError: If there is nothing.
+        ValueError: If it is something else, or too large.
+    """
+    path = Path(path)
+    try:
+        found = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(f"{path} does not exist; check the path of {what}.") from None
+    except ValueError as error:  # a zero byte
+        raise ValueError(f"{str(path)!r} is no path ({error}); check the path of {what}.") from None
+    if stat.S_ISDIR(found.st_mode):
+        raise ValueError(f"{path} is a directory; give {what} inside it.")
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError(f"{path} is no regular file but a device or a pipe; save {what} first and give that.")
+    if largest is not None and found.st_size > largest:
+        raise ValueError(
+            f"{path} has {found.st_size:,} bytes, more than the {largest:,} that {what} may have; check the path."
+        )
+    return path
+
+
+def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JSON) -> Any:
+    """Read a JSON file.
+
+    Args:
+        path: The file.
+        what: What it is called in the message, for example "camera file".
+        largest: Largest size [bytes].
+
+    Returns:
+        What it holds.
+
+    Raises:
+        ValueError: If the file cannot be read, is too large, is not UTF-8 or not JSON, is nested too deeply, or holds
+            a whole number of more than 32 digits.
+    """
+    try:
+        text = check_regular(path, f"the {what}", largest).read_text(encoding="utf-8")
+        return json.loads(text, parse_int=_whole)
+    except FileNotFoundError as error:
+        raise ValueError(f"Cannot read the {what} `{path}` (no such file): check the path.") from error
+    except OSError as error:
+        raise ValueError(f"Cannot read the {what} `{path}` ({error.strerror or error}): check the path.") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"The {what} `{path}` is not valid JSON ({error}): export it again.") from error
+    except RecursionError as error:
+        raise ValueError(f"The {what} `{path}` is nested too deeply: export it again.") from error
+    except _LongNumberError as error:
+        raise ValueError(f"The {what} `{path}` holds {error}: correct it.") from error
+
+
+def check_archive(path: str | os.PathLike[str], what: str) -> Path:
+    """A path, if it is a .npz whose arrays take no more than ten times its size, or a gigabyte.
+
+    Args:
+        path: The path.
+        what: What it should be, for the message.
+
+    Raises:
+        FileNotFoundError: If there is nothing.
+        ValueError: If it is no regular file, no .npz, or holds far more than its size.
+    """
+    path = check_regular(path, what)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            held = sum(entry.file_size for entry in archive.infolist())
+    except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError) as error:
+        raise ValueError(f"{path} is no .npz, or not whole ({error}); make {what} again.") from error
+    if held > (1 << 30) + 10 * path.stat().st_size:
+        raise ValueError(f"{path} claims to hold {held:,} bytes, far more than its size; make {what} again.")
+    return path
+
+
+class _LongNumberError(ValueError):
+    """A whole number that no field can hold."""
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > LONGEST_NUMBER:
+        raise _LongNumberError(f"a whole number of {len(digits)} digits ({digits[:8]}...)")
+    return int(digits)
+
+
+__all__ = ["check_archive", "check_regular", "read_json"]

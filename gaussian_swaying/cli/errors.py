@@ -1,0 +1,215 @@
+"""Errors of a command as one sentence and an exit code; all commands go through :func:`run_command`."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import sys
+import warnings
+from argparse import ArgumentError
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import torch
+
+from gaussian_swaying.cli.streams import SafeStream, safe_streams
+from gaussian_swaying.simulation.signals import exit_code
+
+OK, BUG, BAD_INPUT = 0, 1, 2
+
+# what torch and numpy say when an array is beyond the memory or beyond counting
+_MEMORY = re.compile(
+    r"can't allocate memory|not enough memory|out of memory|Storage size calculation overflowed|"
+    r"multiplication overflow|Unable to allocate|Maximum allowed (size|dimension)|array is too big|"
+    r"Invalid buffer size|bad_alloc",
+    re.IGNORECASE,
+)
+_NUMBER = re.compile(r"overflow|out of range|too large to convert|int too big", re.IGNORECASE)
+_WRITER = re.compile(r"PytorchStreamWriter|inline_container|file write failed|iostream error", re.IGNORECASE)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def run_command(
+    command: Callable[[], int | None],
+    *,
+    stopped: str = "Stopped.",
+    memory: str = "fewer Gaussians or smaller pictures",
+    expected: tuple[type[BaseException], ...] = (),
+    arguments: Sequence[str] | None = None,
+    advice: Callable[[BaseException], str | None] | None = None,
+) -> int:
+    """Run a command, and turn what it raises into a sentence on standard error and an exit code.
+
+    Standard output or error that is closed, full or cannot show a letter does not stop the command.
+
+    Args:
+        command: Does the work and gives an exit code; None is 0.
+        stopped: What is said after Ctrl-C.
+        memory: Remedy that is named if the memory is not enough.
+        expected: Further exceptions whose message is meant for people.
+        arguments: Command line, for messages about it; that of the process if None.
+        advice: Gives what to say after the error or the stop, if anything.
+
+    Returns:
+        What the command gave; 2 for bad input or a machine that is not enough, 130 after Ctrl-C, 128 and the number of
+        another signal that stopped it, 1 for an error that is a bug. With the environment variable
+        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with safe_streams() as (output, _):
+        try:
+            code = _code(command, stopped, memory, expected, arguments, advice)
+        except SystemExit:  # --help and the like
+            if not _was_written(output):
+                raise SystemExit(BAD_INPUT) from None
+            raise
+        return code if _was_written(output) else code or BAD_INPUT
+
+
+def _was_written(output: SafeStream) -> bool:
+    """Whether standard output took everything, which is said otherwise; a reader that has seen enough is no error."""
+    output.flush()
+    number = getattr(output.error, "errno", None) or errno.EBADF
+    if output.error is None or number == errno.EPIPE:
+        return True
+    print(f"error: Standard output could not be written ({os.strerror(number)}).", file=sys.stderr)
+    return False
+
+
+def _code(
+    command: Callable[[], int | None],
+    stopped: str,
+    memory: str,
+    expected: tuple[type[BaseException], ...],
+    arguments: Sequence[str],
+    advice: Callable[[BaseException], str | None] | None,
+) -> int:
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _once(set())
+            return command() or OK
+    except KeyboardInterrupt as stop:
+        print(stopped, file=sys.stderr)
+        _advise(advice, stop)
+        return exit_code(stop)
+    except Exception as error:
+        if os.environ.get("GAUSSIAN_SWAYING_DEBUG") == "1":
+            raise
+        found = sentence(error, memory, expected, arguments)
+        if found is None:
+            print(
+                f"error: {type(error).__name__}: {_first_line(error)} This is a bug in gaussian_swaying: please report "
+                "it with the traceback that GAUSSIAN_SWAYING_DEBUG=1 shows.",
+                file=sys.stderr,
+            )
+        else:
+            print(f"error: {found}", file=sys.stderr)
+        _advise(advice, error)
+        return BUG if found is None else BAD_INPUT
+
+
+def _advise(advice: Callable[[BaseException], str | None] | None, error: BaseException) -> None:
+    text = None if advice is None else advice(error)
+    if text is not None:
+        print(text, file=sys.stderr)
+
+
+def _once(shown: set[str]) -> Callable[..., None]:
+    """How to show a warning: one line, without the line of code that gave it, and not again."""
+
+    def show(message: Warning | str, *where: object, **named: object) -> None:
+        text = str(message)
+        if text not in shown:
+            shown.add(text)
+            print(f"warning: {text}", file=sys.stderr)
+
+    return show
+
+
+def sentence(
+    error: BaseException,
+    memory: str = "fewer Gaussians or smaller pictures",
+    expected: tuple[type[BaseException], ...] = (),
+    arguments: Sequence[str] = (),
+) -> str | None:
+    """What an error says to people, in one line; None if it is a bug.
+
+    Args:
+        error: The error.
+        memory: Remedy if the memory is not enough.
+        expected: Further exceptions whose message is meant for people.
+        arguments: Command line, for messages about it.
+    """
+    text = _first_line(error)
+    if isinstance(error, MemoryError | torch.OutOfMemoryError) or (
+        isinstance(error, RuntimeError | ValueError) and _MEMORY.search(text)
+    ):
+        what = text.rstrip(".") if text.startswith("Unable") else _asked_for(text)
+        return f"The memory is not enough{what and ' (' + what + ')'}. Remedy: {memory}."
+    if isinstance(error, RecursionError):
+        return "The input is nested too deeply: make it flatter."
+    if isinstance(error, UnicodeError):
+        return f"A file or an option is not UTF-8 text ({text}): save it as UTF-8."
+    if isinstance(error, ArithmeticError) or (isinstance(error, RuntimeError) and _NUMBER.search(text)):
+        return f"A number is too large or too small to compute with ({text}): check the values that were given."
+    if isinstance(error, OSError):
+        return _of_the_system(error)
+    if isinstance(error, RuntimeError) and _WRITER.search(text):
+        return f"A file could not be written ({text}): the disk may be full."
+    if isinstance(error, ArgumentError):
+        return f"{parser_sentence(str(error), arguments)}; --help lists the options."
+    if isinstance(error, (ValueError, TypeError, *expected)):
+        return parser_sentence(str(error), arguments)
+    if isinstance(error, ImportError) and error.name and not error.name.startswith("gaussian_swaying"):
+        return text
+    return None
+
+
+def parser_sentence(message: str, arguments: Sequence[str] = ()) -> str:
+    """The part of a message that concerns people, in one line.
+
+    That is the value and the reason, if it comes from the parser, which names the configuration if it cannot be
+    parsed; and the last line of the traceback of a worker process.
+    """
+    if message.startswith("Caught "):
+        return message.strip().rpartition("Error: ")[2]
+    noise = ("Does not validate", "Subtypes:", "Errors:", "- Expected a <class 'NoneType'>", "Given value")
+    lines = [line.strip() for line in message.splitlines()]
+    kept = [line.removeprefix("- ") for line in lines if line and not line.startswith(noise)]
+    if "Does not validate" in message or message.startswith("Problems parsing config"):
+        kept = [line.rstrip(".") for line in kept]
+    if kept and message.startswith("Problems parsing config"):
+        files = [b for a, b in pairwise(arguments) if a == "--config"]
+        files += [a.removeprefix("--config=") for a in arguments if a.startswith("--config=")]
+        kept[0] = f"{', '.join(files)} is not valid YAML{kept[0].removeprefix('Problems parsing config')}"
+    return " ".join(kept)
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def _asked_for(text: str) -> str:
+    """How much memory was asked for, where the message says so."""
+    found = re.search(r"allocate (\d+) bytes", text)
+    if found:
+        return f"{int(found[1]) / 2**30:,.3g} GiB were asked for"
+    found = re.search(r"allocate ([\d.]+ [KMGT]iB)", text)
+    return f"{found[1]} were asked for" if found else ""
+
+
+def _of_the_system(error: OSError) -> str:
+    """A sentence from an error of the system, which has a number and a file, or from one of ours, which is one."""
+    if error.errno is None or error.strerror is None:
+        return parser_sentence(str(error))
+    where = error.filename or "A file"
+    if error.errno in _FULL:
+        return f"{where} could not be written ({error.strerror}): make room, or choose another place with --output."
+    if isinstance(error, FileNotFoundError):
+        return f"{where} does not exist: check the path."
+    return f"{where} cannot be used ({error.strerror}): check the path and its permissions."
+
+
+__all__ = ["parser_sentence", "run_command", "sentence"]

@@ -1,0 +1,111 @@
+"""Standard output and error that may be closed, full or unable to show a letter, without a command dying of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import unicodedata
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO, cast
+
+
+class SafeStream:
+    """A text stream whose failures are kept instead of raised; what comes after the first one is dropped.
+
+    Letters that its encoding lacks are written as their nearest plain ones: ``kg/m³`` as ``kg/m3``.
+
+    Args:
+        stream: The stream to write to.
+
+    Attributes:
+        error: Why writing failed; None while it works.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.error: OSError | ValueError | None = None
+
+    def write(self, text: str) -> int:
+        """Write what can be written."""
+        self._try(lambda: self._stream.write(encodable(text, self._stream.encoding)))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, if that is still possible."""
+        self._try(self._stream.flush)
+
+    def _try(self, action: Callable[[], object]) -> None:
+        if self.error is not None:
+            return
+        try:
+            action()
+        except (OSError, ValueError) as error:  # ValueError: the stream is closed
+            self.error = error
+            _lead_nowhere(self._stream)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def encodable(text: str, encoding: str | None) -> str:
+    """The text, with letters that an encoding lacks replaced by the nearest that it has, or by a question mark.
+
+    Example:
+        >>> encodable("5 kg/m³", "ascii"), encodable("5 kg/m³", "utf-8")
+        ('5 kg/m3', '5 kg/m³')
+    """
+    encoding = encoding or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        letters = (c for c in unicodedata.normalize("NFKD", text) if not unicodedata.combining(c))
+        return "".join(letters).encode(encoding, "replace").decode(encoding)
+    return text
+
+
+def _lead_nowhere(stream: TextIO) -> None:
+    """Let what is still in a stream's buffer go nowhere; the interpreter would stumble over it at its end."""
+    try:
+        descriptor = stream.fileno()
+    except (OSError, ValueError):
+        return
+    if descriptor in (1, 2):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, descriptor)
+        os.close(nowhere)
+
+
+def _open_closed() -> None:
+    """Give a process that was started without standard streams ones that lead nowhere.
+
+    Otherwise the next file that is opened takes their number, and what a library prints ends up in it.
+    """
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+
+
+@contextmanager
+def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
+    """Let ``sys.stdout`` and ``sys.stderr`` be :class:`SafeStream` within the block, and give them."""
+    before = sys.stdout, sys.stderr
+    if None in before:
+        _open_closed()
+    opened = [stream if stream is not None else open(os.devnull, "w") for stream in before]  # noqa: SIM115
+    output, errors = (SafeStream(stream) for stream in opened)
+    sys.stdout, sys.stderr = cast(TextIO, output), cast(TextIO, errors)
+    try:
+        yield output, errors
+    finally:
+        output.flush()
+        errors.flush()
+        sys.stdout, sys.stderr = before
+        for stream, was in zip(opened, before, strict=True):
+            if was is None:
+                stream.close()
+
+
+__all__ = ["SafeStream", "encodable", "safe_streams"]

@@ -1,0 +1,136 @@
+"""Limits of a configuration: what is too large, too deep or grows without end is refused before it is built.
+
+A YAML of a few lines may name the same part again and again and mean a billion of them, or a part of itself. So its
+events are counted first, which takes little memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gaussian_swaying._inputs import LONGEST_NUMBER, check_regular
+
+LARGEST = 1 << 20  # bytes; the configurations of this project have some 5,000
+DEEPEST = 64  # levels
+MOST = 20_000  # values, with those that aliases repeat
+MOST_WORK = 10_000_000  # entries times values of all lists, as jsonargparse copies a list for each entry: some 10 s
+
+
+def check_yaml(text: str) -> str:
+    """The text, unless it is too much of a YAML.
+
+    Args:
+        text: YAML, or a value of the command line.
+
+    Raises:
+        ValueError: If it is too long, too deep, holds too many values, names a part of itself, or has a whole number
+            of more than 32 digits.
+        yaml.YAMLError: If it is no YAML.
+    """
+    if len(text) > LARGEST:
+        raise ValueError(f"A configuration of {len(text):,} characters is too long: {LARGEST:,} are the most.")
+    if len(text) < LONGEST_NUMBER and "*" not in text:  # can neither be deep nor large
+        return text
+    import yaml
+
+    sizes: dict[str, int] = {}  # values within each anchor
+    begun: list[_Part] = []
+    values = work = 0
+    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        if isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            part = begun.pop()
+            size = values - part.before
+            if part.anchor:
+                sizes[part.anchor] = size
+            work += part.entries * size if isinstance(event, yaml.SequenceEndEvent) else 0
+            if work > MOST_WORK:
+                raise ValueError(f"A list of {part.entries:,} entries, {size:,} values, is too long to be read.")
+            continue
+        if isinstance(event, (yaml.ScalarEvent, yaml.AliasEvent, yaml.CollectionStartEvent)) and begun:
+            begun[-1].entries += 1
+        if isinstance(event, yaml.AliasEvent):
+            if any(event.anchor == part.anchor for part in begun):
+                raise ValueError(f"A configuration must not hold itself: remove the alias *{event.anchor}.")
+            values += sizes.get(event.anchor or "", 1)
+        elif isinstance(event, yaml.ScalarEvent):
+            values += 1
+            digits = event.value.lstrip("+-") if event.implicit[0] else ""
+            if len(digits) > LONGEST_NUMBER and digits.isdigit():
+                raise ValueError(
+                    f"A whole number of {len(digits)} digits ({digits[:8]}...) is too large for any field."
+                )
+        elif isinstance(event, yaml.CollectionStartEvent):
+            begun.append(_Part(event.anchor, values))
+            values += 1
+            if len(begun) > DEEPEST:
+                raise ValueError(f"A configuration is nested too deeply: {DEEPEST} levels are the most.")
+        if values > MOST:
+            raise ValueError(f"A configuration of more than {MOST:,} values, aliases included, is too large.")
+    return text
+
+
+@dataclass
+class _Part:
+    """A list or mapping that is being read."""
+
+    anchor: str | None
+    before: int  # values before it
+    entries: int = 0
+
+
+def limit_yaml() -> None:
+    """Let jsonargparse refuse what :func:`check_yaml` refuses, in files and in values of the command line."""
+    from jsonargparse import get_loader, set_loader
+
+    load = get_loader("yaml")
+    if not hasattr(load, "unlimited"):
+        set_loader("yaml", _Limited(load), exceptions=_exceptions())
+
+
+class _Limited:
+    """A loader that checks first."""
+
+    def __init__(self, load: Callable[[str], Any]) -> None:
+        self.unlimited = load
+
+    def __call__(self, text: str) -> Any:
+        return self.unlimited(check_yaml(text))
+
+
+def _exceptions() -> tuple[type[Exception], ...]:
+    import yaml
+
+    return (yaml.YAMLError,)
+
+
+def check_config_files(arguments: Sequence[str]) -> None:
+    """Refuse configurations on a command line that are no regular file of readable size and UTF-8 text.
+
+    Args:
+        arguments: The command line; what follows ``--config``, and every .yaml and .yml on it, is looked at.
+
+    Raises:
+        ValueError: Naming the file and the remedy.
+    """
+    for before, argument in zip(["", *arguments], arguments, strict=False):
+        option, equals, value = argument.partition("=")
+        if option.startswith("--") and equals:
+            before, argument = option, value
+        if before != "--config" and not argument.endswith((".yaml", ".yml")):
+            continue
+        try:
+            if not Path(argument).exists():
+                continue  # YAML on the command line, or told by the parser
+        except (OSError, ValueError):
+            continue
+        path = check_regular(argument, "the configuration", LARGEST)
+        try:
+            path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path} is not UTF-8 text ({error.reason}): save it as UTF-8.") from error
+
+
+__all__ = ["check_config_files", "check_yaml", "limit_yaml"]

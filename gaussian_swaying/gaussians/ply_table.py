@@ -1,0 +1,156 @@
+"""Tables of numbers from .ply files; what a header announces is compared with the size of the file first."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gaussian_swaying._inputs import check_regular
+
+LARGEST_HEADER = 1 << 16  # bytes; a splat of degree 3 takes 2,000
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
+_TYPES |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"}
+_TYPES |= {"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+
+
+@dataclass(frozen=True, slots=True)
+class PlyElement:
+    """One element of a header.
+
+    Attributes:
+        name: Its name, such as ``vertex``.
+        count: Number of rows.
+        fields: Name and numpy type of each property; None as the type of a list.
+    """
+
+    name: str
+    count: int
+    fields: tuple[tuple[str, str | None], ...]
+
+    @property
+    def lists(self) -> tuple[str, ...]:
+        """Names of the properties that are lists."""
+        return tuple(name for name, kind in self.fields if kind is None)
+
+    @property
+    def row(self) -> int:
+        """Size of a binary row [bytes]; the least, if there are lists."""
+        return sum(1 if kind is None else int(kind[1:]) for _, kind in self.fields)
+
+
+@dataclass(frozen=True, slots=True)
+class PlyHeader:
+    """What a .ply file says about itself.
+
+    Attributes:
+        order: ``<`` or ``>`` for binary numbers, empty for text.
+        elements: Its elements, in the order of the file.
+        start: Where the data begin [bytes].
+    """
+
+    order: str
+    elements: tuple[PlyElement, ...]
+    start: int
+
+
+def read_header(path: str | os.PathLike[str]) -> PlyHeader:
+    """Read the header of a .ply file, and compare the rows that it announces with the size of the file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no regular file, has a broken header, or is too short for its rows.
+    """
+    path = check_regular(path, "the .ply file")
+    with path.open("rb") as stream:
+        head = stream.read(LARGEST_HEADER)
+    if not re.match(rb"ply\r?\n", head):
+        raise ValueError(f"{path} is not a .ply file (it does not start with `ply`); export the scene as .ply.")
+    end = re.search(rb"\nend_header\r?\n", head)
+    if end is None:
+        raise _broken(path, f"no `end_header` within its first {LARGEST_HEADER:,} bytes")
+    order: str | None = None
+    elements: list[tuple[str, int, list[tuple[str, str | None]]]] = []
+    for number, line in enumerate(head[: end.start()].decode("ascii", "backslashreplace").splitlines()[1:], start=2):
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) > 1 and words[1] in _ORDERS:
+            order = _ORDERS[words[1]]
+        elif words[0] == "element" and len(words) == 3 and re.fullmatch(r"\d{1,18}", words[2]):
+            elements.append((words[1], int(words[2]), []))
+        elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
+            elements[-1][2].append((words[2], _TYPES[words[1]]))
+        elif words[:2] == ["property", "list"] and elements and len(words) == 5 and {*words[2:4]} <= set(_TYPES):
+            elements[-1][2].append((words[4], None))
+        else:
+            raise _broken(path, f"line {number} is {line[:80]!r}")
+    if order is None:
+        raise _broken(path, "it has no line `format`")
+    header = PlyHeader(order, tuple(PlyElement(name, count, tuple(f)) for name, count, f in elements), end.end())
+    for element in header.elements:
+        names = [name for name, _ in element.fields]
+        if len(set(names)) < len(names):
+            raise _broken(path, f"the element `{element.name}` has a property twice")
+    _check_size(path, header)
+    return header
+
+
+def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> np.ndarray:
+    """Read one element of a binary .ply file, and nothing else.
+
+    Args:
+        path: The file.
+        header: Its header, from :func:`read_header`.
+        name: Name of the element.
+
+    Returns:
+        Structured array with a field for each property, shape (rows,).
+
+    Raises:
+        ValueError: If there is no such element, or it or one before it holds lists.
+    """
+    start = header.start
+    for element in header.elements:
+        if element.lists:
+            raise ValueError(
+                f"{path}: property `{element.lists[0]}` is a list (element `{element.name}`); export it as one float "
+                "per Gaussian, without faces before them."
+            )
+        if element.name == name:
+            kinds = np.dtype([(field, f"{header.order}{kind}") for field, kind in element.fields])
+            if element.count == 0 or kinds.itemsize == 0:
+                return np.zeros(element.count if kinds.itemsize else 0, dtype=kinds)
+            return np.fromfile(path, dtype=kinds, count=element.count, offset=start)
+        start += element.count * element.row
+    found = ", ".join(element.name for element in header.elements) or "none"
+    raise ValueError(f"{path} has no element `{name}` (elements: {found}); export it from a 3DGS tool.")
+
+
+def _check_size(path: Path, header: PlyHeader) -> None:
+    """Raise ValueError if a file is too short for the rows of its header."""
+    size = path.stat().st_size - header.start
+    if header.order == "":  # a digit and a separator for each number
+        needed = sum(element.count * 2 * len(element.fields) for element in header.elements) - 1
+    else:
+        needed = sum(element.count * element.row for element in header.elements)
+    if needed > size:
+        rows = ", ".join(f"{element.count:,} of `{element.name}`" for element in header.elements)
+        raise ValueError(
+            f"{path} is truncated: its header announces {rows}, at least {needed:,} bytes, but {size:,} follow; copy "
+            "or export the file again."
+        )
+
+
+def _broken(path: Path, what: str) -> ValueError:
+    return ValueError(f"{path} has a broken .ply header ({what}); export the file again.")
+
+
+__all__ = ["PlyElement", "PlyHeader", "read_element", "read_header"]

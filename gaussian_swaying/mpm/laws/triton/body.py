@@ -1,0 +1,155 @@
+"""Stress and flow of a body of one or several laws, for the fused substep.
+
+The set of laws is a constant of the compiled kernel, so a body of one law compiles to that law alone. With several, the
+result of its own law is selected for each particle; what laws have in common is computed once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.laws.triton.twin import twin_of
+from gaussian_swaying.mpm.linalg_triton import scaled_product, svd3, where3, where9
+
+ROW = tl.constexpr(6)  # columns of the table: which stress, which flow (-1 for none), four numbers
+
+
+class BodyLaws:
+    """The device functions of the laws of a body, each one once.
+
+    It is passed to kernels as a constant, which read its attributes when they are compiled.
+
+    Args:
+        laws: All with a twin.
+
+    Attributes:
+        table: A row of six numbers for each law: which stress and which flow are its own, and its coefficients.
+        spectral: Whether stresses or flow need the decomposition of F.
+        principals: Functions of the stresses that come from principal stretches; they are numbered first.
+        matrices: Functions of Kirchhoff stresses that come from F itself, numbered after those.
+        elastic: As ``matrices``, for first Piola-Kirchhoff stresses (None for a law that flows).
+        flows: Functions of the plastic flow.
+        all_flow: Whether every law flows.
+        cache_key: Changes with the source of the functions, for the caches of Triton.
+    """
+
+    def __init__(self, laws: Sequence[ConstitutiveLaw]) -> None:
+        twins = [twin for law in laws if (twin := twin_of(law)) is not None]
+        self.spectral = any(twin.flow or not twin.kirchhoff for twin in twins)
+        chosen = [
+            (twin.principal,) if self.spectral and twin.principal else (twin.kirchhoff, twin.pk1) for twin in twins
+        ]
+        order = _once(sorted(chosen, key=len))
+        self.principals = tuple(stress[0] for stress in order if len(stress) == 1)
+        self.matrices = tuple(stress[0] for stress in order if len(stress) == 2)
+        self.elastic = tuple(stress[1] for stress in order if len(stress) == 2)
+        self.flows = _once(twin.flow for twin in twins if twin.flow)
+        self.all_flow = all(twin.flow for twin in twins)
+        self.table = [
+            [float(order.index(stress)), float(self.flows.index(twin.flow) if twin.flow else -1), *_padded(law)]
+            for law, twin, stress in zip(laws, twins, chosen, strict=True)
+        ]
+        functions = [self.principals, self.matrices, self.elastic, self.flows]
+        source = [[_key(function) for function in part] for part in functions]
+        self.cache_key = hashlib.sha256(repr((source, self.spectral, self.all_flow)).encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"Laws_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
+
+
+def _once(functions: Any) -> tuple[Any, ...]:
+    """Each function once, in the order in which they come."""
+    return tuple(dict.fromkeys(functions))
+
+
+def _padded(law: ConstitutiveLaw) -> list[float]:
+    """The four numbers of a law."""
+    values = [float(value) for value in law.coefficients()]
+    if len(values) > 4:
+        raise ValueError(f"Expected at most four `coefficients` of {type(law).__name__}, but got {len(values)}.")
+    return values + [0.0] * (4 - len(values))
+
+
+def _key(function: Any) -> str:
+    """What tells a device function from others; in the interpreter, which caches nothing, its name."""
+    return getattr(function, "cache_key", "") + repr(function)
+
+
+@triton.jit
+def _coefficients(row):
+    return (tl.load(row + 2), tl.load(row + 3), tl.load(row + 4), tl.load(row + 5))
+
+
+@triton.jit
+def _principal(a, mu, lam, internal, which, p, LAWS: tl.constexpr):
+    """Principal first Piola-Kirchhoff stresses; any value for a law that has another stress."""
+    y = LAWS.principals[0](a, mu, lam, internal, p)
+    for k in tl.static_range(1, len(LAWS.principals)):
+        y = where3(which == k, LAWS.principals[k](a, mu, lam, internal, p), y)
+    return y
+
+
+@triton.jit
+def pk1(F, mu, lam, row, LAWS: tl.constexpr):
+    """First Piola-Kirchhoff stress of elastic laws; ``row`` points to the law of each particle in the table."""
+    n: tl.constexpr = len(LAWS.principals)
+    which = tl.load(row).to(tl.int32)
+    p = _coefficients(row)
+    internal = mu * 0
+    if n > 0:
+        u, a, v = svd3(F)
+        stress = scaled_product(u, _principal(a, mu, lam, internal, which, p, LAWS), v)
+    else:
+        stress = LAWS.elastic[0](F, mu, lam, internal, p)
+    for k in tl.static_range(0 if n > 0 else 1, len(LAWS.elastic)):
+        stress = where9(which == n + k, LAWS.elastic[k](F, mu, lam, internal, p), stress)
+    return stress
+
+
+@triton.jit
+def _flow(a, mu, lam, internal, which, p, dt, LAWS: tl.constexpr):
+    """Principal stretches and internal variable after plastic flow."""
+    new, inner = LAWS.flows[0](a, mu, lam, internal, p, dt)
+    if not LAWS.all_flow:
+        new = where3(which == 0, new, a)
+        inner = tl.where(which == 0, inner, internal)
+    for k in tl.static_range(1, len(LAWS.flows)):
+        values, memory = LAWS.flows[k](a, mu, lam, internal, p, dt)
+        new = where3(which == k, values, new)
+        inner = tl.where(which == k, memory, inner)
+    return new, inner
+
+
+@triton.jit
+def kirchhoff(F, mu, lam, internal, row, dt, LAWS: tl.constexpr, FLOW: tl.constexpr):
+    """Kirchhoff stress after the return map, from one decomposition; ``row`` as for :func:`pk1`.
+
+    Returns the elastic F and the internal variable after plastic flow (with FLOW; else as given), and the stress.
+    """
+    n: tl.constexpr = len(LAWS.principals)
+    if LAWS.spectral:
+        u, a, v = svd3(F)
+    # what is read here need not be held in registers during the decomposition
+    which = tl.load(row).to(tl.int32)
+    p = _coefficients(row)
+    if FLOW and len(LAWS.flows) > 0:
+        flow = tl.load(row + 1).to(tl.int32)
+        a, internal = _flow(a, mu, lam, internal, flow, p, dt, LAWS)
+        if LAWS.all_flow:
+            F = scaled_product(u, a, v)
+        else:
+            F = where9(flow >= 0, scaled_product(u, a, v), F)
+    if n > 0:
+        y = _principal(a, mu, lam, internal, which, p, LAWS)
+        stress = scaled_product(u, (y[0] * a[0], y[1] * a[1], y[2] * a[2]), u)
+    else:
+        stress = LAWS.matrices[0](F, mu, lam, internal, p)
+    for k in tl.static_range(0 if n > 0 else 1, len(LAWS.matrices)):
+        stress = where9(which == n + k, LAWS.matrices[k](F, mu, lam, internal, p), stress)
+    return F, internal, stress

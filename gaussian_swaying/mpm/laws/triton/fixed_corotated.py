@@ -1,0 +1,66 @@
+"""Fixed corotated elasticity."""
+
+import triton
+import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
+
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
+from gaussian_swaying.mpm.linalg_triton import (
+    axpy9,
+    cofactor,
+    largest,
+    largest_eigenvalue,
+    matmul,
+    polar_rotation,
+    square9,
+    transpose,
+)
+
+
+@triton.jit
+def corotated_stress(a, mu, lam):
+    """Principal first Piola-Kirchhoff stresses of the fixed corotated energy."""
+    pressure = lam * (a[0] * a[1] * a[2] - 1)
+    return (
+        2 * mu * (a[0] - 1) + pressure * a[1] * a[2],
+        2 * mu * (a[1] - 1) + pressure * a[2] * a[0],
+        2 * mu * (a[2] - 1) + pressure * a[0] * a[1],
+    )
+
+
+@triton.jit
+def principal(a, mu, lam, internal, p):
+    """Principal first Piola-Kirchhoff stresses."""
+    return corotated_stress(a, mu, lam)
+
+
+@triton.jit
+def pk1(F, mu, lam, internal, p):
+    """``fixed_corotated_pk1``."""
+    cof = cofactor(F)
+    pressure = lam * (F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1)
+    return axpy9(2 * mu, axpy9(1.0, F, -1.0, polar_rotation(F)), pressure, cof)
+
+
+@triton.jit
+def kirchhoff(F, mu, lam, internal, p):
+    """P F^T."""
+    return matmul(pk1(F, mu, lam, internal, p), transpose(F))
+
+
+@triton.jit
+def energy(F, mu, lam):
+    """``fixed_corotated_energy``."""
+    cof = cofactor(F)
+    change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
+    return mu * square9(axpy9(1.0, F, -1.0, polar_rotation(F))) + 0.5 * lam * change * change
+
+
+@triton.jit
+def wave(F, mu, lam):
+    """The first of ``fixed_corotated_moduli``."""
+    cof = cofactor(F)
+    area = largest_eigenvalue(matmul(transpose(cof), cof))
+    return 2 * mu + lam * largest(area, 1.0)
+
+
+TWIN = LawTwin(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave)

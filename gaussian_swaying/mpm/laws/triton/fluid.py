@@ -1,0 +1,36 @@
+"""A weakly compressible fluid."""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.mpm.laws.fluid import FLUID_LIMIT
+from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
+from gaussian_swaying.mpm.linalg_triton import cofactor
+
+FLUID_FLOOR = tl.constexpr(FLUID_LIMIT)
+
+
+@triton.jit
+def kirchhoff(F, mu, lam, internal, p):
+    """``fluid_kirchhoff``; ``p`` is the exponent."""
+    gamma = p[0]
+    cof = cofactor(F)
+    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    bulk = lam + 2.0 / 3.0 * mu
+    inside = tl.maximum(det, FLUID_FLOOR)
+    power = tl.exp(-gamma * tl.log(inside))
+    value = -det * (bulk / gamma * (power - 1) - bulk * power / inside * (det - inside))
+    zero = value * 0
+    return (value, zero, zero, zero, value, zero, zero, zero, value)
+
+
+@triton.jit
+def flow(a, mu, lam, internal, p, dt):
+    """``fluid_flow``."""
+    volume = tl.maximum(a[0] * a[1] * a[2], LOG_FLOOR)
+    root = tl.exp(tl.log(volume) / 3)
+    return (root, root, root), internal
+
+
+TWIN = LawTwin(kirchhoff=kirchhoff, flow=flow)

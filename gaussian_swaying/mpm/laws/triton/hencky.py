@@ -1,0 +1,83 @@
+"""Hencky elasticity, the base of the plastic solids."""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.mpm.laws.triton.shared import (
+    EPSILON,
+    LOG_FLOOR,
+    log,
+    log_difference,
+    share_above,
+    spectral_modulus,
+)
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
+from gaussian_swaying.mpm.linalg_triton import dot3, svd3
+
+
+@triton.jit
+def principal(a, mu, lam, internal, p):
+    """Principal first Piola-Kirchhoff stresses of the Hencky energy."""
+    l0 = log(a[0])
+    l1 = log(a[1])
+    l2 = log(a[2])
+    pressure = lam * (l0 + l1 + l2)
+    return (
+        (2 * mu * l0 + pressure) / tl.maximum(a[0], LOG_FLOOR),
+        (2 * mu * l1 + pressure) / tl.maximum(a[1], LOG_FLOOR),
+        (2 * mu * l2 + pressure) / tl.maximum(a[2], LOG_FLOOR),
+    )
+
+
+@triton.jit
+def energy(F, mu, lam):
+    """``stvk_hencky_energy``."""
+    _u, a, _v = svd3(F)
+    logs = (log(a[0]), log(a[1]), log(a[2]))
+    total = logs[0] + logs[1] + logs[2]
+    return mu * dot3(logs, logs) + 0.5 * lam * total * total
+
+
+@triton.jit
+def _pair(x, y, tau_x, tau_y, mu, lam):
+    """H_ij, twist and flip of two axes, from their stretches and Kirchhoff stresses (where nothing is continued)."""
+    gx = 1.0 / tl.maximum(x, LOG_FLOOR)
+    gy = 1.0 / tl.maximum(y, LOG_FLOOR)
+    twist = (tau_x * gx + tau_y * gy) / tl.maximum(x + y, EPSILON)
+    bend = 0.5 * (tau_x + tau_y) * share_above(x, y, LOG_FLOOR) * gx * gy
+    flip = mu * (gx + gy) * log_difference(x, y) - bend
+    return lam * gx * gy, twist, flip
+
+
+@triton.jit
+def _own(x, tau, mu, lam):
+    """H_ii."""
+    g = 1.0 / tl.maximum(x, LOG_FLOOR)
+    return (2 * mu + lam - tl.where(x < LOG_FLOOR, 0.0, tau)) * g * g
+
+
+@triton.jit
+def hencky_wave_modulus(a, mu, lam):
+    """``wave`` of ``stvk_hencky_moduli`` from the principal stretches."""
+    l0 = log(a[0])
+    l1 = log(a[1])
+    l2 = log(a[2])
+    pressure = lam * (l0 + l1 + l2)
+    t0 = 2 * mu * l0 + pressure
+    t1 = 2 * mu * l1 + pressure
+    t2 = 2 * mu * l2 + pressure
+    own = (_own(a[0], t0, mu, lam), _own(a[1], t1, mu, lam), _own(a[2], t2, mu, lam))
+    first = _pair(a[1], a[2], t1, t2, mu, lam)
+    second = _pair(a[0], a[2], t0, t2, mu, lam)
+    third = _pair(a[0], a[1], t0, t1, mu, lam)
+    return spectral_modulus(own, first, second, third, mu, lam)
+
+
+@triton.jit
+def wave(F, mu, lam):
+    """The first of ``stvk_hencky_moduli``."""
+    _u, a, _v = svd3(F)
+    return hencky_wave_modulus(a, mu, lam)
+
+
+TWIN = LawTwin(principal=principal, energy=energy, wave=wave)

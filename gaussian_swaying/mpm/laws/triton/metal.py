@@ -1,0 +1,30 @@
+"""Metal and plasticine: the radial return."""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.mpm.laws.triton.hencky import energy, principal, wave
+from gaussian_swaying.mpm.laws.triton.shared import ROOT, drawn_back, log, split_strain
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
+from gaussian_swaying.mpm.linalg_triton import where3
+
+
+@triton.jit
+def flow(a, mu, lam, internal, p, dt):
+    """``von_mises``; ``p`` are the yield stress, its growth, and its least value."""
+    yield_stress = p[0]
+    hardening = p[1]
+    residual = p[2]
+    trace, d, norm, direction = split_strain(log(a[0]), log(a[1]), log(a[2]))
+    trial = 2 * mu * norm
+    line = yield_stress + hardening * internal
+    stiffness = 2 * mu + 2.0 / 3.0 * hardening
+    floor_flow = (trial - ROOT * residual) / (2 * mu)
+    line_flow = (trial - ROOT * line) / tl.where(stiffness > 0, stiffness, 1.0)
+    amount = tl.where(stiffness > 0, tl.minimum(line_flow, floor_flow), floor_flow)
+    yields = trial > tl.maximum(line, residual) * ROOT
+    amount = tl.where(yields, amount, 0.0)
+    return where3(yields, drawn_back(trace, d, direction, amount), a), internal + ROOT * amount
+
+
+TWIN = LawTwin(principal=principal, flow=flow, energy=energy, wave=wave)

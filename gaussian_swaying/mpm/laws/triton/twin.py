@@ -1,0 +1,70 @@
+"""What a law brings to the kernels, and which laws have it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+
+
+@dataclass(frozen=True)
+class LawTwin:
+    """Device functions of a law: Triton functions of one particle per lane, or None where it has none.
+
+    A matrix is a tuple of nine values, row by row; stretches and principal stresses are tuples of three; ``p`` are the
+    four numbers of ``ConstitutiveLaw.coefficients``, padded with zeros.
+
+    Attributes:
+        principal: ``(a, mu, lam, internal, p)``: principal first Piola-Kirchhoff stresses from the principal stretches.
+        pk1: ``(F, mu, lam, internal, p)``: first Piola-Kirchhoff stress, where that takes no decomposition.
+        kirchhoff: ``(F, mu, lam, internal, p)``: Kirchhoff stress, where that takes no decomposition.
+        flow: ``(a, mu, lam, internal, p, dt)``: principal stretches and internal variable after plastic flow.
+        energy: ``(F, mu, lam)``: energy density.
+        wave: ``(F, mu, lam)``: the first of ``ConstitutiveLaw.moduli``.
+
+    A law needs ``principal``, or ``kirchhoff`` and, if it does not flow, ``pk1``. Where a body needs the decomposition
+    anyway, ``principal`` is used by all laws that have it. Without ``energy`` and ``wave`` torch computes those.
+
+    Raises:
+        ValueError: If the law has no stress.
+    """
+
+    principal: Any = None
+    pk1: Any = None
+    kirchhoff: Any = None
+    flow: Any = None
+    energy: Any = None
+    wave: Any = None
+
+    def __post_init__(self) -> None:
+        if not (self.principal or (self.kirchhoff and (self.pk1 or self.flow))):
+            raise ValueError(
+                "Expected a twin to have a stress: give `principal`, or `kirchhoff` and, for a law that does not flow, "
+                "`pk1`."
+            )
+
+
+def twin_of(law: ConstitutiveLaw) -> LawTwin | None:
+    """The twin of a law, or None for one that runs in torch only.
+
+    Raises:
+        ValueError: If the module that the law names cannot be imported or has no ``TWIN``.
+    """
+    if law.twin is None:
+        return None
+    try:
+        return import_module(law.twin).TWIN
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"Expected `twin` of {type(law).__name__} to be a module that holds a `TWIN`, or None for a law that runs "
+            f"in torch only, but {law.twin!r} is not: {error}."
+        ) from error
+
+
+def shared(laws: Iterable[ConstitutiveLaw], name: str) -> Any:
+    """The ``energy`` or ``wave`` that all laws of a body have in common, or None."""
+    found = {getattr(twin_of(law), name, None) for law in laws}
+    return found.pop() if len(found) == 1 else None

@@ -1,0 +1,59 @@
+"""Whether the size of an object makes sense: no Gaussian far away from all others, and a grid that it fills."""
+
+from __future__ import annotations
+
+import warnings
+
+from torch import Tensor
+
+_SAMPLE = 100_000  # Gaussians that are sorted
+_FEW = 16  # fewer may be meant to lie anywhere
+FAR, TOO_FAR = 20, 1000  # times the side that 98 % of the Gaussians lie within
+SHORT, TOO_SHORT = 3.0, 0.5  # cells along the longest side
+
+
+def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor | None = None) -> None:
+    """Refuse an object whose size is the distance to a stray Gaussian, or that is far smaller than the grid.
+
+    Args:
+        means: Centres of the simulated Gaussians [scene units], shape (N, 3).
+        metres_per_unit: Length of a scene unit [m].
+        dx: Grid spacing [m].
+        index: Numbers of the Gaussians in the splat, for the message, shape (N,).
+
+    Raises:
+        ValueError: If a Gaussian lies a thousand sides away from the others, or the object is shorter than half a cell.
+
+    Warns:
+        UserWarning: If one lies 20 sides away, or the object is shorter than three cells.
+    """
+    if len(means) < _FEW:
+        return
+    some = means[:: -(-len(means) // _SAMPLE)].double().sort(dim=0).values
+    low, high = some[int(0.01 * len(some))], some[-1 - int(0.01 * len(some))]
+    most = float((high - low).amax())
+    whole = float((means.amax(0) - means.amin(0)).amax())
+    if most > 0 and whole > FAR * most:
+        away = (means.double() - 0.5 * (low + high)).abs().amax(-1)
+        first = int(away.argmax())
+        number = first if index is None else int(index[first])
+        text = (
+            f"Gaussian {number} lies at {[float(f'{v:.4g}') for v in means[first].tolist()]}, but 98 % of those "
+            f"simulated lie within {most:.3g} scene units, so size and mass would be those of nearly empty space: leave "
+            "it out with `scene.region` or `scene.opacity_threshold`."
+        )
+        if whole > TOO_FAR * most:
+            raise ValueError(text)
+        warnings.warn(text, UserWarning, stacklevel=2)
+    side = whole * metres_per_unit
+    if side < SHORT * dx:
+        text = (
+            f"The object is {side:.3g} m long, {side / dx:.2g} cells of `solver.dx` = {dx:g} m, so it can hardly bend: "
+            f"lower `solver.dx` to about {side / 24:.2g} m, or check `scene.longest_side` or `scene.metres_per_unit`."
+        )
+        if side < TOO_SHORT * dx:
+            raise ValueError(text)
+        warnings.warn(text, UserWarning, stacklevel=2)
+
+
+__all__ = ["check_extent"]

@@ -1,0 +1,105 @@
+"""What the diagnostics of a run come to, in sentences: whether it held together, what moved most, what to change."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+SOUND = (0.5, 2.0)  # stretch beyond which material is no longer what anyone meant
+
+USUAL = 0.2  # largest displacement as a share of the size that still looks like wind
+
+
+def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elastic: Tensor | None) -> dict[str, Any]:
+    """What moved most, and what was compressed and stretched most, over the frames of a run.
+
+    Args:
+        log: Diagnostics of the frames, as of ``FrameDiagnostics.as_dict``.
+        where: Rest positions of the particles [scene units], shape (P, 3).
+        size: Longest side of the object [m].
+        elastic: Which particles are elastic, shape (P,), None for all; the stretch of what flows says nothing.
+
+    Returns:
+        ``moved``, ``compressed`` and ``stretched``, each a dictionary with ``value`` (in m or as a ratio of lengths),
+        ``at`` (rest position, scene units) and ``time`` [s]; ``moved`` with its ``share`` of the size too. None where
+        no frame tells.
+    """
+    found: dict[str, Any] = {}
+    for name, field, particle, sign in (
+        ("moved", "displacement_max", "moved_particle", 1),
+        ("compressed", "stretch_min", "compressed_particle", -1),
+        ("stretched", "stretch_max", "stretched_particle", 1),
+    ):
+        told = [entry for entry in log if entry.get(particle) is not None and entry[particle] < len(where)]
+        if elastic is not None and name != "moved":
+            told = [entry for entry in told if bool(elastic.reshape(-1)[entry[particle]])]
+        if not told:
+            found[name] = None
+            continue
+        worst = max(told, key=lambda entry: sign * entry[field])
+        place = [round(float(v), 4) for v in where[worst[particle]]]
+        found[name] = {"value": worst[field], "at": place, "time": worst["time"]}
+    if found["moved"] is not None:
+        found["moved"]["share"] = found["moved"]["value"] / size
+    return found
+
+
+def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -> list[str]:
+    """What went wrong with the shape of the object and what to change, in sentences; none if all is well.
+
+    Args:
+        found: From :func:`extremes`.
+        E: Largest Young's modulus of the run [Pa].
+        thickness_matters: Whether ``material.thickness`` decides about the volume.
+
+    Returns:
+        Sentences.
+    """
+    low, high = SOUND
+    small, large, moved = found["compressed"], found["stretched"], found["moved"]
+    bad, factor = [], 1.0
+    if small is not None and not small["value"] >= low:
+        bad.append(f"compressed to {_digits(small['value'])} of its length {_place(small)}")
+        factor = max(factor, (1 - max(small["value"], 0.0)) / (1 - low))
+    if large is not None and not large["value"] <= high:
+        bad.append(f"stretched to {_digits(large['value'])} times its length {_place(large)}")
+        factor = max(factor, (large["value"] - 1) / (high - 1))
+    if not bad:
+        return []
+    said = [f"The material was {' and '.join(bad)}; between {low:g} and {high:g} it keeps its shape."]
+    if moved is not None:
+        said.append(f"What moved most moved by {_digits(moved['value'])} m, {moved['share']:.0%} of the size, "
+                    f"{_place(moved)}.")  # fmt: skip
+    share = 0.0 if moved is None else moved["share"]
+    factor = min(max(2 * factor, share / USUAL, 3.0), 10.0)
+    stiffer = f"raise `material.E` to about {E * factor:.0e} Pa"
+    if thickness_matters:
+        stiffer += f" or `material.thickness` to {factor:.0f} times"
+    said.append(
+        f"What to change: {stiffer}; or weaken `wind.flow`; or enlarge the `region` of the pins in "
+        "`solver.boundaries`, if what should stay in place moves."
+    )
+    return said
+
+
+def _place(entry: Mapping[str, Any]) -> str:
+    at = ", ".join(f"{value:.3g}" for value in entry["at"])
+    return f"at [{at}] (scene units, at rest) after {entry['time']:.3g} s"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
+
+
+def particle_of_extremes(moved: Tensor, eigenvalues: Tensor) -> Tensor:
+    """Indices of the particles that moved, were compressed and were stretched most, int64, shape (3,).
+
+    Args:
+        moved: Distances from rest, shape (..., P).
+        eigenvalues: Squares of the stretches, largest first, shape (..., P, 3).
+    """
+    flat = eigenvalues.reshape(-1, 3)
+    return torch.stack([moved.reshape(-1).argmax(), flat[:, -1].argmin(), flat[:, 0].argmax()])

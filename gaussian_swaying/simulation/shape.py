@@ -1,0 +1,125 @@
+"""Measures of a cloud of points: bounds, quantiles, widths, the normal of a sheet, connected parts."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape
+
+SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
+FEWEST = 16  # Gaussians that make an object
+DIRECTIONS = {
+    "+x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+
+
+def bounds(points: Tensor, share: float = 0.005) -> dict[str, list[float]]:
+    """Extremes and robust bounds of points.
+
+    Args:
+        points: Shape (N, 3).
+        share: Share of the points beyond the robust bounds on each side.
+
+    Returns:
+        ``min``, ``max``, ``robust_min`` and ``robust_max``, 3 numbers each.
+    """
+    check_shape("points", points, None, 3)
+    low, high = ([quantile(c, q) for c in points.unbind(-1)] for q in (share, 1 - share))
+    return {
+        "min": [float(v) for v in points.amin(0)],
+        "max": [float(v) for v in points.amax(0)],
+        "robust_min": low,
+        "robust_max": high,
+    }
+
+
+def sheet_normal(points: Tensor) -> tuple[float, ...] | None:
+    """Unit normal of points that lie close to a plane (see ``SHEET``), snapped to an axis within 10 degrees."""
+    where = points.double()
+    values, axes = torch.linalg.eigh(torch.cov((where - where.mean(0)).T))
+    spread = values.clamp(min=0).sqrt()
+    if float(spread[1]) <= 0 or float(spread[0] / spread[1]) > SHEET:
+        return None
+    return snapped(axes[:, 0])
+
+
+def quantile(values: Tensor, share: float) -> float:
+    """Quantile without the limit of 2^24 values that torch.quantile has."""
+    return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
+
+
+def plane_axes(axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors across another."""
+    helper = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
+    first = torch.linalg.cross(axis, helper)
+    first = first / first.norm()
+    return first, torch.linalg.cross(axis, first)
+
+
+def width(points: Tensor, axis: Tensor) -> float:
+    """Geometric mean of the widths of points across an axis, robust."""
+    sides = [points.double() @ across for across in plane_axes(axis)]
+    return math.sqrt(math.prod(max(quantile(s, 0.97) - quantile(s, 0.03), 1e-9) for s in sides))
+
+
+def snapped(direction: Tensor) -> tuple[float, ...]:
+    """A unit vector, made the axis that it is within 10 degrees of; its largest component positive."""
+    unit = direction.double() / direction.double().norm()
+    main = int(unit.abs().argmax())
+    if float(unit[main]) < 0:
+        unit = -unit
+    if float(unit[main]) > math.cos(math.radians(10)):
+        unit = torch.eye(3, dtype=torch.float64)[main]
+    return tuple(float(c) + 0.0 for c in unit)
+
+
+def rounded(value: float, cell: float) -> float:
+    """A coordinate with no more digits than matter: a hundredth of a cell."""
+    return round(value, max(0, 2 - math.floor(math.log10(cell))))
+
+
+def connected_parts(points: Tensor, cell: float) -> Tensor:
+    """Number of the connected part that each point is in; points in the same or in touching cells are connected.
+
+    Args:
+        points: Shape (N, 3).
+        cell: Size of a cell.
+
+    Returns:
+        Numbers from 0 on, shape (N,).
+
+    Raises:
+        ValueError: If ``cell`` is not positive.
+    """
+    check_shape("points", points, None, 3)
+    check_positive("cell", cell)
+    low = points.amin(0).double()
+    index = ((points.double() - low) / cell).floor().long().clamp(max=2**20 - 4) + 1
+    key, of_point = ((index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]).unique(return_inverse=True)
+    pairs = []
+    for x, y, z in torch.cartesian_prod(*(torch.arange(-1, 2),) * 3).tolist():
+        wanted = key + (x << 42) + (y << 21) + z
+        if (x, y, z) > (0, 0, 0):  # the other half of the neighbours finds the same pairs
+            at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
+            found = (key[at] == wanted).nonzero()[:, 0]
+            pairs.append(torch.stack([found, at[found]]))
+    one, other = torch.cat(pairs, 1)
+    label = torch.arange(len(key))
+    while True:  # the smaller number spreads, by halving of paths
+        smaller = torch.minimum(label[one], label[other])
+        new = label.clone()
+        for end in (one, other, label[one], label[other]):
+            new.scatter_reduce_(0, end, smaller, "amin")
+        new = new[new]
+        if new.equal(label):
+            break
+        label = new
+    return label.unique(return_inverse=True)[1][of_point]

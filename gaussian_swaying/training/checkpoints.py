@@ -1,0 +1,74 @@
+"""Checkpoints of a training: sealed when they are written, read without executing anything in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import Tensor
+
+from gaussian_swaying.simulation.files import atomic, kind_of
+from gaussian_swaying.simulation.seal import check_seal, seal
+from gaussian_swaying.training.densification import PARAMETERS
+
+_FIELDS = {"densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen"}
+
+
+def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str, Any]:
+    """Read a checkpoint that ``tools/train.py`` wrote.
+
+    Args:
+        path: The file.
+        map_location: Where its tensors go, as for ``torch.load``.
+
+    Raises:
+        ValueError: If there is none, or it is damaged or something else.
+    """
+    if kind_of(path) is None:
+        raise ValueError(f"The checkpoint {path} does not exist: give another `--ckpt_path`.")
+    try:
+        check_seal(path)
+        held = torch.load(path, map_location=map_location, weights_only=True)
+        if not isinstance(held, dict) or not isinstance(held.get("splat_training"), dict):
+            raise ValueError("it is not of this training")
+        missing = _FIELDS - set(held["splat_training"])
+        if missing:
+            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+        _check_parameters(held["state_dict"])
+    except Exception as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise ValueError(f"{path} cannot be read as a checkpoint ({why}): give another `--ckpt_path`.") from error
+    return held
+
+
+def _check_parameters(state: dict[str, Any]) -> None:
+    found = [state[f"model.{name}"] for name in PARAMETERS]
+    for name, value in zip(PARAMETERS, found, strict=True):
+        if not isinstance(value, Tensor) or value.dtype != torch.float32 or value.shape[:1] != found[0].shape[:1]:
+            raise ValueError(f"its `{name}` are not those of {len(found[0])} Gaussians")
+        if not bool(torch.isfinite(value).all()):
+            raise ValueError(f"its `{name}` are NaN or infinite")
+
+
+class SealedCheckpoints(TorchCheckpointIO):
+    """How Lightning reads and writes the checkpoints of a training, in every subcommand."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write a checkpoint with its checksum, whole or not at all."""
+        file = Path(path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic(file) as temporary:
+            torch.save(checkpoint, temporary)
+            seal(temporary)
+
+    def load_checkpoint(
+        self,
+        path: Any,
+        map_location: Callable[..., Any] | None = lambda storage, loc: storage,
+        weights_only: bool | None = None,
+    ) -> dict[str, Any]:
+        """Read a checkpoint; ``weights_only`` is taken as true, whatever is asked for."""
+        return read_training_checkpoint(Path(path), map_location)

@@ -1,0 +1,84 @@
+"""The log of a training: rows that are added to ``metrics.csv``, never taken away."""
+
+from __future__ import annotations
+
+import csv
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+from gaussian_swaying.simulation.files import check_regular, write_table
+
+
+def append_row(path: Path, row: dict[str, Any]) -> None:
+    """Add a row to a CSV file with a header; a new column is added to all rows before.
+
+    Args:
+        path: The file; it is made, with its folder, if there is none.
+        row: Values by column.
+
+    Raises:
+        ValueError: If the path is no regular file.
+    """
+    check_regular(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names: list[str] = []
+    whole = True
+    if path.exists():
+        with path.open("rb") as file:
+            first = file.readline()
+            file.seek(max(file.seek(0, 2) - 1, 0))
+            whole = file.read() in (b"\n", b"")
+        names = next(csv.reader([first.decode(errors="replace")]), [])
+    if not set(row) <= set(names):
+        rows: list[dict[str, Any]] = []
+        if names:
+            with path.open(newline="", errors="replace") as text:
+                rows = [{name: line.get(name) for name in names} for line in csv.DictReader(text)]
+        wider = [*names, *sorted(set(row) - set(names))]
+        write_table(path, [{name: line.get(name) for name in wider} for line in [*rows, row]])
+        return
+    with path.open("a", newline="") as text:
+        if not whole:  # a row that was cut off when its training was killed
+            text.write("\r\n")
+        csv.DictWriter(text, fieldnames=names).writerow(row)
+
+
+class CsvLog(Logger):
+    """Lightning's values as rows of ``metrics.csv``, each with its ``step``. Nothing is written before the first.
+
+    Args:
+        folder: Where the file is.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    @property
+    def name(self) -> str:
+        """Empty: the folder has a name already."""
+        return ""
+
+    @property
+    def version(self) -> str:
+        """Empty, likewise."""
+        return ""
+
+    @property
+    def save_dir(self) -> str:
+        """The folder."""
+        return str(self.folder)
+
+    @rank_zero_only
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """Add a row."""
+        append_row(
+            self.folder / "metrics.csv", {name: float(value) for name, value in metrics.items()} | {"step": step}
+        )
+
+    def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
+        """Nothing: the configuration is in ``config.yaml``."""

@@ -1,0 +1,122 @@
+"""The folder of a training: taken when its first image is there, so that one that is refused changes nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import Logger
+
+from gaussian_swaying.simulation.files import remove_temporaries
+from gaussian_swaying.simulation.lock import FolderLock
+from gaussian_swaying.simulation.output import MARKER, claim_folder, hold_folder, mark
+from gaussian_swaying.simulation.resume import check_names
+
+_FILES = ["run.json", "point_cloud.ply", "csv/metrics.csv", "csv/config.yaml"]
+_FOLDERS = ["checkpoints", "panels", "csv", "tensorboard"]
+_OURS = ["point_cloud.ply", *_FOLDERS]
+
+
+class RunFolder(Callback):
+    """Holds the folder of a training from its first image to its end.
+
+    An earlier training found there is moved aside, unless this one continues from a checkpoint in it. Loggers are made
+    and the configuration is written only then.
+
+    Attributes:
+        root: The folder, ``trainer.default_root_dir``.
+        loggers: Makes the loggers; None if the trainer has its own.
+        save_config: Writes the configuration below a folder.
+        begun: Whether the folder was taken.
+        keep: Hold it until :meth:`release`, not only to the end of Lightning's part.
+    """
+
+    def __init__(self) -> None:
+        self.root = Path()
+        self.loggers: Callable[[], list[Logger]] | None = None
+        self.save_config: Callable[[Path], None] | None = None
+        self.begun = self.keep = False
+        self._locks: list[FolderLock] = []
+        self._newest: Callable[[], str | None] = lambda: None
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Take the folder before the first image is trained on."""
+        self._begin(trainer, pl_module)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Likewise where a continued training validates first; a folder for results alone is marked as ours."""
+        if trainer.state.fn != "fit":
+            self._mark(pl_module)
+        elif not trainer.sanity_checking:
+            self._begin(trainer, pl_module)
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Mark a folder for results alone as ours."""
+        self._mark(pl_module)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Let the folder go when the training fails or is stopped."""
+        self.release()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Let the folder go at the end."""
+        if not self.keep:
+            self.release()
+
+    def release(self) -> None:
+        """Let other trainings write to the folder."""
+        for lock in self._locks:
+            lock.release()
+        self._locks = []
+
+    def newest_checkpoint(self) -> str | None:
+        """The last checkpoint of a training that has begun, or the one that it continued; None if there is none."""
+        return self._newest()
+
+    def _mark(self, pl_module: Any) -> None:
+        for folder in {self.root, pl_module.folder}:
+            if not any(os.path.lexists(folder / name) for name in (MARKER, *_OURS)):
+                folder.mkdir(parents=True, exist_ok=True)
+                mark(folder)
+
+    def _begin(self, trainer: Any, pl_module: Any) -> None:
+        if self.begun:
+            return
+        continued = None if trainer.ckpt_path is None else Path(str(trainer.ckpt_path))
+        in_use = [getattr(trainer.datamodule, "path", None), pl_module.init_ply, continued]
+        for folder, option in _apart({pl_module.folder: "--model.output", self.root: "--trainer.default_root_dir"}):
+            self._locks.append(_take(folder, option, continued, [Path(str(path)) for path in in_use if path]))
+        if self.loggers is not None:
+            trainer.loggers = self.loggers()
+        if self.save_config is not None:
+            self.save_config(Path(trainer.log_dir or self.root))
+        self.begun = True
+        self._newest = pl_module.last_checkpoint
+
+
+def _apart(options: dict[Path, str]) -> list[tuple[Path, str]]:
+    """The folders, outer ones first, without those within another."""
+    kept: list[tuple[Path, str]] = []
+    for folder in sorted(options, key=lambda folder: len(folder.resolve().parts)):
+        if not any(folder.resolve().is_relative_to(other.resolve()) for other, _ in kept):
+            kept.append((folder, options[folder]))
+    return kept
+
+
+def _take(folder: Path, option: str, continued: Path | None, in_use: Sequence[Path]) -> FolderLock:
+    remedy = f"choose another with {option}"
+    if continued is None or not continued.resolve().is_relative_to(folder.resolve()):
+        return claim_folder(folder, _OURS, remedy, in_use)
+    lock = hold_folder(folder, remedy)
+    try:
+        check_names(folder, _FILES, _FOLDERS)
+        for name in (".", *_FOLDERS):
+            remove_temporaries(folder / name)
+    except BaseException:
+        lock.release()
+        raise
+    return lock

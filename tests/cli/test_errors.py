@@ -1,0 +1,188 @@
+"""One place turns errors into a sentence and an exit code, and no stream stops a command."""
+
+import errno
+import io
+import os
+import subprocess
+import sys
+import warnings
+from argparse import ArgumentError, ArgumentParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.cli.errors import run_command, sentence
+from gaussian_swaying.cli.streams import SafeStream
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.simulation.config import build_parser
+
+ROOT = Path(__file__).parents[2]
+
+
+def raising(error):
+    def command():
+        raise error
+
+    return command
+
+
+def caught(function):
+    """What a function really raises, as messages differ between versions of the libraries."""
+    try:
+        function()
+    except Exception as error:
+        return error
+    raise AssertionError("nothing was raised")
+
+
+def nested(depth=100_000):
+    return nested(depth - 1) if depth else 0
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (lambda: torch.empty(1 << 62), ["The memory is not enough", "coarser grid"]),
+        (lambda: torch.empty(1 << 45), ["The memory is not enough (", "were asked for", "coarser grid"]),
+        (lambda: torch.empty(1 << 31, 1 << 31, 1 << 31), ["The memory is not enough", "coarser grid"]),
+        (lambda: np.empty(1 << 50), ["The memory is not enough (Unable to allocate", "coarser grid"]),
+        (lambda: float(10**400), ["A number is too large", "check the values"]),
+        (lambda: torch.tensor([0.0]).fill_(1e300), ["A number is too large", "check the values"]),
+        (lambda: b"\xff\xfe".decode(), ["not UTF-8", "save it as UTF-8"]),
+        (nested, ["nested too deeply"]),
+        (Path("/nowhere/at/all").read_bytes, ["/nowhere/at/all does not exist", "check the path"]),
+        (Path("/").read_bytes, ["/ cannot be used", "directory"]),
+        (lambda: os.write(os.open("/dev/full", os.O_WRONLY), b"x"), ["could not be written", "make room"]),
+        (lambda: torch.save({"a": torch.ones(99999)}, "/dev/full"), ["could not be written", "disk may be full"]),
+    ],
+    ids=["count", "memory", "product", "numpy", "float", "fill", "text", "depth", "missing", "folder", "full", "save"],
+)
+def test_what_input_and_machine_cause_is_a_sentence(error, words, capsys):
+    error = caught(error)
+    assert run_command(raising(error), memory="a coarser grid") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    for word in words:
+        assert word in said, said
+
+
+def test_a_bug_is_called_one(capsys, monkeypatch):
+    """And keeps its traceback where it is asked for."""
+    assert run_command(raising(KeyError("colour"))) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("error: KeyError: 'colour'")
+    assert "bug" in said
+    assert "Traceback" not in said
+    assert sentence(AttributeError("no such thing")) is None
+    monkeypatch.setenv("GAUSSIAN_SWAYING_DEBUG", "1")
+    with pytest.raises(KeyError):
+        run_command(raising(KeyError("colour")))
+
+
+def test_codes_and_what_is_said(capsys):
+    assert run_command(lambda: None) == 0
+    assert run_command(lambda: 130) == 130
+    assert run_command(raising(KeyboardInterrupt()), stopped="Stopped here.") == 130
+    assert capsys.readouterr().err == "Stopped here.\n"
+    assert run_command(raising(StopIteration("here")), expected=(StopIteration,)) == 2
+    assert run_command(raising(ArgumentError(None, "no such option"))) == 2
+    assert "no such option; --help lists the options." in capsys.readouterr().err
+
+
+def test_a_warning_is_one_line_and_said_once(capsys):
+    def command():
+        for _ in range(2):
+            warnings.warn("the splat is odd", UserWarning, stacklevel=1)
+            warnings.warn_explicit("the splat is odd", UserWarning, "elsewhere.py", 3)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run_command(command) == 0
+    assert capsys.readouterr().err == "warning: the splat is odd\n"
+
+
+# ---- streams
+
+
+class Broken(io.StringIO):
+    """Fails as a full disk does."""
+
+    def write(self, text):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_stream_that_fails_is_left_alone():
+    stream = SafeStream(Broken())
+    assert stream.write("one") == 3
+    assert stream.error.errno == errno.ENOSPC
+    stream.write("two")
+    stream.flush()
+    closed = io.StringIO()
+    closed.close()
+    SafeStream(closed).write("three")
+
+
+def test_letters_that_the_terminal_lacks():
+    raw = io.BytesIO()
+    stream = SafeStream(io.TextIOWrapper(raw, encoding="ascii"))
+    stream.write("5 kg/m³ é π")
+    stream.flush()
+    assert raw.getvalue() == b"5 kg/m3 e ?"
+
+
+def shell(line, tmp_path, **variables):
+    """Exit code of a line of a shell with ``sim.py`` in it, and what it said on standard error."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **variables}
+    line = "set -o pipefail; " + line.replace("sim.py", f"{sys.executable} {ROOT / 'tools/sim.py'}")
+    done = subprocess.run(["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+    return done.returncode, done.stderr, done.stdout
+
+
+def test_the_program_with_broken_streams(tmp_path):
+    assert shell("sim.py --help | head -1", tmp_path)[:2] == (0, "")
+    assert shell("sim.py --bad 2>/dev/full", tmp_path)[0] == 2
+    assert shell("sim.py --bad 2>&-", tmp_path)[0] == 2
+    code, said, _ = shell("sim.py --help >/dev/full", tmp_path)
+    assert (code, said) == (2, "error: Standard output could not be written (No space left on device).\n")
+    code, _, printed = shell("sim.py --help", tmp_path, PYTHONIOENCODING="ascii")
+    assert code == 0
+    assert "Density [kg/m3]" in printed
+
+
+# ---- guesses
+
+
+@pytest.mark.parametrize(
+    ("arguments", "guess"),
+    [
+        (["--wind.flwo", "3"], "(did you mean --wind.flow?)"),
+        (["--frmes", "3"], "(did you mean --frames?)"),
+        (["--config", "{wind: {flwo: 3}}"], "(did you mean wind.flow?)"),
+        (["--config", "{wnd: {flow: 3}}"], "(did you mean wind.flow?)"),
+        (["--camera", "{class_path: OrbitCamera, init_args: {radus: 3}}"], "(did you mean radius?)"),
+    ],
+)
+def test_a_misspelt_option_is_guessed(arguments, guess):
+    parser = build_parser()
+    with pytest.raises(ArgumentError, match="did you mean") as caught, guessing(parser):
+        parser.parse_args(arguments)
+    assert guess in str(caught.value)
+
+
+def test_no_guess_where_nothing_is_close():
+    parser = build_parser()
+    with pytest.raises(ArgumentError) as caught, guessing(parser):
+        parser.parse_args(["--quite_another_thing", "3"])
+    assert "did you mean" not in str(caught.value)
+
+
+def test_options_of_argparse_with_dashes():
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_argument("--longest-side")
+    with pytest.raises(ArgumentError, match=r"did you mean --longest-side\?"), guessing(parser):
+        raise ArgumentError(None, "unrecognized arguments: --longest-sid 3")

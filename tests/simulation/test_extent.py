@@ -1,0 +1,35 @@
+"""Sizes that make no sense are refused, odd ones are warned of."""
+
+import pytest
+import torch
+
+from gaussian_swaying.simulation.extent import check_extent
+
+
+def cube(count=1000):
+    return torch.rand(count, 3)
+
+
+def test_usual_objects_pass(recwarn):
+    check_extent(cube(), 1.0, 0.05)
+    check_extent(torch.cat([cube(), torch.tensor([[3.0, 0.0, 0.0]])]), 1.0, 0.05)
+    check_extent(torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]), 1.0, 1000.0)  # two may be meant so
+    check_extent(torch.zeros(100, 3) + torch.linspace(0, 1, 100)[:, None], 1.0, 0.05)
+    assert not recwarn.list
+
+
+def test_a_stray_gaussian():
+    stray = torch.cat([cube(), torch.tensor([[0.0, 1e10, 0.0]])])
+    with pytest.raises(ValueError, match=r"Gaussian 1000 lies at \[0.0, 10000000000.0, 0.0\].*`scene.region`"):
+        check_extent(stray, 1e-10, 0.05)
+    with pytest.raises(ValueError, match="Gaussian 7000 lies"):
+        check_extent(stray, 1e-10, 0.05, torch.arange(1001) * 7)
+    with pytest.warns(UserWarning, match="Gaussian 1000 lies at"):
+        check_extent(torch.cat([cube(), torch.tensor([[40.0, 0.0, 0.0]])]), 1.0, 0.05)
+
+
+def test_an_object_smaller_than_the_grid():
+    with pytest.raises(ValueError, match=r"0\.00\d+ cells of `solver.dx` = 1000 m.*lower `solver.dx` to about 0.042"):
+        check_extent(cube(), 1.0, 1000.0)
+    with pytest.warns(UserWarning, match="2 cells of `solver.dx` = 0.5 m"):
+        check_extent(cube(), 1.0, 0.5)

@@ -1,0 +1,158 @@
+"""What a run shows: frames, progress within one that is slow, and why it is."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation import pipeline as pipeline_module
+from gaussian_swaying.simulation import progress as progress_module
+from gaussian_swaying.simulation.config import main
+from gaussian_swaying.simulation.progress import RunProgress
+
+FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
+SMALL = ["--config", str(FLAG), "--device", "cpu", "--scene.generator.init_args.spacing", "0.1"]
+SMALL += ["--solver.dx", "0.2", "--camera.init_args.width", "32", "--camera.init_args.height", "18"]
+SMALL += ["--solver.boundaries", "[]", "--frames", "3"]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that is set by hand."""
+
+    class Clock:
+        now = 0.0
+
+    monkeypatch.setattr(progress_module.time, "perf_counter", lambda: Clock.now)
+    return Clock
+
+
+def work(progress, clock, frame, steps, seconds):
+    """A frame of so many substeps of so many seconds each."""
+    progress.begin(frame)
+    for done in range(1, steps + 1):
+        clock.now += seconds
+        progress.substep(done, steps)
+    progress.end(steps, 0.125)
+
+
+def test_usual_frames_say_nothing_but_where_they_are(clock, capsys):
+    progress = RunProgress(4)
+    for frame in range(4):
+        work(progress, clock, frame, 50, 0.01)
+    progress.close()
+    said = capsys.readouterr().err
+    assert "50 substeps, 0.125 m from rest on average" in said
+    assert "note:" not in said
+    assert "left in this frame" not in said
+
+
+def test_a_slow_frame_shows_its_substeps_and_says_why_once(clock, capsys):
+    progress = RunProgress(10)
+    work(progress, clock, 1, 10, 0.5)
+    said = capsys.readouterr().err
+    assert "substep 3 of 10, 3.5 s left in this frame" in said
+    assert "note:" not in said
+    work(progress, clock, 2, 300, 0.5)
+    work(progress, clock, 3, 400, 0.5)
+    said = capsys.readouterr().err
+    assert said.count("note:") == 1
+    assert "note: Frame 2 takes 300 substeps, about 2.5 min, 30 times those of the first" in said
+    work(progress, clock, 4, 1300, 0.5)
+    assert "note: Frame 4 takes 1,300 substeps" in capsys.readouterr().err
+    progress.close()
+
+
+def test_a_slow_first_frame_is_told_with_the_whole_run(clock, capsys):
+    progress = RunProgress(101)
+    work(progress, clock, 1, 1000, 0.1)
+    said = capsys.readouterr().err
+    assert said.count("note:") == 1
+    assert "note: Frame 1 takes 1,000 substeps, about 100 s, and the frames to come about 2.8 h." in said
+    assert "`solver.dx`" in said
+
+
+def test_a_frame_that_is_done_again_is_counted_anew(clock, capsys):
+    progress = RunProgress(10)
+    progress.begin(1)
+    for steps in (20, 40):
+        for done in range(1, steps + 1):
+            clock.now += 1.0
+            progress.substep(done, steps)
+    assert "substep 40 of 40, 0 ms left" in capsys.readouterr().err
+
+
+def test_nothing_is_shown_where_nothing_is_wanted(clock, capsys):
+    progress = RunProgress(3, shown=False)
+    work(progress, clock, 1, 1000, 0.1)
+    progress.close()
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+@pytest.mark.parametrize("looks", [1, 8])
+def test_watching_changes_no_bit(formulation, looks):
+    """And every substep is told of, in order."""
+    solver = MPMSolver(dx=0.25, formulation=formulation, transfer="torch")
+    points = MaterialPoints.create(
+        torch.rand(200, 3), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
+    )
+    state, told = solver.init_state(points), []
+    plain, speed = solver.watched_rollout(state, 1e-4, 21, looks=looks)
+    watched, same = solver.watched_rollout(state, 1e-4, 21, looks=looks, watch=told.append)
+    assert told == list(range(1, 22))
+    assert torch.equal(plain.position, watched.position)
+    assert torch.equal(plain.velocity, watched.velocity)
+    assert torch.equal(speed, same)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--solver.substep", "1e-9"], ["40,000,000 substeps", "raise `solver.substep`"]),
+        (["--material.E", "1e16"], ["substeps", "`material.E`", "`frame_dt`"]),
+        (["--material.E", "1e30"], ["substeps", "`material.E`"]),
+        (["--frame_dt", "1e9"], ["substeps", "`frame_dt`"]),
+        (["--material.density", "1e-30"], ["substeps"]),
+    ],
+)
+def test_substeps_without_end_are_refused(arguments, words, tmp_path, capsys):
+    assert main([*SMALL, *arguments, "--output", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for word in words:
+        assert word in said, said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(pipeline_module, "MAX_SUBSTEPS", 20)
+    assert main([*SMALL, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert "substeps, and 20 are the most" in said
+    assert (tmp_path / "run/frames/00000.png").exists()
+
+
+def test_the_cameras_of_a_billion_frames(tmp_path, monkeypatch):
+    """Some of them are looked at, with the first and the last."""
+    seen = []
+    monkeypatch.setattr(pipeline_module.SimulationPipeline, "check_camera", lambda self, frame: seen.append(frame))
+
+    def stop(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline_module.SimulationPipeline, "start", stop)
+    assert main([*SMALL, "--frames", "1000000000", "--output", str(tmp_path / "run")]) == 130
+    assert len(seen) == pipeline_module.MAX_LOOKS
+    assert (seen[0], seen[-1]) == (0, 999_999_999)
+    seen.clear()
+    assert main([*SMALL, "--frames", "7", "--output", str(tmp_path / "run")]) == 130
+    assert seen == list(range(7))
+
+
+@pytest.mark.parametrize("color", ["[255, 255, 255]", "[-0.1, 0, 0]"])
+def test_a_background_beyond_white_is_refused(color, tmp_path, capsys):
+    assert main([*SMALL, "--background", color, "--output", str(tmp_path / "run")]) == 2
+    assert "`background` within [0, 1]" in capsys.readouterr().err

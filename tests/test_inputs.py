@@ -1,0 +1,92 @@
+"""Files that are refused before they are read."""
+
+import json
+import os
+import struct
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+
+from gaussian_swaying._inputs import check_archive, check_regular, read_json
+from gaussian_swaying.data.images import image_size
+
+
+def test_a_pipe_and_a_device_are_no_files(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", "/dev/zero"):
+        with pytest.raises(ValueError, match=r"no regular file .* save the splat first"):
+            check_regular(path, "the splat")
+    with pytest.raises(ValueError, match="is a directory; give the splat inside it"):
+        check_regular(tmp_path, "the splat")
+    with pytest.raises(FileNotFoundError, match="does not exist; check the path of the splat"):
+        check_regular(tmp_path / "none", "the splat")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        check_regular("/dev/null/below", "the splat")
+    (tmp_path / "file").write_bytes(b"12345")
+    assert check_regular(tmp_path / "file", largest=5) == tmp_path / "file"
+    with pytest.raises(ValueError, match="has 5 bytes, more than the 4"):
+        check_regular(tmp_path / "file", largest=4)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"[" * 200_000, "nested too deeply"),
+        (b'{"a":' * 100_000, "nested too deeply"),
+        (b'{"w": ' + b"9" * 400 + b"}", "whole number of 400 digits"),
+        ('{"name": "Blüte"}'.encode("latin-1"), "not valid JSON"),
+        ('{"a": 1}'.encode("utf-16"), "not valid JSON"),
+        (b"{", "not valid JSON"),
+    ],
+    ids=["list", "dict", "digits", "latin-1", "utf-16", "cut"],
+)
+def test_bad_json_is_one_sentence(text, words, tmp_path):
+    (tmp_path / "cameras.json").write_bytes(text)
+    with pytest.raises(ValueError, match=words) as error:
+        read_json(tmp_path / "cameras.json", "camera file")
+    assert "cameras.json" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_good_json(tmp_path):
+    (tmp_path / "good.json").write_text(json.dumps({"a": [1, 2.5, -3], "b": "ü"}), encoding="utf-8")
+    assert read_json(tmp_path / "good.json", "file") == {"a": [1, 2.5, -3], "b": "ü"}
+
+
+def test_an_archive_that_swells_is_refused(tmp_path):
+    """Two gigabytes of zeros in two megabytes; the name of the member is enough, nothing is unpacked."""
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    np.savez(good, a=np.zeros(10))
+    assert check_archive(good, "the run") == good
+    with zipfile.ZipFile(bad, "w") as archive:
+        archive.writestr("a.npy", b"12")
+    data = bad.read_bytes()
+    size = struct.pack("<I", 2)
+    bad.write_bytes(data[:-60].replace(size + size, struct.pack("<II", 2, 0x7FFFFFFF)) + data[-60:].replace(
+        size + size, struct.pack("<II", 2, 0x7FFFFFFF)))  # fmt: skip
+    with pytest.raises(ValueError, match=r"2,147,483,647 bytes, far more than its size"):
+        check_archive(bad, "the run")
+    bad.write_bytes(b"PK not quite")
+    with pytest.raises(ValueError, match=r"no .npz, or not whole"):
+        check_archive(bad, "the run")
+
+
+def test_a_picture_that_swells_is_refused(tmp_path):
+    """A header of 60,000 x 60,000 pixels in a hundred bytes."""
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    def picture(width, height):
+        header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+        return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+    path = tmp_path / "photo.png"
+    for side in (60_000, 10_000):
+        path.write_bytes(picture(side, side))
+        with pytest.raises(ValueError, match=r"photo.png"):
+            image_size(path)
+    path.write_bytes(picture(400, 300))
+    assert image_size(path) == (400, 300)

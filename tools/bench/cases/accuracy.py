@@ -1,0 +1,152 @@
+"""What ``bench.py accuracy`` measures: errors against closed forms and experiments."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bench import record
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.validation import bars, beams, flags, granular, plates, surfaces, vortex
+from gaussian_swaying.validation.settings import Settings
+
+Row = dict[str, Any]
+
+VARIANTS = {
+    "total": Settings(),
+    "updated": Settings(formulation="updated"),
+    "MLS": Settings(formulation="updated", mls=True),
+}
+SINGLE = {"total, float32": Settings(dtype=torch.float32)}
+
+
+def _plate(k: float, law: str, settings: Settings) -> dict[str, float]:
+    return plates.hinged_plate(k, law, settings)
+
+
+def _surface(settings: Settings, **options: Any) -> dict[str, float]:
+    del settings  # no solver in it
+    return surfaces.surface_drag(**options)
+
+
+def _elements(settings: Settings) -> dict[str, float]:
+    del settings  # element tests need no solver
+    law = Sand(friction_angle=30.0)
+    return {
+        "shear_deg": granular.shear_angle(law),
+        "triaxial_deg": granular.triaxial_angle(law),
+        "plane_strain_deg": granular.plane_strain_angle(law),
+    }
+
+
+def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], dict[str, float]]]]:
+    """The name, the parameters and the function of each measurement."""
+    everyone = {**VARIANTS, **SINGLE}
+
+    def case(name: str, function: Callable[..., Any], variant: str, **parameters: Any) -> Any:
+        settings = replace(everyone[variant], device=device)
+        return name, {"variant": variant, **parameters}, lambda: function(settings=settings, **parameters)
+
+    for variant in everyone:
+        for cells in (8, 16, 32, 64):
+            for ends in ("free", "fixed-free"):
+                yield case("vibrating bar", bars.vibrating_bar, variant, cells=cells, ends=ends)
+    for cells in (8, 16, 32):
+        yield case(
+            "unconfined bar",
+            bars.vibrating_bar,
+            "total",
+            cells=cells,
+            ends="fixed-free",
+            confined=False,
+            poisson_ratio=0.0,
+        )
+    for variant in everyone:
+        for clamp in ("mirror", "pin"):
+            for cells in (8, 16, 32):
+                yield case("hanging bar", bars.hanging_bar, variant, cells=cells, clamp=clamp)
+    for variant in VARIANTS:
+        for cells in (1, 2, 3, 4) if thorough else (1, 2):
+            yield case("cantilever", beams.cantilever, variant, cells=cells, b=1.0)
+    for b in (0.5, 2.0, 4.0, 8.0):
+        yield case("cantilever", beams.cantilever, "total", cells=2, b=b)
+    for variant in everyone:
+        for cells in (16, 24, 32, 48) if thorough and variant == "total" else (16, 24, 32):
+            yield case("vortex", vortex.vortex, variant, cells=cells)
+    for variant in VARIANTS:
+        yield case("free block", bars.free_block, variant, periods=100 if variant == "total" else 20)
+    for variant in ("total", "updated"):
+        for law, ks in (("paper", (0.25, 0.5, 0.75)), ("projected", (0.25, 0.5, 1.0, 2.0))):
+            for k in ks:
+                yield case("hinged plate", _plate, variant, k=k, law=law)
+    for shape in ("plate", "sphere"):
+        for law in ("paper", "projected"):
+            for count, overlap in ((500, 0.5), (2000, 0.3), (2000, 1.0), (6000, 0.5)):
+                for area in ("coverage", "paper"):
+                    options = {"shape": shape, "law": law, "count": count, "overlap": overlap, "area": area}
+                    yield case("surface drag", _surface, "total", **options)
+    yield case("sand element", _elements, "updated")
+    yield case("sand slope", granular.angle_of_repose, "updated")
+    for cells in (4, 8, 16) if thorough else (4, 8):
+        yield case("sand column", granular.column_collapse, "updated", aspect=1.0, cells=cells)
+    for aspect in (0.5, 2.0, 3.0):
+        yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=16 if thorough else 8)
+    for aspect in (0.5, 1.0, 2.0, 3.0):
+        yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=8, volume_correction=False)
+    if thorough:
+        for aspect in (0.5, 1.0, 2.0):
+            yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=8, planar=False)
+        for dx in (0.08, 0.04, 0.02, 0.01) if device == "cuda" else ():  # tens of thousands of particles
+            for density in (20.0, 50.0):
+                yield case("soft flag", _soft_flag, "total, float32", dx=dx, density=density)
+
+
+def _soft_flag(dx: float, density: float, settings: Settings) -> dict[str, float]:
+    """250 frames of the softest of the paper's flags."""
+    result, _ = flags.flag(
+        dx,
+        settings,
+        frames=250,
+        spacing=dx / 2,
+        youngs_modulus=3e3,
+        density=density,
+        wind=(2.5, 0.5, 0.0),
+    )
+    return result
+
+
+def measure(device: str, thorough: bool, only: str | None = None) -> list[Row]:
+    """Run all cases; a case that fails is recorded with its message."""
+    rows = []
+    for name, parameters, function in cases(device, thorough):
+        if only and only not in name:
+            continue
+        try:
+            result: Row = dict(function())
+        except Exception as error:
+            result = {"failed": f"{type(error).__name__}: {error}"}
+        rows.append({"problem": name, "parameters": parameters, "result": result})
+        print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py accuracy``."""
+    command.add_argument("--only", help="only the problems with this name")
+    command.add_argument("--thorough", action="store_true", help="finer grids and full 3D; for a GPU")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Measure errors against closed forms and experiments."""
+    device, result = record.start(options.device)
+    folder, name = Path(options.results), f"accuracy_{device.type}"
+    only = options.only
+    result["rows"] = record.kept_rows(folder, name, lambda row: only not in row["problem"]) if only else []
+    result["rows"] += measure(device.type, options.thorough, only)
+    record.write(folder, name, result)

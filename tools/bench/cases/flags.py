@@ -1,0 +1,318 @@
+"""The flag benchmark of ``bench.py flags``: train, simulate, and compare with Blender's cloth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from bench.record import ROOT
+from gaussian_swaying.metrics.compare import compare_run
+
+sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts, which find each other in their own folder
+
+from flag_reference import PATTERNS as REFERENCES
+
+BENCH = ROOT / "configs" / "bench"
+Row = dict[str, Any]
+
+PATTERNS = (1, 2, 3)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to simulate a flag.
+
+    Attributes:
+        title: What the tables say.
+        overlays: Files of configs/bench/variants on top of the matched configuration.
+        options: Further options of tools/sim.py.
+        patterns: Flags for which it differs from ``ours``.
+        training: Further options of tools/train.py; a variant with some has a splat of its own.
+        true_normals: Whether the Gaussians are turned to the reference's normals at rest.
+    """
+
+    title: str
+    overlays: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    patterns: tuple[int, ...] = PATTERNS
+    training: tuple[str, ...] = ()
+    true_normals: bool = False
+
+
+def _grid(dx: float) -> tuple[str, ...]:
+    """Options for a grid spacing [m], with as many particles in a cell."""
+    return (f"--solver.dx={dx:g}", f"--scene.particle_spacing={0.45 * dx:g}")
+
+
+VARIANTS: dict[str, Variant] = {
+    "ours": Variant("ours (`total`, three layers)"),
+    "particle": Variant("PhysGaussian's way", ("particle",)),
+    "no_surface": Variant("no surface modelling", ("no_surface",), patterns=(2, 3)),
+    "no_shading": Variant("no shading", ("no_shading",)),
+    "gusts": Variant("flow randomised", ("gusts",), patterns=(2, 3)),
+    "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
+    "paper_area": Variant("areas π s1 s2", ("paper_area",)),
+    "membrane": Variant("one layer: no bending stiffness", options=("--scene.layers=1",)),
+    "true_normals": Variant("with the reference's normals at rest", patterns=(2, 3), true_normals=True),
+    "one_point": Variant("one point to a Gaussian", options=("--scene.particle_spacing=null",)),
+    "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
+    "total_03": Variant("`total`, dx = 0.03 m", options=_grid(0.03)),
+    "total_02": Variant("`total`, dx = 0.02 m", options=_grid(0.02)),
+    "total_01": Variant("`total`, dx = 0.01 m", options=_grid(0.01), patterns=(1, 2)),
+    "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",), _grid(0.04)),
+    "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), _grid(0.03)),
+    "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), _grid(0.02)),
+    "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
+    "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
+    "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
+    "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
+    "thin": Variant("half the thickness, twice E and density", options=("--material.thickness=0.005",)),
+    **{
+        f"b_{b:g}": Variant(
+            f"size loss b = {b:g}, no late split",
+            training=(
+                f"--model.loss_terms.size.init_args.b={b:g}",
+                "--model.densification.init_args.split_at=null",  # or it would make all sizes alike
+            ),
+            patterns=(3,),
+        )
+        for b in (0.001, 0.004, 0.008, 0.02, 0.1)
+    },
+}
+"""All rows, by name."""
+
+_TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
+
+
+def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None) -> list[str]:
+    """Command line of tools/sim.py for a row."""
+    configs = [ROOT / "configs" / "sim" / f"flag{pattern}.yaml", BENCH / f"flag{pattern}.yaml"]
+    configs += [BENCH / "variants" / f"{name}.yaml" for name in variant.overlays]
+    arguments = [part for path in configs for part in ("--config", str(path))]
+    if splat is not None:
+        arguments += ["--scene.ply", str(splat)]
+    else:  # a ripple of 3 mm changes the incidence of the wind by more than a degree
+        arguments += [f"--scene.generator.init_args.ripple={REFERENCES[pattern].ripple}"]
+    camera = dataset / f"pattern{pattern}" / "video" / "camera.json"
+    if camera.exists():
+        arguments += ["--camera=TransformsCamera", f"--camera.path={camera}"]
+        described = json.loads(camera.read_text())
+        arguments += [f"--camera.width={described['w']}", f"--camera.height={described['h']}"]
+    arguments += list(variant.options)
+    if {"particle", "no_surface"} & set(variant.overlays):  # as much friction as drag; no air in pattern 1
+        matched = yaml.safe_load((BENCH / f"flag{pattern}.yaml").read_text())
+        arguments += [f"--aero.C_F={matched.get('aero', {}).get('C_D', 0.0)}"]
+    if variant is VARIANTS["thin"]:
+        modulus, density = _TWICE[pattern]
+        arguments += [f"--material.E={modulus}", f"--material.density={density}"]
+    return arguments
+
+
+def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
+    """Train a splat of a flag from its photographs, unless it is there; how long it took lies beside it."""
+    account = target / "training.json"
+    if (target / "point_cloud.ply").exists():
+        return json.loads(account.read_text()) if account.exists() else {"kept": True}
+    command = [sys.executable, str(ROOT / "tools" / "train.py"), "fit"]
+    command += [f"--config={ROOT}/configs/train/default.yaml", f"--config={BENCH}/train.yaml"]
+    command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
+    command += [f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"]
+    command += [f"--data.init_args.path={dataset / f'pattern{pattern}' / 'train'}"]
+    command += [f"--trainer.default_root_dir={target}", *variant.training]
+    begin = time.perf_counter()
+    with (target.parent / f"{target.name}.log").open("w") as log:
+        subprocess.run(command, check=True, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
+    row: Row = {"seconds": time.perf_counter() - begin, "steps": steps}
+    account.write_text(json.dumps(row))
+    return row
+
+
+def turn_to_reference(splat: Path, cloth: Path, target: Path) -> None:
+    """Write a splat whose Gaussians are turned, the shortest way, to the normals of the reference at rest."""
+    import numpy as np
+    import torch
+
+    from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+    from gaussian_swaying.gaussians.ply import read_ply, write_ply
+    from gaussian_swaying.gaussians.surface import quat_to_rotation, rotation_to_quat, smallest_axis_normal
+
+    cloud = read_ply(splat)
+    with np.load(cloth) as reference:
+        vertices = torch.from_numpy(reference["positions"][0].astype(np.float64))
+        normals = torch.from_numpy(reference["rest_normals"].astype(np.float64))
+    own = smallest_axis_normal(cloud.quats.double(), cloud.scales.double())
+    true = normals[nearest_neighbours(vertices, 1, cloud.means)[1][:, 0]]
+    true = torch.where((own * true).sum(-1, keepdim=True) < 0, -true, true)
+    arc = torch.cat([1 + (own * true).sum(-1, keepdim=True), torch.linalg.cross(own, true)], -1)
+    turned = rotation_to_quat(quat_to_rotation(arc) @ quat_to_rotation(cloud.quats.double()))
+    write_ply(target, replace(cloud, quats=turned.to(cloud.quats), normals=None))
+
+
+def what_failed(told: str) -> str:
+    """The line of a process's last words that names the error."""
+    lines = [line for line in told.strip().splitlines() if line.strip()]
+    named = [line for line in lines if "rror:" in line]
+    return (named or lines or ["no message"])[-1]
+
+
+def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | None, folder: Path) -> Row:
+    """Simulate a row and compare it with the reference."""
+    dataset = Path(options.dataset)
+    reference = dataset / f"pattern{pattern}"
+    output = folder / f"{name}_{pattern}"
+    command = [sys.executable, str(ROOT / "tools" / "sim.py")]
+    command += sim_arguments(pattern, VARIANTS[name], dataset, splat)
+    command += ["--device", options.device, "--output", str(output)]
+    command += [f"--frames={options.frames}"] if options.frames else []
+    command += options.more.split() if options.more else []
+    pictures = len(list((reference / "video" / "frames").glob("*.png")))
+    with_pictures = pictures == 250
+    if not with_pictures:  # they may still be in the making
+        bare = folder / f"surface_{pattern}"
+        bare.mkdir(parents=True, exist_ok=True)
+        if not (bare / "cloth.npz").exists():
+            (bare / "cloth.npz").symlink_to((reference / "cloth.npz").resolve())
+        reference = bare
+        command += ["--recorder.images=false", "--recorder.video=false"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode not in (0, 3) or not (output / "summary.json").exists():
+        return {"failed": what_failed(done.stderr)}
+    summary = json.loads((output / "summary.json").read_text())
+    row: Row = {
+        "status": summary["status"],
+        "reason": summary["reason"],
+        "particles": summary["particles"],
+        "frames": summary["frames"],
+        "substeps": summary["substeps"],
+        "ms_per_frame": 1e3 * sum(summary["wall_s"].get(k, 0.0) for k in ("simulation", "shading", "rendering")),
+        "device_memory_bytes": summary["peak_memory_bytes"]["device"],
+        "torn_particles": summary["torn_particles"],
+        "stretch_max": summary["stretch_max"],
+        "mass_kg": summary["mass_kg"],
+    }
+    row["ms_per_frame"] /= max(summary["frames"], 1)
+    on = "cuda" if summary["peak_memory_bytes"]["device"] is not None else "cpu"  # where it ran
+    frames = options.frames or summary["frames"]
+    found = compare_run(output, reference, frames=frames, points=options.points, device=on)
+    row |= {key: found[key] for key in ("chamfer_share", "sampling_m", "psnr_of_mean_db") if key in found}
+    row["mean"] = found["mean"]
+    row["chamfer_per_frame_m"] = [entry.get("chamfer_m") for entry in found["per_frame"]]
+    (output / "trajectory.npz").unlink(missing_ok=True)  # gigabytes, and the figure needs the pictures alone
+    return row
+
+
+_TIMES = (0.05, 0.2, 0.4, 0.6, 0.95)  # of a figure, as shares of the run
+
+
+def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -> bool:
+    """Reference, ours, PhysGaussian's way and the error of ours at five times; False without pictures of all."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import numpy as np
+    from imageio.v3 import imread
+
+    folders = {"reference": reference / "video" / "frames"}
+    folders |= {name: runs[name] / "frames" for name in ("ours", "particle") if name in runs}
+    files = {name: sorted(folder.glob("*.png")) for name, folder in folders.items()}
+    count = min(map(len, files.values()))
+    if len(files) < 3 or count < 250:
+        return False
+    rows = [*files, "error of ours"]
+    drawn, axes = plt.subplots(len(rows), len(_TIMES), figsize=(12, 12 * len(rows) / len(_TIMES) * 0.62))
+    for column, share in enumerate(_TIMES):
+        frame = round(share * (count - 1))
+        seen = {name: imread(files[name][frame])[..., :3] for name in files}
+        wrong = np.abs(seen["ours"].astype(float) - seen["reference"].astype(float)).mean(-1)
+        for row, name in enumerate(rows):
+            axis = axes[row, column]
+            if name in seen:
+                axis.imshow(seen[name])
+            else:
+                axis.imshow(wrong, cmap="magma", vmin=0, vmax=255)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if column == 0:
+                axis.set_ylabel(VARIANTS["particle"].title if name == "particle" else name)
+            if row == 0:
+                axis.set_title(f"{0.04 * frame:.2f} s")
+    drawn.tight_layout()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    drawn.savefig(target, dpi=110)
+    plt.close(drawn)
+    return True
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py flags``."""
+    command.add_argument("--dataset", required=True, help="folder that tools/datasets/make_flag_dataset.py wrote")
+    command.add_argument("--rows", default=",".join(VARIANTS), help="a list with commas")
+    command.add_argument("--patterns", default="1,2,3", help="a list with commas")
+    command.add_argument("--splats", default="outputs/flags", help="folder of the trained splats; `made` for splats "
+                         "made in code, which no training has blurred")  # fmt: skip
+    command.add_argument("--train_steps", type=int, default=7000, help="images of a training")
+    command.add_argument("--frames", type=int, help="only the first frames")
+    command.add_argument("--points", type=int, default=10_000, help="on the reference's surface")
+    command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
+    command.add_argument("--more", help='further options of tools/sim.py: --more="--frames=25"')
+
+
+def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
+    """Fill ``result["rows"]``, saving it after each run; rows that are there and not asked for are kept."""
+    names = options.rows.split(",")
+    if unknown := set(names) - set(VARIANTS):
+        raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
+    patterns = [int(p) for p in options.patterns.split(",")]
+    for pattern in patterns:
+        if not (Path(options.dataset) / f"pattern{pattern}" / "cloth.npz").exists():
+            raise SystemExit(
+                f"{options.dataset} has no pattern{pattern}/cloth.npz: make it with tools/datasets/make_flag_dataset.py"
+            )
+    result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
+    result["more"] = options.more or ""
+    rows = result.setdefault("rows", {})
+    for pattern in patterns:
+        path = Path(options.dataset) / f"pattern{pattern}" / "uncertainty.json"
+        if path.exists():
+            known = json.loads(path.read_text())["variants"]
+            kept = {name: {k: v for k, v in found.items() if k != "chamfer_per_frame"} for name, found in known.items()}
+            result.setdefault("uncertainty", {})[str(pattern)] = kept
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in names:
+            variant = VARIANTS[name]
+            for pattern in [p for p in patterns if p in variant.patterns]:
+                splat = None
+                row: Row = {}
+                if options.splats != "made":
+                    home = Path(options.splats) / f"pattern{pattern}"
+                    home.mkdir(parents=True, exist_ok=True)
+                    target = home / (name if variant.training else "all_losses")
+                    row["training"] = train(pattern, variant, Path(options.dataset), target, options.train_steps)
+                    splat = target / "point_cloud.ply"
+                    if variant.true_normals:
+                        own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
+                        turn_to_reference(own, Path(options.dataset) / f"pattern{pattern}" / "cloth.npz", splat)
+                elif variant.training or variant.true_normals:
+                    continue  # there is nothing to train, and normals are right
+                row |= run_row(pattern, name, options, splat, Path(scratch))
+                rows.setdefault(name, {})[str(pattern)] = row
+                shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
+                print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)
+                save(result)
+        for pattern in patterns:
+            runs = {n: Path(scratch) / f"{n}_{pattern}" for n in names if (Path(scratch) / f"{n}_{pattern}").is_dir()}
+            target = Path(options.pictures) / f"flags_pattern{pattern}.png"
+            if figure(pattern, Path(options.dataset) / f"pattern{pattern}", runs, target):
+                result.setdefault("figures", {})[str(pattern)] = target.name
+                save(result)

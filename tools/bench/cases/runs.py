@@ -1,0 +1,102 @@
+"""What ``bench.py substep`` and ``bench.py sim`` measure: one elastic substep, and whole runs as a user starts them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bench import record
+from bench.clock import timed
+from bench.problems import CUBE, sheet
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
+
+
+def bench_substep(
+    device: torch.device, particles: int, formulation: str, deterministic: bool = False, mls: bool = False
+) -> dict[str, Any]:
+    """One elastic substep, without wind; the grid of ``updated`` is the whole cube of 100³ nodes."""
+    points = sheet(particles, device)
+    solver = MPMSolver(dx=CUBE.dx, formulation=formulation, deterministic=deterministic, mls=mls)
+    state = solver.init_state(points)
+    if formulation == "updated":
+        state = state.replace(grid=CUBE)
+    with torch.inference_mode():
+        result = timed(lambda: solver.step(state, 1e-4), device, 30)
+    nodes = state.grid.node_count
+    name = formulation + (", MLS" if mls else "") + (", deterministic" if deterministic else "")
+    return {"particles": points.count, "formulation": name, "nodes": nodes} | result
+
+
+def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, Any]:
+    """Run tools/sim.py as a user does, in its own process, and keep its summary."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, str(record.ROOT / "tools" / "sim.py"), *arguments, "--device", device.type]
+        begin = time.perf_counter()
+        subprocess.run([*command, "--output", f"{folder}/out"], check=True, cwd=record.ROOT)
+        wall = time.perf_counter() - begin
+        summary = json.loads((Path(folder) / "out" / "summary.json").read_text())
+    summary.pop("per_frame")
+    named = [Path(a).name if a.endswith(".ply") else a for a in arguments]
+    return {"name": name, "arguments": named, "process_wall_s": wall} | summary
+
+
+def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
+    """PSNR between the splat as it is and the picture of frame 0 of the run, at the size of the config's camera."""
+    parser = build_parser()
+    settings = parser.parse_args(["--config", config, "--scene.ply", ply, "--device", device.type])
+    pipeline, _ = build_pipeline(parser, settings)
+    with torch.inference_mode():
+        state = pipeline.start()
+        moved = pipeline.render(state, 0).color
+        pipeline.shader = None
+        rest = pipeline.scene.rest()
+        camera = pipeline.camera_at(0)
+        plain = pipeline.draw(rest, pipeline.colors(rest, camera), camera).color
+    error = float((moved - plain).square().mean())
+    return float("inf") if error == 0 else -10 * float(torch.log10(torch.tensor(error)))
+
+
+def substep(options: argparse.Namespace) -> None:
+    """Measure one elastic substep."""
+    device, result = record.start(options.device)
+    counts = [20_000, 100_000] if device.type == "cpu" else [20_000, 100_000, 1_000_000]
+    variants: list[dict[str, Any]] = [{"formulation": "total"}, {"formulation": "updated"}]
+    variants += [{"formulation": "updated", "mls": True}]
+    if device.type == "cuda":
+        variants += [{"formulation": name, "deterministic": True} for name in ("total", "updated")]
+    result["substep"] = [bench_substep(device, n, **variant) for n in counts for variant in variants]
+    record.write(Path(options.results), f"substep_{device.type}", result)
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py sim``."""
+    command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
+    command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")
+    command.add_argument("--more", help='further options of tools/sim.py: --more="--frames=25"')
+
+
+def sim(options: argparse.Namespace) -> None:
+    """Measure the main job."""
+    device, result = record.start(options.device)
+    configs = record.ROOT / "configs" / "sim"
+    more = options.more.split() if options.more else []
+    result["runs"] = [run_sim("flag, 75 frames at 480x270", ["--config", str(configs / "flag.yaml"), *more], device)]
+    if options.ply:
+        hanging = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
+        size = (
+            ["--camera.init_args.width", "1920", "--camera.init_args.height", "1080"] if device.type == "cuda" else []
+        )
+        frames = ["--frames", str(options.frames)] if options.frames else []
+        name = f"{Path(options.ply).stem}, {'1920x1080' if size else '960x540'}"
+        result["runs"].append(run_sim(name, [*hanging, *size, *frames, *more], device))
+        result["round_trip_psnr_db"] = round_trip_psnr(hanging[1], options.ply, device)
+    record.write(Path(options.results), f"sim_{device.type}", result)

@@ -1,0 +1,323 @@
+"""What ``bench.py speed`` measures: substeps, batches and frames, with their bytes, memory and error."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench import record
+from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
+from bench.problems import CUBE, block, fewest_bytes, nodes_in_reach, sheet, waves, wind, wind_load
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
+
+Row = dict[str, Any]
+
+CONFIG = record.ROOT / "configs" / "sim" / "flag.yaml"
+DT = 1e-4  # s
+FORMULATIONS = ("total", "updated")
+SECTIONS = ("substep", "sand", "batch", "frame")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is measured on a device.
+
+    Attributes:
+        counts: Particles of the sheets.
+        torch_limit: Most particles for which the torch path is timed beside the Triton one.
+        exact_limit: Most particles for which the error against float64 is measured.
+        sand: Particles of the block of sand.
+        scenes: Flags of the batch.
+        side: Particles along a side of each of them.
+        steps: Substeps of the rollout that is timed, and of the longer one that gives the slope.
+        torch_steps: Substeps of the rollout with the torch path.
+        warm: Rollouts before the first that is timed; on CUDA one compiles and one records graphs.
+        repeats: Rollouts that are timed, and longer ones.
+        copy_bytes: Size of the copy [bytes].
+        frames: Frames before the first that is timed, and timed ones.
+        picture: Its width and height.
+        spacing: Distance between the Gaussians of the flag [m].
+        dx: Its grid spacings [m]; the goals are those of the first.
+    """
+
+    counts: tuple[int, ...]
+    torch_limit: int
+    exact_limit: int
+    sand: int
+    scenes: int
+    copy_bytes: int
+    picture: tuple[int, int]
+    spacing: float
+    dx: tuple[float, ...]
+    side: int = 64
+    steps: tuple[int, int] = (64, 192)
+    torch_steps: int = 8
+    warm: int = 3
+    repeats: tuple[int, int] = (7, 5)
+    frames: tuple[int, int] = (5, 25)
+
+
+PLANS = {
+    "cuda": Plan(
+        counts=(20_000, 100_000, 300_000, 1_000_000, 3_000_000, 10_000_000),
+        torch_limit=1_000_000,
+        exact_limit=1_000_000,
+        sand=1_000_000,
+        scenes=64,
+        copy_bytes=2**30,
+        picture=(1920, 1080),
+        spacing=0.0031,
+        dx=(0.0125, 0.025, 0.00625),
+    ),
+    "cpu": Plan(
+        counts=(5_000, 20_000, 100_000),
+        torch_limit=0,
+        exact_limit=20_000,
+        sand=20_000,
+        scenes=4,
+        copy_bytes=2**28,
+        picture=(480, 270),
+        spacing=0.0125,
+        dx=(0.025, 0.05, 0.0125),
+        warm=1,
+        repeats=(3, 1),
+    ),
+}
+
+
+def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
+    """The plan of a kind of device, with other counts (``"5000,20000"``), or all of it small enough for a test."""
+    plan = PLANS[kind]
+    if quick:
+        plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
+        plan = replace(plan, torch_steps=2, warm=2, repeats=(2, 2), copy_bytes=2**20)
+        plan = replace(plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,))
+    return plan if counts is None else replace(plan, counts=tuple(int(n) for n in counts.split(",")))
+
+
+def _double(state: MPMState) -> MPMState:
+    values = {f.name: getattr(state, f.name) for f in fields(state)}
+    single = {k: v for k, v in values.items() if isinstance(v, Tensor) and v.dtype == torch.float32}
+    return state.replace(**{k: v.double() for k, v in single.items()})
+
+
+def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load: WindForce | None) -> Row:
+    """Largest difference from the same rollout by the torch path in float64.
+
+    Positions relative to the largest displacement since the start, velocities to the largest velocity.
+    """
+    exact = MPMSolver(dx=solver.dx, formulation=solver.formulation, transfer="torch")
+    exact.init_state(solver.points.map(Tensor.double))
+    if load is not None:
+        load = WindForce(load.aero, load.wind, load.normal.double(), load.area.double())
+    true = exact.rollout(_double(start), DT, steps, load)
+    position = (end.position - true.position).abs().amax() / (true.position - start.position).abs().amax()
+    velocity = (end.velocity - true.velocity).abs().amax() / true.velocity.abs().amax()
+    found = {"position": float(position), "velocity": float(velocity)}
+    if not all(math.isfinite(value) for value in found.values()):
+        raise FloatingPointError("the rollout is not finite")
+    return found
+
+
+def bench_rollout(plan: Plan, asked: int, formulation: str, device: torch.device, copy: float, sand: bool) -> Row:
+    """Time, bytes, memory and error of substeps: a sheet in wind, or a block of sand without."""
+    peak = Peak(device)
+    points = (block if sand else sheet)(asked, device)
+    load = None if sand else wind_load(points, wind(0, True, device))
+
+    def start(transfer: str) -> tuple[MPMSolver, MPMState]:
+        solver = MPMSolver(dx=CUBE.dx, formulation=formulation, transfer=transfer)
+        state = solver.init_state(points, waves(points.position))
+        return solver, state.replace(grid=CUBE) if formulation == "updated" else state
+
+    solver, state = start("auto")
+    steps, longer = plan.steps
+    for _ in range(plan.warm):
+        solver.rollout(state, DT, steps, load)
+    peak.start()
+    row: Row = timed(lambda: solver.rollout(state, DT, steps, load), device, plan.repeats[0], 0, 1 / steps)
+    row["memory_bytes"] = peak.read()
+    slow = timed(lambda: solver.rollout(state, DT, longer, load), device, plan.repeats[1], 1)
+    row["graph_ms"] = (slow["median_ms"] - steps * row["median_ms"]) / (longer - steps)
+    row |= {"particles": points.count, "grid_nodes": state.grid.node_count, "substeps": steps}
+    row["path"] = "torch" if solver.fused() is None else "triton"
+    row["nodes"] = nodes_in_reach(points.position, CUBE.dx)
+    row["bytes"] = fewest_bytes(formulation, points.count, row["nodes"], wind=not sand, plastic=sand)
+    row["bytes_per_s"] = row["bytes"] / (1e-3 * row["median_ms"])
+    row["share"] = row["bytes_per_s"] / copy
+    row["share_graph"] = row["bytes"] / (1e-3 * row["graph_ms"]) / copy if row["graph_ms"] > 0 else None
+    row["error"] = row["torch"] = None
+    if asked <= plan.exact_limit:
+        end = solver.rollout(state, DT, steps, load)
+        row["error"] = guarded(lambda: error_of(end, solver, state, steps, load))
+    if asked <= plan.torch_limit:
+        row["torch"] = guarded(lambda: _torch_path(plan, *start("torch"), load, device))
+    return row
+
+
+def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindForce | None, device: torch.device) -> Row:
+    """Time of a substep with ``transfer: torch``."""
+    few = plan.torch_steps
+    return timed(lambda: solver.rollout(state, DT, few, load), device, 3, 2, 1 / few) | {"substeps": few}
+
+
+def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device) -> Row:
+    """Flags in different winds: all in one rollout, against a rollout of each, one after the other."""
+    steps = plan.steps[0]
+    winds = [wind(k, gusts, device) for k in range(plan.scenes)]
+    one = sheet(plan.side**2, device)
+    many = one.map(lambda t: t.expand(plan.scenes, *t.shape).contiguous())
+    results: dict[str, Any] = {}
+
+    def start(points: MaterialPoints) -> tuple[MPMSolver, MPMState]:
+        solver = MPMSolver(dx=2 * 0.9 / plan.side, formulation=formulation)
+        return solver, solver.init_state(points, waves(points.position))
+
+    together, all_at_rest = start(many)
+    load = wind_load(many, winds)
+
+    def batched() -> None:
+        results["together"] = together.rollout(all_at_rest, DT, steps, load).position
+
+    single, at_rest = start(one)
+    patches = wind_load(one, winds[0])
+    loads = [WindForce(patches.aero, w, patches.normal, patches.area) for w in winds]
+
+    def in_turn() -> None:
+        results["apart"] = [single.rollout(at_rest, DT, steps, own).position for own in loads]
+
+    row: Row = {"scenes": plan.scenes, "particles": one.count, "substeps": steps}
+    row["together"] = timed(batched, device, plan.repeats[0], plan.warm)
+    row["apart"] = timed(in_turn, device, plan.repeats[1], 2 if device.type == "cuda" else 1)
+    done = plan.scenes * one.count * steps
+    for name in ("together", "apart"):
+        row[f"{name}_per_s"] = done / (1e-3 * row[name]["median_ms"])
+    row["ratio"] = row["together_per_s"] / row["apart_per_s"]
+    apart = torch.stack(results["apart"])
+    row["difference"] = float((results["together"] - apart).abs().amax() / (apart - one.position).abs().amax())
+    return row
+
+
+def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
+    """Frames of configs/sim/flag.yaml, from the state of one to the picture of the next on the device."""
+    width, height = plan.picture
+    arguments = ["--config", str(CONFIG), "--device", device.type, "--solver.dx", str(dx)]
+    arguments += ["--scene.generator.init_args.spacing", str(plan.spacing)]
+    arguments += ["--camera.init_args.width", str(width), "--camera.init_args.height", str(height)]
+    parser = build_parser()
+    peak = Peak(device)
+    pipeline, _ = build_pipeline(parser, parser.parse_args(arguments))
+    state = pipeline.start()
+    build_memory = peak.read()
+    peak.start()
+    parts: list[list[float]] = []
+    substeps = []
+    for frame in range(1, 1 + sum(plan.frames)):
+        clock = Clock(device)
+        clock.mark()
+        state, health = pipeline.advance(state)
+        clock.mark()
+        camera = pipeline.camera_at(frame)
+        gaussians, colours = pipeline.shade(state, camera)
+        clock.mark()
+        pipeline.draw(gaussians, colours, camera)
+        clock.mark()
+        if frame > plan.frames[0]:
+            parts.append(clock.read())
+            substeps.append(health.substeps)
+    row: Row = spread([sum(part) for part in parts])
+    names = ("simulation_ms", "shading_ms", "rendering_ms")
+    row |= {name: statistics.median(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
+    row |= {"particles": pipeline.solver.points.count, "width": width, "height": height}
+    row |= {"substeps": statistics.median(substeps), "renderer": type(pipeline.renderer).__name__}
+    return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory}
+
+
+@torch.inference_mode()
+def measure(
+    plan: Plan, device: torch.device, result: Row, save: Callable[[Row], None], only: list[str] | None = None
+) -> None:
+    """Fill ``result`` with the wanted sections and save it after each case; ``partial`` is in it until the last.
+
+    Args:
+        plan: How much to measure.
+        device: Where.
+        result: What is known already; sections that are not wanted stay as they are.
+        save: Writes the result.
+        only: Which of ``SECTIONS``; all if None.
+    """
+    begin = time.perf_counter()
+    wanted = [name for name in SECTIONS if only is None or name in only]
+    result |= {"partial": True, "dt_s": DT, "seconds": 0.0} | {name: [] for name in wanted}
+    result["copy"] = copy_bandwidth(plan.copy_bytes, device)
+    clear()
+    copy = result["copy"]["bytes_per_s"]
+    print(f"copy: {copy / 1e9:.1f} GB/s", flush=True)
+    save(result)
+
+    def case(section: str, known: Row, function: Callable[[], Row]) -> None:
+        row = known | guarded(function)
+        result[section].append(row)
+        result["seconds"] = time.perf_counter() - begin
+        save(result)
+        print(f"{result['seconds']:.0f} s, {section}: {json.dumps(row)}", flush=True)
+
+    if "substep" in wanted:
+        for asked in plan.counts:
+            for name in FORMULATIONS:
+                known = {"formulation": name, "asked": asked}
+                case("substep", known, lambda a=asked, f=name: bench_rollout(plan, a, f, device, copy, sand=False))
+    if "sand" in wanted:
+        known = {"formulation": "updated", "asked": plan.sand}
+        case("sand", known, lambda: bench_rollout(plan, plan.sand, "updated", device, copy, sand=True))
+    if "batch" in wanted:
+        for name in FORMULATIONS:
+            for gusts in (False, True):
+                known = {"formulation": name, "gusts": gusts}
+                case("batch", known, lambda f=name, g=gusts: bench_batch(plan, f, g, device))
+    if "frame" in wanted:
+        for dx in plan.dx:
+            case("frame", {"dx_m": dx, "main": dx == plan.dx[0]}, lambda dx=dx: bench_frame(plan, dx, device))
+    del result["partial"]
+    save(result)
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py speed``."""
+    command.add_argument("--counts", help="particles of the sheets, a list with commas")
+    command.add_argument("--only", help=f"of {', '.join(SECTIONS)}: a list with commas")
+    command.add_argument("--quick", action="store_true", help="tiny counts, only to see that it runs")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Measure rollouts of many sizes, sand, batches and frames, with memory and error."""
+    device, result = record.start(options.device)
+    result["kind"], result["threads"], result["quick"] = device.type, torch.get_num_threads(), options.quick
+    folder = Path(options.results)
+    if options.quick and folder.resolve() == record.RESULTS:
+        raise SystemExit("--quick measures nothing worth keeping: give it another folder with --results")
+    name = f"speed_{device.type}"
+    path = folder / f"{name}.json"
+    only = options.only.split(",") if options.only else None
+    if unknown := set(only or []) - set(SECTIONS):
+        raise SystemExit(f"--only takes {', '.join(SECTIONS)}, not {', '.join(sorted(unknown))}")
+    if only and path.exists():
+        kept = json.loads(path.read_text())
+        if kept["device"] == result["device"]:
+            result |= {section: kept[section] for section in SECTIONS if section in kept}
+    plan = plan_for(device.type, options.counts, options.quick)
+    measure(plan, device, result, lambda now: record.write(folder, name, now, quiet=True), only)
+    print(f"wrote {path}")

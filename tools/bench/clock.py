@@ -1,0 +1,113 @@
+"""Time and memory of a call, and what becomes of one that fails."""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+Row = dict[str, Any]
+
+
+class Clock:
+    """Marks in time; on a GPU events, as its stream gets to them."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.marks: list[Any] = []
+        self._wait()
+
+    def _wait(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    def mark(self) -> None:
+        """Set a mark."""
+        if self.device.type == "cuda":
+            event = torch.cuda.Event(enable_timing=True)
+            event.record()
+            self.marks.append(event)
+        else:
+            self.marks.append(time.perf_counter())
+
+    def read(self) -> list[float]:
+        """Milliseconds from mark to mark."""
+        self._wait()
+        pairs = zip(self.marks, self.marks[1:], strict=False)
+        return [a.elapsed_time(b) if self.device.type == "cuda" else 1e3 * (b - a) for a, b in pairs]
+
+
+def spread(samples: list[float], share: float = 1.0) -> dict[str, float]:
+    """Median and quartiles of times [ms], each times ``share``."""
+    low, median, high = statistics.quantiles(samples, n=4) if len(samples) > 1 else samples * 3
+    return {
+        "median_ms": share * median,
+        "quartile_low_ms": share * low,
+        "quartile_high_ms": share * high,
+        "repeats": len(samples),
+    }
+
+
+def timed(
+    function: Callable[[], Any], device: torch.device, repeats: int, warm: int = 3, share: float = 1.0
+) -> dict[str, float]:
+    """Milliseconds of a call after warm-up, times ``share``: median and quartiles; on a GPU between events."""
+    for _ in range(warm):
+        function()
+    samples = []
+    for _ in range(repeats):
+        clock = Clock(device)
+        clock.mark()
+        function()
+        clock.mark()
+        samples += clock.read()
+    return spread(samples, share)
+
+
+def copy_bandwidth(size: int, device: torch.device) -> Row:
+    """Bytes per second of a copy within the memory of the device, read and written."""
+    source = torch.rand(size // 4, device=device)
+    target = torch.empty_like(source)
+    took = timed(lambda: target.copy_(source), device, 20 if device.type == "cuda" else 7)
+    return {"copy_bytes": size, "bytes_per_s": 2 * size / (1e-3 * took["median_ms"])} | took
+
+
+def clear() -> None:
+    """Give back the memory that nothing uses."""
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
+def guarded(function: Callable[[], Row]) -> Row:
+    """What the function gives, or ``failed`` with the reason: one case must not cost the others."""
+    try:
+        return function()
+    except Exception as error:
+        full = isinstance(error, (torch.OutOfMemoryError, MemoryError)) or "can't allocate memory" in str(error)
+        return {"failed": "out of memory" if full else f"{type(error).__name__}: {error}"}
+    finally:
+        clear()
+
+
+class Peak:
+    """Most memory that torch's allocator held since the last start, beyond what it held at first; None on a CPU."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        clear()
+        self.before = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
+        self.start()
+
+    def start(self) -> None:
+        """Forget the peak so far."""
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
+
+    def read(self) -> int | None:
+        """The peak [bytes]."""
+        return torch.cuda.max_memory_allocated(self.device) - self.before if self.device.type == "cuda" else None

@@ -1,0 +1,101 @@
+"""The commands of ``bench.py``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench import pages, record, show
+from bench.cases import accuracy, flags, gallery, gradients, pareto, runs, speed, training
+from bench.slots import SlotError
+
+
+def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Namespace], None]:
+    """A command that adds to what was recorded on the same device."""
+
+    def run(options: argparse.Namespace) -> None:
+        device, result = record.start(options.device)
+        options.device = device.type
+        if name == "gallery":
+            options.preset = options.preset or ("preview" if device.type == "cpu" else None)
+        record.go_on(options, f"{name}_{device.type}", result, measure)
+
+    return run
+
+
+def fill_pages(options: argparse.Namespace) -> None:
+    """Fill the slots of the pages beside the results."""
+    pages.refill(Path(options.results))
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command of ``bench.py``.
+
+    Attributes:
+        help: What it does.
+        run: Does it.
+        add_arguments: Adds its own options.
+        device: Whether it takes ``--device``.
+        page: The page that is filled again after it.
+    """
+
+    help: str
+    run: Callable[[argparse.Namespace], None]
+    add_arguments: Callable[[argparse.ArgumentParser], None] | None = None
+    device: bool = True
+    page: str | None = None
+
+
+COMMANDS = {
+    "substep": Command("Measure one elastic substep.", runs.substep),
+    "speed": Command("Measure rollouts of many sizes, sand, batches and frames, with memory and error.",
+                     speed.run, speed.add_arguments),
+    "sim": Command("Measure the main job.", runs.sim, runs.add_arguments),
+    "accuracy": Command("Measure errors against closed forms and experiments.",
+                        accuracy.run, accuracy.add_arguments, page="validation.md"),
+    "pareto": Command("Measure speed against error over the settings of the solver.",
+                      pareto.run, pareto.add_arguments, page="validation.md"),
+    "gradients": Command("Measure the memory of gradients through long rollouts, and fit a flag.",
+                         gradients.run, device=False, page="validation.md"),
+    "train": Command("Measure trainings: a bare gsplat loop beside Lightning, and what the surface losses buy.",
+                     _going_on("train", training.measure), training.add_arguments),
+    "flags": Command("Train, simulate and compare the flags of the paper with Blender's cloth.",
+                     _going_on("flags", flags.measure), flags.add_arguments),
+    "gallery": Command("Run and picture the paper's scenes.",
+                       _going_on("gallery", gallery.measure), gallery.add_arguments),
+    "pages": Command("Fill the slots of the pages beside the results.", fill_pages, device=False),
+    "pictures": Command("A strip of frames of a finished run.",
+                        show.pictures, show.add_pictures_arguments, device=False),
+    "film": Command("An animated WebP of finished runs side by side.",
+                    show.film, show.add_film_arguments, device=False),
+}  # fmt: skip
+
+
+def build_parser(description: str) -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    for name, command in COMMANDS.items():
+        own = commands.add_parser(name, help=command.help)
+        own.set_defaults(command=command)
+        own.add_argument("--results", default=str(record.RESULTS), help="folder of the recorded JSON")
+        if command.device:
+            own.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+        if command.add_arguments:
+            command.add_arguments(own)
+    return parser
+
+
+def main(description: str, arguments: list[str] | None = None) -> None:
+    """Parse and run one command, then fill the page that shows what it recorded."""
+    options: Any = build_parser(description).parse_args(arguments)
+    try:
+        options.command.run(options)
+        if options.command.page:
+            pages.refill(Path(options.results), options.command.page)
+    except SlotError as error:
+        raise SystemExit(f"error: {error}") from error

@@ -1,0 +1,70 @@
+"""The pages of the documentation that show what was recorded, filled again in place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fnmatch import fnmatch
+from pathlib import Path
+
+from bench import record, slots
+from bench.cases import gallery  # noqa: F401  registers its slots
+from bench.tables import (
+    accuracy,
+    accuracy_plot,
+    flags,
+    goals,
+    gradients,
+    long_flag,
+    pareto,
+    pareto_plot,
+    runs,
+    speed,
+    speed_plot,
+    training,
+)
+
+TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, runs, speed, training)
+"""What registers the slots."""
+
+PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
+    "accuracy_*": accuracy_plot.draw,
+    "pareto_*": pareto_plot.draw,
+    "speed_*": speed_plot.draw,
+}
+"""What draws into the folder of the pictures, from which records."""
+
+
+def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Path, str]:
+    """The pages of a folder that have slots, filled; nothing is written.
+
+    Args:
+        docs: Folder of the pages.
+        records: What was recorded.
+        only: Name of the one page to fill, which may then lack slots; all if None, which may not.
+
+    Raises:
+        SlotError: If a page cannot be filled, or lacks a slot for something that was recorded.
+    """
+    if only is None:
+        for page in sorted({slot.page for slot in slots.SLOTS.values() if slot.page}):
+            if (docs / page).exists():
+                slots.check_complete(page, (docs / page).read_text(), records)
+            elif missing := slots.wanted(page, records):
+                raise slots.SlotError(f"There is no {docs / page}, which has to show the slot `{missing[0]}`.")
+    paths = sorted(docs.glob("*.md")) if only is None else [docs / only]
+    texts = {path: path.read_text() for path in paths}
+    return {path: slots.fill(path.name, text, records) for path, text in texts.items() if slots.used(text)}
+
+
+def refill(results: Path, only: str | None = None) -> None:
+    """Fill the pages beside a folder of results and draw their plots; with ``only``, one page if it is there."""
+    docs = results.parent
+    if only is not None and not (docs / only).exists():
+        return
+    records = record.read(results)
+    for path, text in fill(docs, records, only).items():
+        record.write_whole(path, text)
+        print(f"wrote {path}")
+    for pattern, draw in PLOTS.items():
+        if found := [row for name, row in records.items() if fnmatch(name, pattern)]:
+            draw(found, docs / "pictures")

@@ -1,0 +1,65 @@
+"""The recorded JSON: where a measurement starts, how it is written, and how it is read again."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gaussian_swaying.simulation.pipeline import describe_device, versions
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
+Row = dict[str, Any]
+
+
+def start(device: str) -> tuple[torch.device, Row]:
+    """The device of a name or ``auto``, and the head of a record: device, versions and seed."""
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    found = torch.device(device)
+    return found, {"device": describe_device(found), "versions": versions(), "seed": 0}
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that there is always a whole one, whenever the process is killed."""
+    draft = path.with_name(path.name + ".part")
+    draft.write_text(text)
+    os.replace(draft, path)
+
+
+def write(folder: Path, name: str, result: Row, quiet: bool = False) -> None:
+    """Write a record into the folder of the results, without paths of this machine."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.json"
+    write_whole(path, json.dumps(result, indent=2).replace(str(ROOT) + "/", "") + "\n")
+    if not quiet:
+        print(f"wrote {path}")
+
+
+def read(folder: Path) -> dict[str, Row]:
+    """All records of a folder, by the name of their file without its ending."""
+    return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
+
+
+def kept_rows(folder: Path, name: str, keep: Callable[[Row], bool]) -> list[Row]:
+    """The rows of an earlier record that are to stay; none if there is no such record."""
+    path = folder / f"{name}.json"
+    return [row for row in json.loads(path.read_text())["rows"] if keep(row)] if path.exists() else []
+
+
+def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable[..., None]) -> None:
+    """Add to what was recorded on the same device, and write after each part."""
+    folder = Path(options.results)
+    path = folder / f"{name}.json"
+    if path.exists():
+        kept = json.loads(path.read_text())
+        if kept["device"] == result["device"]:
+            result = kept | result
+    measure(options, result, lambda now: write(folder, name, now, quiet=True))
+    print(f"wrote {path}")

@@ -1,0 +1,49 @@
+"""Pictures of finished runs: ``bench.py pictures`` and ``bench.py film``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from bench import films, record
+
+
+def film(options: argparse.Namespace) -> None:
+    """An animated WebP of finished runs side by side."""
+    start, stop, step = (int(number) for number in options.frames_shown.split(":"))
+    width, height = (int(number) for number in options.size.split("x"))
+    target = record.ROOT / "docs" / "pictures" / f"{options.name}.webp"
+    runs = [Path(run) for run in options.runs.split(",")]
+    films.film(runs, target, range(start, stop, step), (width, height), round(40 * step), options.quality)
+    print(f"wrote {target}, {target.stat().st_size:,} bytes")
+
+
+def pictures(options: argparse.Namespace) -> None:
+    """A strip of frames of a finished run."""
+    import imageio.v3 as iio
+    import numpy as np
+
+    frames = [iio.imread(Path(options.run) / "frames" / f"{int(i):05d}.png") for i in options.frames_shown.split(",")]
+    left, right = (round(float(share) * frames[0].shape[1]) for share in options.columns.split(","))
+    frames = [frame[:, left:right] for frame in frames]
+    target = record.ROOT / "docs" / "pictures" / f"{options.name}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(target, np.concatenate(frames, axis=1))
+    print(f"wrote {target}")
+
+
+def add_pictures_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py pictures``."""
+    command.add_argument("--run", required=True, help="output folder of a run")
+    command.add_argument("--name", required=True, help="name of the picture")
+    command.add_argument("--frames_shown", default="0,20,40,60", help="frame numbers")
+    command.add_argument("--columns", default="0,1", help="part of the width to keep, as shares")
+
+
+def add_film_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py film``."""
+    command.add_argument("--runs", required=True, help="output folders of runs, a list with commas")
+    command.add_argument("--name", default="swaying", help="name of the picture")
+    command.add_argument("--frames_shown", default="0:75:2", help="first frame, the one after the last, step")
+    command.add_argument("--size", default="320x320", help="of each panel [pixels]")
+    command.add_argument("--quality", type=int, default=60, help="0 to 100")

@@ -1,0 +1,269 @@
+"""Tables and findings of ``bench.py accuracy``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from bench.cases.accuracy import SINGLE, VARIANTS
+from bench.slots import table, value
+from bench.tables.accuracy_goals import GATES
+from bench.tables.markdown import grid, stack
+from bench.tables.rows import Row, order, select
+
+PAGE = "validation.md"
+
+
+def _value(value: Any, form: str = ".3g") -> str:
+    return "-" if value is None else f"{value:{form}}" if isinstance(value, (int, float)) else str(value)
+
+
+def rows_table(name: str) -> Callable[[Callable[[list[Row]], list[str]]], Any]:
+    """Register a table of the rows of all records."""
+
+    def register(make: Callable[[list[Row]], list[str]]) -> Any:
+        def of_results(results: list[Row]) -> list[str]:
+            return make([row for result in results for row in result["rows"]])
+
+        table(PAGE, name, "accuracy_*", together=True)(of_results)
+        return make
+
+    return register
+
+
+@table(PAGE, "accuracy.devices", "accuracy_*", together=True)
+def devices(results: list[Row]) -> list[str]:
+    """Which problems were measured where."""
+    return [
+        f"- {', '.join(sorted({row['problem'] for row in result['rows']}))}: {result['device']}; {stack(result)}."
+        for result in results
+    ]
+
+
+@rows_table("accuracy.goals")
+def goals(rows: list[Row]) -> list[str]:
+    """The goals, and what failed to be measured."""
+    found = [(name, wanted, judge(rows)) for name, wanted, judge in GATES]
+    reached = [[name, wanted, one[0], "yes" if one[1] else "**no**"] for name, wanted, one in found if one]
+    lines = grid(["goal", "wanted", "measured", "reached"], reached)
+    failed = [row for row in rows if "failed" in row["result"]]
+    told = [f"- failed: {row['problem']} {row['parameters']}: {row['result']['failed']}" for row in failed]
+    return [*lines, "", *told] if told else lines
+
+
+def _convergence(rows: list[Row], problem: str, columns: dict[str, str], **parameters: Any) -> list[str]:
+    """Error against cells for each variant, with the order of the last halving, and further columns."""
+    shown = []
+    for variant in (*VARIANTS, *SINGLE):
+        found = sorted(select(rows, problem, variant=variant, **parameters), key=lambda r: r["parameters"]["cells"])
+        for k, row in enumerate(found):
+            observed = f"{order(found[k - 1], row):.2f}" if k and row["result"]["error"] > 0 else ""
+            extra = [_value(row["result"].get(name)) for name in columns]
+            shown.append(
+                [f"`{variant}`", str(row["parameters"]["cells"]), f"{row['result']['error']:.2e}", observed, *extra]
+            )
+    return grid(["variant", "cells", "relative error", "order", *columns.values()], shown)
+
+
+_LOSS = {"loss": "amplitude lost per period"}
+_SHIFT = {"end_shift": "the pin seems further out by [cells]"}
+
+CONVERGENCE: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
+    "accuracy.free_bar": ("vibrating bar", _LOSS, {"ends": "free"}),
+    "accuracy.pinned_bar": ("vibrating bar", _LOSS | _SHIFT, {"ends": "fixed-free"}),
+    "accuracy.unconfined_bar": ("unconfined bar", _SHIFT, {}),
+    "accuracy.hanging_bar": ("hanging bar", {}, {"clamp": "mirror"}),
+    "accuracy.hanging_pinned_bar": ("hanging bar", _SHIFT, {"clamp": "pin"}),
+    "accuracy.vortex": ("vortex", {}, {}),
+}
+"""Slots of the tables of convergence: problem, further columns, and parameters."""
+
+for _name, (_problem, _columns, _parameters) in CONVERGENCE.items():
+    rows_table(_name)(lambda rows, p=_problem, c=_columns, q=_parameters: _convergence(rows, p, c, **q))
+
+
+@rows_table("accuracy.free_block")
+def free_block(rows: list[Row]) -> list[str]:
+    """Energy and momenta of the block that nothing holds."""
+    names = {
+        "kept": "energy at the end, of the start",
+        "error": "largest change",
+        "growth": "largest rise of a single state",
+        "linear": "change of linear momentum",
+        "angular": "change of angular momentum",
+        "substeps": "substeps",
+    }
+    return grid(
+        ["variant", *names.values()],
+        [
+            [f"`{row['parameters']['variant']}`", *(_value(row["result"].get(n)) for n in names)]
+            for row in select(rows, "free block")
+        ],
+    )
+
+
+@rows_table("accuracy.hinged_plate")
+def hinged_plate(rows: list[Row]) -> list[str]:
+    """The angle at which a plate hangs in the wind."""
+    return grid(
+        ["variant", "law", "k", "angle [deg]", "exact [deg]", "error [deg]"],
+        [
+            [
+                f"`{row['parameters']['variant']}`",
+                f"`{row['parameters']['law']}`",
+                str(row["parameters"]["k"]),
+                *(f"{row['result'][n]:.2f}" for n in ("angle", "exact", "error")),
+            ]
+            for row in select(rows, "hinged plate")
+        ],
+    )
+
+
+@rows_table("accuracy.surface_drag")
+def surface_drag(rows: list[Row]) -> list[str]:
+    """Drag on surfaces made of Gaussians, as a share of the exact one."""
+    places: dict[tuple[Any, ...], dict[str, str]] = {}
+    for row in select(rows, "surface drag"):
+        p = row["parameters"]
+        place = places.setdefault((p["shape"], p["count"], p["overlap"]), {})
+        place[f"{p['area']}, {p['law']}"] = f"{row['result']['share']:.3f}"
+    names = [f"{area}, {law}" for area in ("coverage", "paper") for law in ("paper", "projected")]
+    header = [
+        "surface",
+        "Gaussians",
+        "overlap",
+        *(f"areas `{n.split(', ')[0]}`, law `{n.split(', ')[1]}`" for n in names),
+    ]
+    return grid(header, [[*map(str, key), *(place.get(n, "-") for n in names)] for key, place in places.items()])
+
+
+@rows_table("accuracy.cantilever")
+def cantilever(rows: list[Row]) -> list[str]:
+    """Drop of a cantilever, and where its error comes from."""
+    names = {
+        "drop": "drop / L",
+        "error": "error of the drop",
+        "shear": "of that, shear",
+        "quadrature": "of that, quadrature",
+        "unexplained": "left over",
+        "shortening_error": "error of the shortening",
+    }
+    return grid(
+        ["variant", "b", "cells through the thickness", *names.values()],
+        [
+            [
+                f"`{row['parameters']['variant']}`",
+                str(row["parameters"]["b"]),
+                str(row["parameters"]["cells"]),
+                *(_value(row["result"].get(n)) for n in names),
+            ]
+            for row in select(rows, "cantilever")
+        ],
+    )
+
+
+def _mobilised(degrees: float) -> float:
+    """Strength of the cone, fitted to an angle in triaxial compression, where one principal stress is the mean."""
+    sine = math.sin(math.radians(degrees))
+    return 6 * sine / (math.sqrt(3) * (3 - sine))
+
+
+@rows_table("accuracy.sand_angles")
+def sand_angles(rows: list[Row]) -> list[str]:
+    """Friction angles of the law of sand, of an element and of a layer."""
+    strength = _mobilised(30.0)
+    exact = {"shear": math.degrees(math.atan(strength)), "plane": math.degrees(math.asin(strength))}
+    shown = []
+    for result in (row["result"] for row in select(rows, "sand element")):
+        shown += [
+            ["simple shear", f"{result['shear_deg']:.1f}", f"{exact['shear']:.1f}"],
+            ["triaxial compression", f"{result['triaxial_deg']:.1f}", "30.0"],
+            ["plane strain", f"{result['plane_strain_deg']:.1f}", f"{exact['plane']:.1f}"],
+        ]
+    for result in (row["result"] for row in select(rows, "sand slope")):
+        angles = [f"{result['friction_deg']:.2f}", f"{result['exact']:.2f}"]
+        shown += [["a layer that slides down an incline, from its acceleration", *angles]]
+        shown += [["a layer on an incline: steepest on which it stands", f"{result['stands']:.0f}", "-"]]
+        shown += [["a layer on an incline: least on which it flows", f"{result['flows']:.0f}", "-"]]
+    return grid(["test, phi = 30 degrees", "angle [deg]", "theory [deg]"], shown)
+
+
+@value("accuracy.plane_strain_angle", "accuracy_*", together=True)
+def plane_strain_angle(results: list[Row]) -> str:
+    """Friction angle of the law in plane strain [degrees]."""
+    row = select([row for result in results for row in result["rows"]], "sand element")[0]
+    return f"{row['result']['plane_strain_deg']:.0f}"
+
+
+@value("accuracy.band", "accuracy_*", together=True)
+def band(results: list[Row]) -> str:
+    """The largest ratio of Lube's and Lajeunesse's run-outs, of the round columns."""
+    rows = select([row for result in results for row in result["rows"]], "sand column", planar=False)
+    pairs = [sorted((row["result"]["lube"], row["result"]["lajeunesse"])) for row in rows]
+    return f"{max(high / low for low, high in pairs):.1f}"
+
+
+@rows_table("accuracy.sand_columns")
+def sand_columns(rows: list[Row]) -> list[str]:
+    """Run-out of columns of sand that collapse."""
+    names = {
+        "runout": "run-out",
+        "lube": "Lube",
+        "lajeunesse": "Lajeunesse",
+        "height": "height / L0",
+        "slope_deg": "slope [deg]",
+        "volume_ratio": "volume after / before",
+        "particles": "particles",
+    }
+    return grid(
+        ["column", "a", "cells", "volume correction", *names.values()],
+        [
+            [
+                "round" if row["parameters"].get("planar") is False else "planar",
+                str(row["parameters"]["aspect"]),
+                str(row["parameters"]["cells"]),
+                "no" if row["parameters"].get("volume_correction") is False else "yes",
+                *(_value(row["result"].get(n)) for n in names),
+            ]
+            for row in select(rows, "sand column")
+        ],
+    )
+
+
+@rows_table("accuracy.sand_exponents")
+def sand_exponents(rows: list[Row]) -> list[str]:
+    """The exponent of the run-out in the aspect ratio, from the finest grid that has all aspects."""
+    lines = []
+    for planar in (True, False):
+        own = [row for row in select(rows, "sand column") if row["parameters"].get("planar", True) == planar]
+        own = [row for row in own if row["parameters"].get("volume_correction", True)]
+        for low, high in ((0.5, 1.0), (1.0, 2.0), (1.0, 3.0)):
+            finest: dict[float, Row] = {}
+            for row in sorted(own, key=lambda r: r["parameters"]["cells"]):
+                finest[row["parameters"]["aspect"]] = row
+            if low in finest and high in finest:
+                values = [finest[a]["result"] for a in (low, high)]
+                found, lube = (math.log(values[1][n] / values[0][n]) / math.log(high / low) for n in ("runout", "lube"))
+                kind = "planar" if planar else "round"
+                lines.append(f"- {kind}, a from {low} to {high}: run-out as a^{found:.2f}; Lube's fit a^{lube:.2f}.")
+    return lines
+
+
+@rows_table("accuracy.soft_flag")
+def soft_flag(rows: list[Row]) -> list[str]:
+    """Whether the softest of the paper's flags stays whole."""
+    return grid(
+        ["dx [m]", "density [kg/m³]", "substeps", "torn", "singular values of F", "seconds"],
+        [
+            [
+                str(row["parameters"]["dx"]),
+                str(row["parameters"]["density"]),
+                f"{row['result']['substeps']:,.0f}",
+                f"{row['result']['torn']:.0f}",
+                f"[{row['result']['stretch_min']:.2f}, {row['result']['stretch_max']:.2f}]",
+                f"{row['result']['wall_s']:.0f}",
+            ]
+            for row in select(rows, "soft flag")
+        ],
+    )

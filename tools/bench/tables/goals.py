@@ -1,0 +1,65 @@
+"""The goals of docs/benchmarks.md: what was wanted, what was measured, and whether it is reached."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench.slots import table
+from bench.tables import speed_goals
+from bench.tables.markdown import gib, grid, yes_no
+
+Row = dict[str, Any]
+Goal = tuple[str, str, bool | None, str, bool | None]
+"""Goal, what was measured, whether it was reached (None: not measured), the stretch goal, and whether that was."""
+
+GOALS = {
+    "flag_cpu": "flag end to end on 2 CPU cores: within 90 s and 2 GB",
+    "substep_cpu": "one elastic substep of 20,000 particles on 2 CPU cores: within 40 ms",
+    "whole": "captured object over 250 frames: no particle lost, singular values of F within [0.5, 2]",
+    "round_trip": "captured object, frame 0 against the splat itself: PSNR of 35 dB",
+    "object_cuda": "captured object, 250 frames at 1920x1080 on one H200, files apart: within 180 s and 2 GiB",
+    "object_cuda_fast": "captured object, 250 frames at 1920x1080 on one H200, files apart: within 6 s",
+}
+
+
+def _goal(name: str, measured: str, reached: bool, stretch: str = "-", stretched: bool | None = None) -> Goal:
+    return GOALS[name], measured, reached, stretch, stretched
+
+
+def of_runs(result: Row) -> list[Goal]:
+    """Goals of a substep and of whole runs."""
+    rows = []
+    on_cpu = "CPU" in result["device"]
+    for row in result.get("substep", []):
+        if on_cpu and row["particles"] < 21_000:
+            measured = f"{row['median_ms']:.1f} ms (`{row['formulation']}`)"
+            rows.append(_goal("substep_cpu", measured, row["median_ms"] <= 40))
+    for run in result.get("runs", []):
+        wall, memory = run["wall_s"], run["peak_memory_bytes"]
+        if on_cpu and run["name"].startswith("flag"):
+            took, used = run["process_wall_s"], memory["host"] / 1e9
+            rows.append(_goal("flag_cpu", f"{took:.1f} s, {used:.2f} GB", took <= 90 and used <= 2))
+        if not on_cpu and "1920x1080" in run["name"]:
+            took = wall["simulation"] + wall["shading"] + wall["rendering"]
+            reached = run["frames"] >= 250 and took <= 180 and memory["device"] <= 2 * 2**30
+            rows.append(_goal("object_cuda", f"{took:.1f} s, {gib(memory['device'])} GiB", reached))
+            whole = run["frames"] >= 250
+            fast, faster = (whole and took <= limit for limit in (6, 3))
+            rows.append(_goal("object_cuda_fast", f"{took:.1f} s", fast, "3 s", faster))
+        if run["frames"] >= 250:
+            whole = run["lost_particles"] == 0 and run["stretch_min"] >= 0.5 and run["stretch_max"] <= 2
+            measured = f"[{run['stretch_min']:.2f}, {run['stretch_max']:.2f}], {run['lost_particles']} lost"
+            rows.append(_goal("whole", f"{measured} ({'CPU' if on_cpu else 'GPU'})", whole))
+    if "round_trip_psnr_db" in result:
+        value = result["round_trip_psnr_db"]
+        rows.append(_goal("round_trip", f"{value:.1f} dB ({'CPU' if on_cpu else 'GPU'})", value >= 35))
+    return rows
+
+
+@table("benchmarks.md", "goals.table", "s*_*", together=True)
+def goals(results: list[Row]) -> list[str]:
+    """The goals of all recorded runs."""
+    found = [goal for result in results if "copy" not in result for goal in of_runs(result)]
+    found += [goal for result in results if "copy" in result for goal in speed_goals.goals(result)]
+    rows = [[goal, measured, yes_no(one), stretch, yes_no(two)] for goal, measured, one, stretch, two in found]
+    return grid(["goal", "measured", "reached", "stretch goal", "reached"], rows)

@@ -1,0 +1,57 @@
+"""Table and findings of the long flag, which a slow test of tests/validation/test_hard_cases.py records."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from bench.slots import table, value
+from bench.tables.markdown import grid, stack
+
+Row = dict[str, Any]
+
+
+@table("validation.md", "long_flag.minutes", "long_flag")
+def minutes(found: Row) -> list[str]:
+    """Energies of each minute, with and without damping."""
+    head = ["damping [1/s]", "mechanical energy of each minute [J]", "kinetic energy of the particles [J]"]
+    head += ["largest stretch", "torn", "lost", "substeps", "seconds"]
+    rows = [
+        [
+            str(run["damping_per_s"]),
+            *(
+                ", ".join(f"{energy:.3g}" for energy in run["energy_per_minute_J"][name])
+                for name in ("mechanical", "kinetic_of_particles")
+            ),
+            f"{run['largest_stretch']:.2f}",
+            str(run["torn"]),
+            str(run["lost"]),
+            f"{run['substeps']:,}",
+            f"{run['wall_s']:.0f}",
+        ]
+        for run in found.values()
+    ]
+    first = next(iter(found.values()))
+    return [f"{first['device']}; {stack(first)}.", "", *grid(head, rows)]
+
+
+@value("long_flag.growth", "long_flag")
+def growth(found: Row, run: str) -> str:
+    """Growth of the mechanical energy in a minute, from a straight line through the logarithms."""
+    logarithms = [math.log(energy) for energy in found[run]["energy_per_minute_J"]["mechanical"]]
+    middle, mean = (len(logarithms) - 1) / 2, sum(logarithms) / len(logarithms)
+    slope = sum((k - middle) * (y - mean) for k, y in enumerate(logarithms))
+    slope /= sum((k - middle) ** 2 for k in range(len(logarithms)))
+    return f"{100 * math.expm1(slope):.1f} %"
+
+
+@value("long_flag.damping", "long_flag")
+def damping(found: Row, run: str) -> str:
+    """The damping of a run."""
+    return f"{found[run]['damping_per_s']:g} 1/s"
+
+
+@value("long_flag.kinetic", "long_flag")
+def kinetic(found: Row, run: str, minute: str) -> str:
+    """Mean kinetic energy of the particles in a minute, counted from 1."""
+    return f"{found[run]['energy_per_minute_J']['kinetic_of_particles'][int(minute) - 1]:.3g} J"

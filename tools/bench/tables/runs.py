@@ -1,0 +1,56 @@
+"""Tables of ``bench.py substep`` and ``bench.py sim``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench.slots import table
+from bench.tables.markdown import gib, grid, source
+
+Row = dict[str, Any]
+PAGE = "benchmarks.md"
+
+
+@table(PAGE, "runs.substep", "substep_*")
+def substep(result: Row) -> list[str]:
+    """Time of one elastic substep."""
+    head = ["elastic substep, sheet, no wind", "grid nodes", "median [ms]", "quartiles [ms]"]
+    rows = [
+        [
+            f"`{row['formulation']}`, {row['particles']:,} particles",
+            f"{row['nodes']:,}",
+            f"{row['median_ms']:.2f}",
+            f"{row['quartile_low_ms']:.2f} to {row['quartile_high_ms']:.2f}",
+        ]
+        for row in result["substep"]
+    ]
+    return [source(result), "", *grid(head, rows)]
+
+
+@table(PAGE, "runs.whole", "sim_*")
+def whole(result: Row) -> list[str]:
+    """Time and memory of whole runs, and whether they stayed whole."""
+    parts = ("simulation", "shading", "rendering", "writing")
+    head = ["run", "particles", "frames", "substeps", *(f"{part} [s]" for part in parts)]
+    head += ["process [s]", "host memory [GiB]", "device memory [GiB]"]
+    rows = [
+        [
+            run["name"],
+            f"{run['particles']:,}",
+            str(run["frames"]),
+            f"{run['substeps']:,}",
+            *(f"{run['wall_s'][part]:.1f}" for part in parts),
+            f"{run['process_wall_s']:.1f}",
+            *(gib(run["peak_memory_bytes"][where]) for where in ("host", "device")),
+        ]
+        for run in result["runs"]
+    ]
+    told = [
+        f"- {run['name']}: {run['lost_particles']} particles lost, singular values of F in "
+        f"[{run['stretch_min']:.2f}, {run['stretch_max']:.2f}], largest CFL number {run['largest_cfl']:.2f}, "
+        f"largest mean displacement {run['displacement_mean_max_m']:.3f} m."
+        for run in result["runs"]
+    ]
+    if "round_trip_psnr_db" in result:
+        told.append(f"- PSNR of frame 0 against the splat as it was captured: {result['round_trip_psnr_db']:.1f} dB.")
+    return [source(result), "", *grid(head, rows), "", *told]

@@ -1,0 +1,118 @@
+"""Tables and findings of ``bench.py train``."""
+
+from __future__ import annotations
+
+import statistics
+from typing import Any
+
+from bench.cases.training import FLAG_ROWS, FOX_VARIANTS
+from bench.slots import table, value
+from bench.tables.markdown import gib, grid, source, yes_no
+
+Row = dict[str, Any]
+PAGE = "training.md"
+
+
+def _median(rows: list[Row], key: str) -> float:
+    return statistics.median(row[key] for row in rows)
+
+
+def goals(result: Row) -> list[tuple[str, str, bool]]:
+    """What was to be reached, what was measured, and whether it is."""
+    found: list[tuple[str, str, bool]] = []
+    pair = result.get("pair", {})
+    if pair.get("bare") and pair.get("lightning"):
+        bare, ours = (_median(pair[name], "psnr_db") for name in ("bare", "lightning"))
+        ratio = _median(pair["lightning"], "seconds") / _median(pair["bare"], "seconds")
+        memory = max(row["memory_bytes"] for row in pair["lightning"]) / 2**30
+        found += [
+            ("capture: test PSNR within 0.1 dB of the bare loop", f"{ours - bare:+.2f} dB", ours >= bare - 0.1),
+            ("capture: at most 1.10 times the time of the bare loop", f"{ratio:.2f} times", ratio <= 1.1),
+            ("capture: GPU memory within 1 GiB", f"{memory:.2f} GiB", memory <= 1.0),
+        ]
+        variants = {n: row["psnr_db"] for n, row in result.get("variants", {}).items() if "failed" not in row}
+        if variants:
+            name = max(variants, key=lambda n: variants[n])
+            better = f"{variants[name] - bare:+.2f} dB ({FOX_VARIANTS[name][0]})"
+            found.append(("capture: beat the bare loop's PSNR", better, variants[name] > bare))
+    row = result.get("flag", {}).get("flag:settled", result.get("flag", {}).get("flag:size"))
+    if row and "failed" not in row:
+        found += [
+            (
+                f"flag, all losses: {row['steps']:,} images within 300 s",
+                f"{row['seconds']:.0f} s ({row.get('runs_per_device', 1)} on the device)",
+                row["seconds"] <= 300,
+            ),
+            ("flag, all losses: PSNR of 35 dB", f"{row['psnr_db']:.1f} dB", row["psnr_db"] >= 35),
+            (
+                "flag, all losses: median angle between patch and true normal within 5°",
+                f"{row['angle_median_deg']:.1f}°",
+                row["angle_median_deg"] <= 5,
+            ),
+        ]
+    return found
+
+
+@table(PAGE, "training.goals", "train_*")
+def goal_table(result: Row) -> list[str]:
+    """Where it was measured, and the goals."""
+    rows = [[goal, measured, yes_no(reached)] for goal, measured, reached in goals(result)]
+    return [source(result), "", *grid(["goal", "measured", "reached"], rows)]
+
+
+@table(PAGE, "training.capture", "train_*")
+def capture(result: Row) -> list[str]:
+    """The bare loop, Lightning, and what was tried beside them."""
+    rows = [
+        (f"{name}, run {k + 1}", row) for name, rows in result.get("pair", {}).items() for k, row in enumerate(rows)
+    ]
+    rows += [(FOX_VARIANTS[name][0], row) for name, row in result.get("variants", {}).items()]
+    shown = []
+    for name, row in rows:
+        if "failed" in row:
+            shown.append([name, "failed", *[""] * 5])
+            continue
+        quality = [f"{row['psnr_db']:.2f}", f"{row['ssim']:.3f}", f"{row['gaussians']:,}", f"{row['seconds']:.1f}"]
+        shown.append([name, *quality, gib(row["memory_bytes"]), str(row.get("runs_per_device", 1))])
+    return grid(["run", "PSNR [dB]", "SSIM", "Gaussians", "seconds", "GPU memory [GiB]", "at once"], shown)
+
+
+@value("training.spread", "train_*")
+def spread(result: Row, name: str) -> str:
+    """How far the runs of one side differ."""
+    values = [row["psnr_db"] for row in result["pair"][name]]
+    return f"{max(values) - min(values):.2f} dB"
+
+
+@table(PAGE, "training.gains", "train_*")
+def gains(result: Row) -> list[str]:
+    """The variants in the order of what they gain over the mean of the bare loop's runs."""
+    bare = [row["psnr_db"] for row in result.get("pair", {}).get("bare", [])]
+    found = {
+        FOX_VARIANTS[name][0]: row["psnr_db"] - statistics.mean(bare)
+        for name, row in result.get("variants", {}).items()
+        if bare and "failed" not in row
+    }
+    return [f"- {found[name]:+.2f} dB {name}" for name in sorted(found, key=lambda name: -found[name])]
+
+
+@table(PAGE, "training.flag", "train_*")
+def flag(result: Row) -> list[str]:
+    """What each of the surface losses does to a flag whose surface is known."""
+    found = {name.removeprefix("flag:"): row for name, row in result.get("flag", {}).items() if "failed" not in row}
+    head = ["losses", "round", "decided", "small", "angle to true normal: median, 90 % [°]"]
+    head += ["distance: median, 90 % [mm]", "area `paper`", "area `coverage`", "PSNR [dB]", "Gaussians", "seconds"]
+    rows = [
+        [
+            title,
+            *(f"{100 * row[share]:.1f} %" for share in ("round_share", "decided_share", "small_share")),
+            f"{row['angle_median_deg']:.1f}, {row['angle_p90_deg']:.1f}",
+            f"{1e3 * row['distance_median_m']:.2f}, {1e3 * row['distance_p90_m']:.2f}",
+            *(f"{row[name]:.2f}" for name in ("area_paper_ratio", "area_coverage_ratio", "psnr_db")),
+            f"{row['gaussians']:,}",
+            f"{row['seconds']:.0f}",
+        ]
+        for name, (title, _) in FLAG_ROWS.items()
+        if (row := found.get(name)) is not None
+    ]
+    return grid(head, rows)

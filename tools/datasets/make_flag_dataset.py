@@ -1,0 +1,365 @@
+"""Make the flag benchmark: the motion of three flags by Blender's cloth solver, photographs of them, and a video.
+
+``python tools/datasets/make_flag_dataset.py --preview``      all three, small, in two minutes on two cores
+``python tools/datasets/make_flag_dataset.py --pattern 2``    one, at full size
+``python tools/datasets/make_flag_dataset.py --check``        measures how Blender's settings relate to SI units
+``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from the same flag solved otherwise
+
+Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
+
+For each pattern the folder ``pattern1`` to ``pattern3`` holds ``cloth.npz`` (the motion, see ``flag_reference.py``),
+``mesh.ply`` and ``truth.npz`` (the rest shape with its normals), ``train/`` (photographs of the rest shape from all
+around, with ``transforms.json``) and ``video/`` (``frames/``, ``camera.json``, ``reference.mp4``). The same settings
+give the same files. What is there is not made again, so an interrupted run is continued by the same command; where
+settings changed, the run stops and names them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import flag_reference as reference
+import numpy as np
+from blender_checks import check_relations
+from blender_cloth import require_bpy
+from blender_images import TRANSFERS, Studio
+from flag_reference import PATTERNS, FlagPattern, check_settings, write_json, write_whole
+
+PARTS = ("cloth", "train", "video")
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """How the pictures are taken.
+
+    Attributes:
+        size: Width and height of the video [pixels].
+        samples: Light paths per pixel.
+        views: Number of photographs of the rest shape.
+        view_size: Their width and height [pixels].
+        transfer: ``linear``, pixel values proportional to light, which the paper's shading law assumes, or ``srgb``.
+        every: Render every how many-th frame of the video.
+        threads: Threads to render with; 0 for all.
+    """
+
+    size: tuple[int, int] = (1920, 1080)
+    samples: int = 16
+    views: int = 200
+    view_size: int = 400
+    transfer: str = "linear"
+    every: int = 1
+    threads: int = 0
+
+
+PREVIEW = Pictures(size=(320, 180), samples=4, views=24, view_size=128, every=10)
+
+
+def claim(folder: Path, settings: dict[str, Any]) -> None:
+    """Make a folder and note the settings of what goes there.
+
+    Raises:
+        ValueError: If the folder was made with others; the message names them.
+    """
+    path = folder / "settings.json"
+    if path.exists():
+        check_settings(folder, json.loads(path.read_text(encoding="utf-8")), settings)
+    else:
+        write_json(path, settings)
+
+
+def picture_settings(pattern: FlagPattern, texture: np.ndarray, pictures: Pictures) -> dict[str, Any]:
+    """What all pictures of a flag depend on; those of its motion depend on that as well."""
+    shape = {name: getattr(pattern, name) for name in ("width", "height", "yaw", "ripple")}
+    digest = hashlib.sha256(np.ascontiguousarray(texture).tobytes()).hexdigest()[:16]
+    return shape | {"texture": digest, "samples": pictures.samples, "transfer": pictures.transfer}
+
+
+def missing_pictures(folder: Path, names: list[str]) -> list[str]:
+    """Those of the pictures that are not there yet, in the same order."""
+    return [name for name in names if not (folder / name).is_file()]
+
+
+def make_truth(pattern: FlagPattern, folder: Path) -> None:
+    """Write the rest shape as ``truth.npz`` and ``mesh.ply``."""
+    from plyfile import PlyData, PlyElement
+
+    truth = pattern.truth()
+    fields = ("x", "y", "z", "nx", "ny", "nz", "s", "t")
+    rows = np.zeros(len(truth["vertices"]), dtype=[(name, "<f4") for name in fields])
+    columns = np.concatenate([truth["vertices"], truth["normals"], truth["uv"]], axis=1)
+    for index, name in enumerate(fields):
+        rows[name] = columns[:, index]
+    triangles = np.zeros(len(truth["faces"]), dtype=[("vertex_indices", "<i4", (3,))])
+    triangles["vertex_indices"] = truth["faces"]
+    ply = PlyData([PlyElement.describe(rows, "vertex"), PlyElement.describe(triangles, "face")], byte_order="<")
+
+    def write_npz(partial: Path) -> None:
+        with partial.open("wb") as file:
+            np.savez_compressed(file, area=np.float64(pattern.width * pattern.height), **truth)  # type: ignore[arg-type]
+
+    write_whole(folder / "truth.npz", write_npz)
+    write_whole(folder / "mesh.ply", lambda partial: ply.write(str(partial)))
+
+
+def make_train(pattern: FlagPattern, folder: Path, pictures: Pictures, report: Report) -> int:
+    """Photograph the rest shape from all around.
+
+    There is a lamp on either side: with the video's alone every view from behind would be black.
+
+    Returns:
+        Number of pictures made.
+    """
+    texture = reference.draw_texture(pattern)
+    claim(folder, picture_settings(pattern, texture, pictures) | {"views": pictures.views, "size": pictures.view_size})
+    views = reference.sphere_views(pattern, pictures.views, pictures.view_size)
+    names = [f"images/{index:04d}.png" for index in range(len(views))]
+    (folder / "images").mkdir(exist_ok=True)
+    wanted = missing_pictures(folder, names)
+    if wanted:
+        lamps = np.stack([reference.lamp_position(pattern, side) for side in (1, -1)])
+        studio = _studio(pattern, texture, lamps, pictures, transparent=True)
+        studio.move(pattern.rest(pattern.grid().uv())[0])
+        for done, name in enumerate(wanted, 1):
+            studio.photograph(views[names.index(name)], folder / name)
+            report(f"view {done}/{len(wanted)}")
+    write_json(folder / "transforms.json", reference.transforms_fields(views, names))
+    return len(wanted)
+
+
+def make_video(pattern: FlagPattern, cloth: Path, folder: Path, pictures: Pictures, report: Report) -> int:
+    """Photograph the motion from one camera along the initial normal, with one lamp behind it.
+
+    Every tenth frame is made first. The video itself is written once all frames are there, if imageio is.
+
+    Returns:
+        Number of pictures made.
+    """
+    motion = reference.read_cloth(cloth)
+    texture = reference.draw_texture(pattern)
+    width, height = pictures.size
+    settings = picture_settings(pattern, texture, pictures) | {"size": [width, height]}
+    claim(folder, settings | {"cloth": reference.settings_hash(motion.settings)})
+    view = reference.reference_view(pattern, motion.positions, width, height)
+    lamp = reference.lamp_position(pattern)
+    (folder / "frames").mkdir(exist_ok=True)
+    fields = reference.transforms_fields([view], ["frames/0000.png"])
+    light = {"position": lamp.tolist(), "direction": pattern.normal().tolist(), "size": _lamp_size(pattern)}
+    write_json(folder / "camera.json", fields | {"fps": pattern.fps, "light": light})
+    count = len(motion.positions)
+    names = {f"frames/{frame:04d}.png": frame for frame in reference.frame_order(count) if frame % pictures.every == 0}
+    wanted = missing_pictures(folder, list(names))
+    if wanted:
+        studio = _studio(pattern, texture, lamp[None], pictures, transparent=False)
+        for done, name in enumerate(wanted, 1):
+            studio.move(motion.positions[names[name]])
+            studio.photograph(view, folder / name)
+            report(f"frame {done}/{len(wanted)}")
+    whole = pictures.every == 1
+    if whole and (wanted or not (folder / "reference.mp4").exists()):
+        write_film(folder / "reference.mp4", [folder / name for name in sorted(names)], pattern.fps)
+    return len(wanted)
+
+
+def write_film(path: Path, frames: list[Path], fps: int) -> bool:
+    """Join pictures to an mp4; returns False, and writes nothing, where imageio is not there."""
+    try:
+        import imageio.v2 as imageio
+        import imageio_ffmpeg  # noqa: F401
+    except ImportError:
+        return False
+    partial = path.with_name(f".partial-{path.name}")
+    with imageio.get_writer(partial, format="FFMPEG", fps=fps, quality=9, macro_block_size=1) as writer:
+        for frame in frames:
+            writer.append_data(imageio.imread(frame))
+    partial.replace(path)
+    return True
+
+
+def make_uncertainty(
+    pattern: FlagPattern, folder: Path, names: list[str], report: Report, every: int = 5, along: int = 80
+) -> dict[str, Any]:
+    """Solve a flag otherwise and compare.
+
+    Args:
+        pattern: The flag; its own motion is ``cloth.npz``, solved if it is not there.
+        folder: Of the pattern. Motions go to ``uncertainty/``.
+        names: Keys of :func:`flag_reference.variants`.
+        report: Called with a line of progress.
+        every: Compare every how many-th frame.
+        along: Points compared along the longer side.
+
+    Returns:
+        What is written to ``uncertainty.json``: for each variant the fields of :func:`flag_reference.difference`.
+    """
+    own = folder / "cloth.npz"
+    reference.solve_pattern(pattern, own, _every_25th(report, "cloth", pattern.frames))
+    result: dict[str, Any] = {
+        "settings": pattern.cloth_settings(),
+        "hash": reference.settings_hash(pattern.cloth_settings()),
+        "unit": "shares of the longer side; mean over frames; Chamfer distance is half the sum of both mean distances",
+        "variants": {},
+    }
+    for name, variant in reference.variants(pattern, names).items():
+        path = folder / "uncertainty" / f"{name.replace(' ', '_')}.npz"
+        reference.solve_pattern(variant, path, _every_25th(report, name, pattern.frames))
+        numbers = reference.difference(pattern, reference.read_cloth(own), reference.read_cloth(path), every, along)
+        result["variants"][name] = {"cells": variant.cells, "quality": variant.quality, **numbers}
+    write_json(folder / "uncertainty.json", result)
+    return result
+
+
+def _every_25th(report: Report, what: str, frames: int) -> Callable[[int], None]:
+    def frame_done(frame: int) -> None:
+        if frame % 25 == 0:
+            report(f"{what}, frame {frame}/{frames}")
+
+    return frame_done
+
+
+def _lamp_size(pattern: FlagPattern) -> float:
+    return 0.5 * pattern.longer_side
+
+
+def _studio(
+    pattern: FlagPattern, texture: np.ndarray, lamps: np.ndarray, pictures: Pictures, transparent: bool
+) -> Studio:
+    grid = pattern.grid()
+    return Studio(
+        grid.faces(),
+        grid.uv(),
+        texture,
+        lamps,
+        pattern.center(),
+        _lamp_size(pattern),
+        pictures.samples,
+        transparent,
+        pictures.transfer,
+        pictures.threads,
+    )
+
+
+# ---- command line
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("outputs/flags"), help="folder to write (default: %(default)s)")
+    add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), default=sorted(PATTERNS), help="which flags")
+    add("--only", nargs="+", choices=PARTS, default=list(PARTS), help="which parts")
+    add("--preview", action="store_true", help="coarse mesh, small pictures, every tenth frame")
+    add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140)")
+    add("--quality", type=int, help="steps of the solver a frame, a power of two (what the mesh needs)")
+    add("--frames", type=int, help="number of frames, of which the first is the rest shape (250)")
+    add("--flag-size", type=float, nargs=2, metavar=("WIDTH", "HEIGHT"), help="sides of the flag [m]")
+    add("--texture", help="white, stripes, or the path of an image")
+    add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (0.8 in pattern 2, else 1.28)")
+    add("--damping", type=float, help="rate at which every velocity decays [1/s] (2, 1, 1)")
+    add("--self-collision", action="store_true", default=None, help="keep the cloth away from itself")
+    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of the video [pixels] (1920x1080)")
+    add("--samples", type=int, help="light paths per pixel (16)")
+    add("--views", type=int, help="number of photographs of the rest shape (200)")
+    add("--view-size", type=int, help="their width and height [pixels] (400)")
+    add("--transfer", choices=TRANSFERS, help="linear: pixel values proportional to light; srgb: as cameras (linear)")
+    add("--every", type=int, help="render every how many-th frame (1)")
+    add("--threads", type=int, help="threads to render with; 0 for all (0)")
+    add("--check", action="store_true", help="measure the relations between Blender's settings and SI units")
+    add("--uncertainty", action="store_true", help="solve the flags otherwise, and compare")
+    add("--variants", nargs="+", choices=sorted(reference.VARIANTS), default=list(reference.VARIANTS), help="how")
+    add("--json", type=Path, help="where --check writes what it measured (default: check.json in --out)")
+    return parser.parse_args(argv)
+
+
+def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
+    """The pattern that the command line asks for.
+
+    Raises:
+        ValueError: If an option is out of range.
+    """
+    names = ("frames", "texture", "drag", "damping", "self_collision", "cells")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if options.flag_size:
+        given["width"], given["height"] = options.flag_size
+    pattern = PATTERNS[number]
+    if options.preview:
+        given = {"cells": pattern.cells // 4} | given
+    pattern = replace(pattern, **given)
+    return replace(pattern, quality=options.quality or reference.least_quality(pattern))
+
+
+def pictures_of(options: argparse.Namespace) -> Pictures:
+    """The pictures that the command line asks for.
+
+    Raises:
+        ValueError: If an option is out of range.
+    """
+    base = PREVIEW if options.preview else Pictures()
+    given = {name: getattr(options, name) for name in asdict(base) if getattr(options, name) is not None}
+    for name, value in given.items():
+        least = 0 if name == "threads" else 1
+        if isinstance(value, int) and value < least:
+            raise ValueError(f"Expected `{name}` to be at least {least}, but got {value}.")
+    return replace(base, **given)
+
+
+def make(number: int, options: argparse.Namespace) -> None:
+    """Make what is missing of one pattern."""
+    pattern, pictures = flag_of(number, options), pictures_of(options)
+    folder = options.out / f"pattern{number}"
+
+    def report(line: str) -> None:
+        print(f"pattern {number}: {line}", flush=True)
+
+    if options.uncertainty:
+        found = make_uncertainty(pattern, folder, options.variants, report)
+        for name, row in found["variants"].items():
+            report(f"{name}: Chamfer distance {100 * row['chamfer']:.2f} % of the longer side")
+        return
+    started = time.time()
+    if "cloth" in options.only:
+        reference.solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames))
+        make_truth(pattern, folder)
+    if "train" in options.only:
+        make_train(pattern, folder / "train", pictures, report)
+    if "video" in options.only:
+        make_video(pattern, folder / "cloth.npz", folder / "video", pictures, report)
+    report(f"done in {time.time() - started:.0f} s: {folder}")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = parse(argv)
+    try:
+        require_bpy()
+        if options.check:
+            path = options.json or options.out / "check.json"
+            rows = check_relations()
+            write_json(path, rows)
+            for row in rows["checks"]:
+                print(f"{row['name']}: {row['measured']:.4g} {row['unit']}, {row['ratio']:.4f} of what was expected")
+            return 0
+        for number in options.pattern:
+            make(number, options)
+    except (ImportError, ValueError, ArithmeticError) as error:
+        print(f"make_flag_dataset.py: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    return int(width), int(height)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
