@@ -13,7 +13,7 @@ import torch
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.mpm.forces import Force, FunctionForce, Twin, as_forces, divide
+from gaussian_swaying.mpm.forces import Force, ForceTwin, FunctionForce, as_forces, divide
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -204,7 +204,7 @@ def test_the_first_force_with_a_twin_is_fused():
     with pytest.raises(NotImplementedError, match="Spring has no Triton twin"):
         spring.twin()
     pytest.importorskip("triton")
-    assert isinstance(wind.twin(), Twin)
+    assert isinstance(wind.twin(), ForceTwin)
 
 
 # ---- wind that depends on the place
@@ -294,7 +294,7 @@ def test_example_prints_what_the_page_shows(example, output, capsys):
 def test_mpm_imports_nothing_that_is_built_on_it():
     """Of the package only itself, regions, and what lies below all of it."""
     allowed = ("gaussian_swaying.mpm", "gaussian_swaying._", "gaussian_swaying.gaussians.selection")
-    modules = sorted((ROOT / "gaussian_swaying" / "mpm").glob("*.py"))
+    modules = sorted((ROOT / "gaussian_swaying" / "mpm").rglob("*.py"))
     assert len(modules) > 15
     for path in modules:
         for node in ast.walk(ast.parse(path.read_text())):

@@ -28,7 +28,7 @@ from gaussian_swaying.mpm.boundary import (
     SequentialRelease,
     VelocityBox,
 )
-from gaussian_swaying.mpm.forces import Force, Twin
+from gaussian_swaying.mpm.forces import Force, ForceTwin
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
 from gaussian_swaying.mpm.laws.foam import Foam
@@ -662,7 +662,7 @@ class _Toward(Force):
         return force - self.share[..., 1:] * state.velocity, self.share[..., 1]
 
     def twin(self):
-        return Twin(
+        return ForceTwin(
             function=_toward,
             options=(self.resists,),
             implicit=self.resists,
