@@ -12,7 +12,7 @@ from gaussian_swaying._graphs import fingerprint, record
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.gaussians.surface import deform_patch
-from gaussian_swaying.mpm.forces import MOST_STEPS, Force, Given, Twin
+from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
 from gaussian_swaying.mpm.state import MPMState
 
 Wind = WindField | SpatialWind
@@ -196,14 +196,14 @@ class WindForce(Force):
         """Whether the kernels can compute it: where the wind is uniform."""
         return self.uniform
 
-    def twin(self) -> Twin:
+    def twin(self) -> ForceTwin:
         """See ``Force.twin``; of a uniform wind."""
         from gaussian_swaying.aero.force_triton import wind_force
 
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
         half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
-        return Twin(
+        return ForceTwin(
             function=wind_force,
             options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
             implicit=implicit,

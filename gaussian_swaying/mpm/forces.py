@@ -14,10 +14,10 @@ from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.mpm.state import MPMState
 
 MOST_STEPS = 256
-"""Substeps for which a :class:`Twin` is asked for its vectors at a time, at most."""
+"""Substeps for which a :class:`ForceTwin` is asked for its vectors at a time, at most."""
 
 TWIN_VALUES, TWIN_NUMBERS = 4, 8
-"""How many numbers a :class:`Twin` has for each particle and in all, at most."""
+"""How many numbers a :class:`ForceTwin` has for each particle and in all, at most."""
 
 Given = Tensor | tuple[Tensor, Tensor | None]
 """A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
@@ -26,7 +26,7 @@ ForceFunction = Callable[[MPMState], Given]
 
 
 @dataclass(frozen=True)
-class Twin:
+class ForceTwin:
     """A force as a Triton function, which the particle kernels call; its definition is the force in torch.
 
     Attributes:
@@ -107,7 +107,7 @@ class Force(Recordable, nn.Module, ABC):
         """Whether there is a :meth:`twin`."""
         return False
 
-    def twin(self) -> Twin:
+    def twin(self) -> ForceTwin:
         """The force for the fused substep, of a force that ``has_twin``."""
         raise NotImplementedError(f"The force {type(self).__name__} has no Triton twin.")
 
@@ -190,4 +190,4 @@ def divide(forces: Sequence[Force]) -> tuple[Force | None, tuple[Force, ...]]:
     return None, tuple(forces)
 
 
-__all__ = ["Force", "ForceFunction", "Forces", "FunctionForce", "Twin", "as_forces"]
+__all__ = ["Force", "ForceFunction", "ForceTwin", "Forces", "FunctionForce", "as_forces"]

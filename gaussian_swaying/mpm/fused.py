@@ -19,7 +19,7 @@ from torch import Tensor
 from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.mpm import transfer_triton as kernels
 from gaussian_swaying.mpm.boundary import PinnedRegion
-from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, TWIN_VALUES, Force, Twin, added, divide, split
+from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, TWIN_VALUES, Force, ForceTwin, added, divide, split
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
 from gaussian_swaying.mpm.state import GridSpec, MPMState
@@ -160,7 +160,7 @@ class FusedSolver(ABC):
             return state, self.speed[0] / self.solver.dx
 
     def _advance(
-        self, state: MPMState, dt: float, steps: int, twin: Twin | None, options: dict[str, Any], looks: list[int]
+        self, state: MPMState, dt: float, steps: int, twin: ForceTwin | None, options: dict[str, Any], looks: list[int]
     ) -> MPMState:
         """As many substeps as the buffers hold."""
         solver = self.solver
@@ -182,7 +182,7 @@ class FusedSolver(ABC):
             changes["work"] = state.work + self._work().reshape(self.solver.points.mass.shape[:-1])
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _take_twin(self, twin: Twin) -> None:
+    def _take_twin(self, twin: ForceTwin) -> None:
         """Take the numbers of a twin, and its values of the particles where they are other ones."""
         self.numbers[: len(twin.numbers)].copy_(twin.numbers)
         sources = [(t, None if t.is_inference() else t._version) for t in twin.sources]

@@ -269,7 +269,8 @@ class MPMSolver(nn.Module):
         """As :meth:`fused`, for rollouts in some forces; None too if one of them has to be asked in every substep."""
         if not all(force.recordable for force in divide(forces)[1]):
             return None
-        return self.fused(*_tensors(state), *tensors_of(forces))
+        asking = [*_tensors(state), *tensors_of(forces)] if torch.is_grad_enabled() else []
+        return self.fused(*asking)
 
     def held_mass(self, k: int, time: Tensor | None) -> Tensor:
         """Mass of the particles that the ``k``-th boundary holds at a time [kg], zero elsewhere, shape (..., P)."""

@@ -208,7 +208,7 @@ def _twin_force(
     TWIN: tl.constexpr, OPTIONS: tl.constexpr, F, velocity, index, mask, scene, values, count, vectors, scenes, step,
     numbers,
 ):  # fmt: skip
-    """Force of a ``forces.Twin`` on some particles [N] and their resistance [kg/s]."""
+    """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]."""
     first = _load3(values, count, index, mask)
     last = tl.load(values + 3 * count + index, mask, 0.0)
     vector = vectors + (step * scenes + scene) * 3

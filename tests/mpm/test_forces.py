@@ -13,7 +13,7 @@ import torch
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.mpm.forces import Force, FunctionForce, Twin, as_forces, divide
+from gaussian_swaying.mpm.forces import Force, ForceTwin, FunctionForce, as_forces, divide
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -204,7 +204,7 @@ def test_the_first_force_with_a_twin_is_fused():
     with pytest.raises(NotImplementedError, match="Spring has no Triton twin"):
         spring.twin()
     pytest.importorskip("triton")
-    assert isinstance(wind.twin(), Twin)
+    assert isinstance(wind.twin(), ForceTwin)
 
 
 # ---- wind that depends on the place

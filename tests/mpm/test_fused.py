@@ -28,7 +28,7 @@ from gaussian_swaying.mpm.boundary import (
     SequentialRelease,
     VelocityBox,
 )
-from gaussian_swaying.mpm.forces import Force, Twin
+from gaussian_swaying.mpm.forces import Force, ForceTwin
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
 from gaussian_swaying.mpm.laws.foam import Foam
@@ -510,10 +510,10 @@ class _Pull(Force):
         super().__init__()
         self.register_buffer("place", torch.tensor([0.3, 0.1, -0.2], device=device))
         self.register_buffer("way", torch.tensor([80.0, 0.0, 0.0], device=device))
-        self.resistance, self.called = resistance, 0
+        self.resistance, self._called = resistance, 0
 
     def forward(self, state):
-        self.called += 1
+        self._called += 1
         shear = 1 + state.F_total[..., 0, 1:2].abs() + 1e-3 * state.affine[..., 1, 2:3].abs()
         pull = 5.0 * shear * (self.place + self.way * state.time - state.position) - 0.1 * state.velocity
         if state.internal is not None:
@@ -536,17 +536,22 @@ FORCES = {
 
 
 @pytest.mark.parametrize(
-    ("kernel_device", "name"),
-    _on("wind and custom", "custom, wind, wind", interpreted=["custom", "semi-implicit wind and custom"]),
+    ("kernel_device", "case"),
+    _on(
+        ("wind and custom", 2.0),
+        ("custom, wind, wind", None),
+        interpreted=[("custom", 2.0), ("semi-implicit wind and custom", None)],
+    ),
     indirect=["kernel_device"],
+    ids=str,
 )
-@pytest.mark.parametrize("resistance", [None, 2.0], ids=["force", "resistance"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_forces_in_torch_among_the_kernels(kernel_device, formulation, resistance, name, monkeypatch):
+def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, monkeypatch):
     """Over a part that ends, particles that are sorted anew, and a batch; all forces and their work."""
+    name, resistance = case
     monkeypatch.setattr(fused, "MAX_STEPS", 3)
     monkeypatch.setattr(fused, "RESORT", 2)
-    points = _points(kernel_device, count=10, batch=(2,))
+    points = _points(kernel_device, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)
 
     def run(solver, state):
@@ -598,7 +603,7 @@ def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, for
     def run(solver, state):
         waiting = Waiting(kernel_device)
         end = solver.rollout(state, DT, 3, [_load(points), waiting])
-        assert waiting.called == 2
+        assert waiting._called == 2
         return end
 
     _agree(_both(points, run, formulation))
@@ -657,7 +662,7 @@ class _Toward(Force):
         return force - self.share[..., 1:] * state.velocity, self.share[..., 1]
 
     def twin(self):
-        return Twin(
+        return ForceTwin(
             function=_toward,
             options=(self.resists,),
             implicit=self.resists,
@@ -708,13 +713,13 @@ def test_forces_in_torch_are_replayed_from_graphs(formulation):
         if k == 5:
             for pull in pulls:
                 pull.resistance = 3.0
-        before = pulls[1].called
+        before = pulls[1]._called
         dt = [1e-4, 7e-5][k % 2]
         expected, found = (
             solver.rollout(state, dt, 22, [load, pull]) for solver, pull in zip(solvers, pulls, strict=True)
         )
-        _agree([expected, found], tolerance=1e-4)
-        called.append(pulls[1].called - before)
+        _agree([expected, found], tolerance=5e-4)
+        called.append(pulls[1]._called - before)
         state = expected
     once = 1 if formulation == "updated" else 0  # at the start, where the particles are sorted
     assert called[0] > 22 - 1
