@@ -98,10 +98,10 @@ class SandScene(ProceduralScene):
             center = torch.stack([x[column], y[column], layers[level]], -1)
             center[:, :2] += 0.5 * h * (level % 2)[:, None]  # between those of the layers above and below
             near = (z[column] - layers[level] < (OPEN - 0.1) * h)[:, None]
-            side = torch.where(near, g, 0.02 * h) * torch.ones_like(near, dtype=torch.float64)
+            edge = torch.where(near, g, 0.02 * h).double()
             along_x, along_y = torch.eye(3, dtype=torch.float64)[:2]
             shade = torch.tensor([0.80, 0.64, 0.41], dtype=torch.float64) * (1 + 0.10 * draw.normal(len(center), 1))
-            parts.append(Patches(center, side * along_x, side * along_y, shade))
+            parts.append(Patches(center, edge * along_x, edge * along_y, shade))
         return to_cloud(join(parts), overlap=0.55, ambient=0.35, two_sided=False)
 
     @staticmethod
