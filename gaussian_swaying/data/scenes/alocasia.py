@@ -15,8 +15,7 @@ from gaussian_swaying.gaussians.ply import GaussianCloud
 
 
 class AlocasiaScene(ProceduralScene):
-    """An alocasia (elephant's ear) about 1.1 m tall in a pot, z up, the pot standing on a floor at z = 0, its earth at
-    0.20 m.
+    """An alocasia (elephant's ear) about 1.1 m tall in a pot on a floor at z = 0, z up, its earth at 0.20 m.
 
     Bent stalks that carry one broad blade of 38 cm each.
 

@@ -32,12 +32,12 @@ OPEN = 3  # layers of grains that the wind reaches: they share the area of the s
 
 
 class SandScene(ProceduralScene):
-    """A bear of sand lying on a beach, 2.3 m from head to foot, z up, the beach at z = 0.
+    """A bear of sand lying on a beach, 2.3 m from head to foot, z up, the bear on z = 0.
 
     Dry sand has no cohesion, so the bear is heaped up of mounds (:data:`MOUNDS`) nowhere steeper than ``slope``, which
-    stand by themselves. It is solid. The wind reaches :data:`OPEN` layers of grains, which share the area of the surface,
-    so that it finds grains to take where it has taken some; deeper ones are specks on a lattice, too small to be seen or
-    to feel the wind.
+    stand by themselves. It is solid. The wind reaches :data:`OPEN` layers of grains, which share the area of the
+    surface, so that it finds grains to take where it has taken some; deeper ones are specks on a lattice, too small to
+    be seen or to feel the wind.
 
     Args:
         spacing: Distance between Gaussians [m], on the surface and inside.
@@ -88,7 +88,7 @@ class SandScene(ProceduralScene):
             skin = skin.painted(0.75 * colour, self._in(x, y, 0.42 * side, -0.76, 0.12))
         step = max(h, 0.03)
         beach = floor(step, (0.66, 0.55, 0.39), flat=2.2, fade=(3.0, 9.0), ambient=0.35)
-        # a little below, as Gaussians are drawn in the order of their centres: else it would cover grains that lie on it
+        # a little below, or it would cover the grains that lie on it: Gaussians are drawn in the order of their centres
         parts = [skin, beach.mapped(shift=(0.0, 0.1, -1.6 * step))]
         if self.interior:
             layers = torch.arange(int(float(z.max()) / h) + 1, dtype=torch.float64) * h + 0.5 * h
@@ -98,10 +98,10 @@ class SandScene(ProceduralScene):
             center = torch.stack([x[column], y[column], layers[level]], -1)
             center[:, :2] += 0.5 * h * (level % 2)[:, None]  # between those of the layers above and below
             near = (z[column] - layers[level] < (OPEN - 0.1) * h)[:, None]
-            side = torch.where(near, g, 0.02 * h) * torch.ones_like(near, dtype=torch.float64)
+            edge = torch.where(near, g, 0.02 * h).double()
             along_x, along_y = torch.eye(3, dtype=torch.float64)[:2]
             shade = torch.tensor([0.80, 0.64, 0.41], dtype=torch.float64) * (1 + 0.10 * draw.normal(len(center), 1))
-            parts.append(Patches(center, side * along_x, side * along_y, shade))
+            parts.append(Patches(center, edge * along_x, edge * along_y, shade))
         return to_cloud(join(parts), overlap=0.55, ambient=0.35, two_sided=False)
 
     @staticmethod

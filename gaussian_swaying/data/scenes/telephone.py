@@ -30,8 +30,8 @@ RED, CREAM, DARK = (0.72, 0.10, 0.09), (0.90, 0.87, 0.80), (0.13, 0.13, 0.14)
 class TelephoneScene(ProceduralScene):
     """A red telephone on a tiled wall, z up, seen from -y: the handset is off the hook and hangs on a coiled cord.
 
-    The wall is the plane y = 0.10 m; the telephone ends at z = 0. The cord hangs below it to z = -0.36 m, and from its end
-    the handset, to z = -0.79 m.
+    The wall is the plane y = 0.10 m; the telephone ends at z = 0. The cord hangs below it to z = -0.37 m, and from its
+    end the handset, to z = -0.81 m.
 
     Args:
         spacing: Distance between Gaussians along the cord [m]; elsewhere at least 8 mm.

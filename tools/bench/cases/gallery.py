@@ -168,9 +168,9 @@ def page(recorded: list[Row]) -> list[str]:
             memory = row["peak_memory_bytes"]
             on_device = "-" if memory["device"] is None else f"{memory['device'] / 2**30:.2f}"
             moved = row["displacement_share"]
-            older = "" if of_today(name, row) else " \\*"
+            shown = title + ("" if of_today(name, row) else " \\*")
             lines.append(
-                f"| {title}{older}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
+                f"| {shown}{', preset `' + row['preset'] + '`' if row['preset'] else ''} | {row['particles']:,} | "
                 f"`{row['formulation']}` | {row['frames']} | {row['substeps'] / max(row['frames'] - 1, 1):.0f} | "
                 f"{1e3 * wall / max(row['frames'], 1):.1f} | {row['process_s']:.0f} | {memory['host'] / 2**30:.2f} | "
                 f"{on_device} | {'-' if moved is None else f'{100 * moved:.1f} %'} | {'yes' if whole(row) else 'no'} |"
