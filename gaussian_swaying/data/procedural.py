@@ -11,6 +11,8 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
 
+_MOST = 50_000_000  # Gaussians, some 100 GB of them
+
 
 class ProceduralScene(ABC):
     """Base of all generated scenes."""
@@ -53,6 +55,11 @@ class FlagScene(ProceduralScene):
             raise ValueError(f"Expected `generator.pattern` to be stripes or white, but got {pattern!r}.")
         if spacing > min(width, height):
             raise ValueError(f"Expected `generator.spacing` below the flag's sides, but got {spacing} m.")
+        count = width / spacing * height / spacing
+        if not count <= _MOST:
+            raise ValueError(
+                f"Expected `generator.spacing` that makes at most {_MOST:,} Gaussians, but got {spacing} m."
+            )
         self.width, self.height, self.spacing = float(width), float(height), float(spacing)
         self.overlap, self.ripple, self.pattern = float(overlap), float(ripple), pattern
         if not math.isfinite(yaw):

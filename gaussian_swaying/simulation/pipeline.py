@@ -53,6 +53,7 @@ MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and noth
 MAX_WIND = 1e6  # m/s; any more is a mistake, and would overflow positions
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
 MAX_SUBSTEPS = 1_000_000  # in a frame: hours of a processor, and minutes of the fastest GPU
+MAX_PIXELS = 1 << 26  # of a picture: twice those of 8K
 MAX_LOOKS = 2_000  # how many frames' cameras are looked at before a run
 
 
@@ -308,17 +309,22 @@ class SimulationPipeline(nn.Module):
         return path(frame, frame * self.frame_dt, scene.center, scene.frame.rotation[2], scene.size)
 
     def check_camera(self, frame: int) -> None:
-        """Raise ValueError if a camera of a frame lies inside the box of the object at rest.
+        """Raise ValueError if a camera of a frame lies inside the box of the object at rest, or has too many pixels.
 
-        Not asked of cameras of a capture, which stood where they stood: around an object or in a room.
+        The first is not asked of cameras of a capture, which stood where they stood: around an object or in a room.
         """
         low, high = self.scene.bounds
         for name, path in {"": self.camera, **self.cameras}.items():
+            camera, field = self._camera(frame, name), f"cameras.{name}" if name else "camera"
+            if camera.width * camera.height > MAX_PIXELS:
+                raise ValueError(
+                    f"A picture of {camera.width:,} x {camera.height:,} pixels is too large, {MAX_PIXELS:,} are the "
+                    f"most: lower `{field}.init_args.width` and `height`."
+                )
             if path.captured:
                 continue
-            eye = self._camera(frame, name).position.to(low)
+            eye = camera.position.to(low)
             if bool(((eye > low) & (eye < high)).all()):
-                field = f"cameras.{name}" if name else "camera"
                 raise ValueError(
                     f"The camera at {[round(v, 3) for v in eye.tolist()]} lies inside the object, whose box reaches "
                     f"from {[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene "

@@ -6,6 +6,7 @@ The process is a fork of one that has imported everything, so a case takes milli
 from __future__ import annotations
 
 import os
+import re
 import resource
 import signal
 import sys
@@ -89,7 +90,7 @@ def try_case(case: Case, commands: dict[str, Command], limit: float = TIME) -> V
         kind = killed or _kind(ended[1], said)
         if kind == "no sentence" and case.command == "spoilt" and not said.strip():
             kind = "refused"  # its standard error is what was spoilt
-        if kind == "hang" and "left in this frame" in said:
+        if kind == "hang" and re.search(r"left in this frame|\[[^\]]*<\d[^\]]*frame", said):
             kind = "slow, but told"
         if kind in GOOD and memory > allowed:
             kind = "memory"

@@ -152,6 +152,18 @@ def test_the_cameras_of_a_billion_frames(tmp_path, monkeypatch):
     assert seen == list(range(7))
 
 
+def test_a_picture_that_is_too_large_is_refused(tmp_path, capsys):
+    size = ["--camera.init_args.width", "60000", "--camera.init_args.height", "60000"]
+    assert main([*SMALL, *size, "--output", str(tmp_path / "run")]) == 2
+    assert "60,000 x 60,000 pixels is too large" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_flag_of_more_gaussians_than_there_is_memory(capsys):
+    assert main([*SMALL, "--scene.generator.init_args.spacing", "1e-9"]) == 2
+    assert "`generator.spacing` that makes at most" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("color", ["[255, 255, 255]", "[-0.1, 0, 0]"])
 def test_a_background_beyond_white_is_refused(color, tmp_path, capsys):
     assert main([*SMALL, "--background", color, "--output", str(tmp_path / "run")]) == 2
