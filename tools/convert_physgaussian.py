@@ -1,43 +1,8 @@
 """Convert a PhysGaussian configuration: ``python tools/convert_physgaussian.py config.json --output my.yaml``."""
 
-import argparse
 import sys
-from pathlib import Path
 
-from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.simulation.files import atomic
-from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
-
-
-def main(arguments=None):
-    """Write the YAML to a file or to the standard output; 2 on bad input."""
-    parser = argparse.ArgumentParser(
-        description="PhysGaussian's JSON to YAML for tools/sim.py --config; docs/physgaussian.md has the differences."
-    )
-    parser.add_argument("config", type=Path, help="A configuration of PhysGaussian.")
-    parser.add_argument("--output", type=Path, help="YAML file to write; by default it is printed.")
-    parser.add_argument("--cameras", help="cameras.json of the 3DGS model, for its lens and default_camera_index.")
-    parser.add_argument(
-        "--sticky-planes", action="store_true", help="Make every plane stick, as PhysGaussian's code does."
-    )
-    return run_command(
-        lambda: write(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="a smaller file"
-    )
-
-
-def write(options):
-    """Convert, write or print, and say what was written and what means something else."""
-    settings, notes = convert(read_config(options.config), options.cameras, options.sticky_planes)
-    text = to_yaml(settings, notes, options.config.name)
-    if options.output is None:
-        print(text, end="")
-    else:
-        with atomic(options.output) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-        print(f"wrote {options.output}")
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
-
+from gaussian_swaying.cli.convert import main
 
 if __name__ == "__main__":
     sys.exit(main())

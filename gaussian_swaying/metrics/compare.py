@@ -92,7 +92,7 @@ def compare_run(
     reference and as many others as there are particles.
 
     Args:
-        run: Folder of a run, as ``tools/sim.py`` writes it.
+        run: Folder of a run, as a simulation writes it.
         reference: Folder of the reference.
         reference_offset: Number of the reference's frame that belongs to frame 0 of the run; may be negative.
         frames: Compare only so many frames; by default all, and then both must have equally many.
@@ -367,12 +367,12 @@ class _Surface:
 
 def _read_summary(run: Path) -> dict[str, Any]:
     if not run.is_dir():
-        raise ValueError(f"There is no run folder {run}: give the folder that tools/sim.py wrote.")
+        raise ValueError(f"There is no run folder {run}: give the folder of a simulation.")
     try:
         return dict(read_json(run / "summary.json", "summary"))
     except (OSError, ValueError, TypeError) as error:
         raise ValueError(
-            f"The run {run} has no readable summary.json: give the folder of a finished run of tools/sim.py."
+            f"The run {run} has no readable summary.json: give the folder of a finished simulation."
         ) from error
 
 

@@ -13,7 +13,9 @@ import torch
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.cli import program
 from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.data.capture_camera import CaptureCamera
@@ -82,12 +84,12 @@ class PresetAction(Action):
 
 
 def build_parser() -> ArgumentParser:
-    """The parser of ``tools/sim.py``: one group of options per component, typos are errors."""
+    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors."""
     from jsonargparse import ActionYesNo, ArgumentParser
 
     limit_yaml()
     parser = ArgumentParser(
-        prog="sim.py",
+        prog=program.name("sim"),
         exit_on_error=False,
         description="Let the wind move a 3D Gaussian scene: splat in, video out. Lengths that say where something is "
         "are in scene units and axes; velocities, gravity and light are in metres, z up.",
@@ -263,6 +265,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[SimulationPipeline]) -> None:
     """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
+    arguments = with_shipped(arguments, "sim")
     check_config_files(arguments)
     with guessing(parser):
         settings = parser.parse_args(arguments)

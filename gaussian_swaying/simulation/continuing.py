@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+from gaussian_swaying.cli import program
 
 
 def command(arguments: Sequence[str], *more: str, without: str | None = None) -> str:
@@ -24,9 +25,7 @@ def command(arguments: Sequence[str], *more: str, without: str | None = None) ->
             skip = True
         else:
             kept.append(argument)
-    program = sys.argv[0] or "python"
-    start = ["python", program] if program.endswith(".py") else [Path(program).name]
-    return shlex.join([*start, *kept, *(argument for argument in more if argument not in kept)])
+    return shlex.join([*program.this(), *kept, *(argument for argument in more if argument not in kept)])
 
 
 def how_to_resume(checkpoint: Path, frame: int, arguments: Sequence[str], diverged: bool = False) -> str:

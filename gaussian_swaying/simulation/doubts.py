@@ -6,18 +6,19 @@ import argparse
 import shlex
 from collections.abc import Sequence
 
+from gaussian_swaying.cli import program
 from gaussian_swaying.simulation.preview import Suggestion
 
 
 def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, **changes: str | list[str]) -> str:
-    """The command line of ``tools/preview.py`` that gives these options, and some in place of theirs.
+    """The command line of the preview that gives these options, and some in place of theirs.
 
     Args:
         options: What was given.
         defaults: What is not written.
         changes: Options to give instead, by their names in ``options``.
     """
-    words = ["python", "tools/preview.py", str(options.scene)]
+    words = [*program.words("preview"), str(options.scene)]
     for name, default in vars(defaults).items():
         value = changes.get(name, getattr(options, name, default))
         if name == "scene" or value is None or value == default:

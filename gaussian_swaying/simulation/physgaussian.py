@@ -44,7 +44,7 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
 def convert(
     config: Mapping[str, Any], cameras: str | None = None, sticky_planes: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Settings of ``tools/sim.py`` for a PhysGaussian configuration.
+    """Settings of a simulation for a PhysGaussian configuration.
 
     Numbers stay as they are in the file: boxes and planes in the normalised space (:class:`Normalisation`), which is
     brought to the scene once its splat is known. Vectors turn with :func:`heading`.
@@ -123,7 +123,7 @@ def convert(
 
 
 def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str | None = None) -> str:
-    """Settings as a YAML file for ``tools/sim.py --config``, with the notes as comments at its head.
+    """Settings as a YAML file for ``--config``, with the notes as comments at its head.
 
     Args:
         settings: From :func:`convert`.

@@ -1,9 +1,10 @@
-"""The command line of ``tools/preview.py``: report, picture and a first configuration."""
+"""The command line of ``gaussian-swaying preview``: report, picture and a first configuration."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 import time
 from argparse import ArgumentError
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gaussian_swaying.cli import program
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.cli.yaml_limits import check_config_files
@@ -61,9 +63,9 @@ class Preview:
 def build_options() -> argparse.ArgumentParser:
     """The options."""
     parser = argparse.ArgumentParser(
-        prog="preview.py",
+        prog=program.name("preview"),
         description="Bounds, up axis, Gaussians, region, pins, grid and cost of a splat; a picture of them; and a "
-        "first configuration for tools/sim.py.",
+        "first configuration.",
     )
     add = parser.add_argument
     add("scene", nargs="?", metavar="SCENE.ply", help="the splat; may be left out if --config names one")
@@ -148,7 +150,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     ):
         pictures = f"{_seconds_of(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
-        report.append(f"  python tools/sim.py --config {folder / name}.yaml --output {where}")
+        report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
     return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), texts)
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gaussian_swaying.cli import program
 from gaussian_swaying.gaussians.selection import Box, Cylinder, Not, Region, Union
 from gaussian_swaying.simulation.preview import DRAFT_CELLS, Suggestion, suggest_spacing
 
@@ -94,7 +96,7 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
         frames: Number of frames.
 
     Returns:
-        YAML for ``tools/sim.py --config``.
+        YAML for ``--config`` of a simulation.
     """
     return _yaml(suggestion, ply, frames, STARTER_PICTURE, "# A first configuration.")
 
@@ -118,7 +120,7 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
 {title}
 # Guessed from the splat; every number may be changed. A splat does not tell what it is made of: E and thickness are
 # such that it sways visibly in this wind.
-#   python tools/sim.py --config THIS_FILE
+#   {shlex.join(program.words("sim"))} --config THIS_FILE
 frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
 frame_dt: 0.04                  # s
 background: [0.93, 0.94, 0.96]

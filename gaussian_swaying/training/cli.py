@@ -21,7 +21,9 @@ import gaussian_swaying.data.datamodule
 import gaussian_swaying.data.generated_datamodule
 import gaussian_swaying.training.densification
 import gaussian_swaying.training.losses  # noqa: F401
+from gaussian_swaying.cli import program
 from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.simulation.continuing import command
@@ -153,7 +155,8 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         TrainingDiverged: If a loss or a Gaussian is not finite any more.
     """
     limit_yaml()
-    check_config_files(sys.argv[1:] if arguments is None else arguments)
+    given = with_shipped(sys.argv[1:] if arguments is None else arguments, "train")
+    check_config_files(given)
     return TrainCLI(
         SplatTrainer,
         LightningDataModule,
@@ -162,8 +165,12 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         seed_everything_default=0,
         save_config_callback=None,  # the run folder writes it, once the training has begun
         run_folder=run_folder,
-        parser_kwargs={"exit_on_error": False, "description": "Train surface-aligned Gaussians from photos."},
-        args=None if arguments is None else list(arguments),
+        parser_kwargs={
+            "prog": program.name("train"),
+            "exit_on_error": False,
+            "description": "Train surface-aligned Gaussians from photos.",
+        },
+        args=given,
         run=run,
     )
 
@@ -175,7 +182,7 @@ def next_step(folder: Path, data: object) -> str:
         folder: Folder of the training.
         data: What it was trained on; its ``path`` is the folder of the photos.
     """
-    words = ["python", "tools/preview.py", str(folder / "point_cloud.ply")]
+    words = [*program.words("preview"), str(folder / "point_cloud.ply")]
     path = getattr(data, "path", None)
     return shlex.join(words if path is None else [*words, "--capture", str(path)])
 

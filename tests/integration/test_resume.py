@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from gaussian_swaying.simulation.checkpoint import write_checkpoint
+from gaussian_swaying.simulation.checkpoint import read_checkpoint, write_checkpoint
 from gaussian_swaying.simulation.config import main
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
@@ -158,9 +158,10 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
         while not slow.exists() and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.05)
         assert slow.exists()
-        while not (folder / "frames/00003.png").exists() and time.monotonic() < deadline:
+        while time.monotonic() < deadline:  # written in the background, after the frame
+            if (folder / "checkpoint.pt").exists() and read_checkpoint(folder / "checkpoint.pt")["frame"] == 3:
+                break
             time.sleep(0.05)
-        time.sleep(0.5)  # until it is in the checkpoint too
         for more in ([], ["--resume"]):
             check_refused(_arguments(folder, *more), tmp_path, capsys, f"process {process.pid} on this host", "stop it")
         process.send_signal(getattr(signal, name))

@@ -1,0 +1,97 @@
+"""Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or a run's ``ply`` folder to USD."""
+
+import argparse
+import json
+from pathlib import Path
+
+import torch
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.cli import program
+from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
+from gaussian_swaying.gaussians.export import SUFFIXES, convert, format_of
+from gaussian_swaying.simulation.frame import SimFrame
+
+
+def build_options() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
+    parser.add_argument("source", help="A .ply, compressed .ply or .splat, or a folder of .ply for an animated USD.")
+    parser.add_argument("target", help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}.")
+    parser.add_argument("--fps", type=float, help="Frames per second of a folder; default: those of its run, or 25.")
+    parser.add_argument(
+        "--up",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="Direction in the scene that points up, for USD; default: that of the run that wrote the source, or z.",
+    )
+    parser.add_argument(
+        "--metres-per-unit",
+        type=float,
+        help="Length of a scene unit [m], for USD; default: that of the run that wrote the source, or 1.",
+    )
+    return parser
+
+
+def run_of(source: Path) -> Path | None:
+    """The summary of the run that wrote a splat or a folder of them, None if no run did."""
+    for folder in (source.parent, source.parent.parent):
+        if (folder / "summary.json").is_file() and (folder / "run.json").is_file():
+            return folder / "summary.json"
+    return None
+
+
+def usd_settings(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
+    """Frames per second, frame and where they come from, for a USD file.
+
+    Raises:
+        ValueError: If an option is bad, or the summary of the run cannot be read.
+    """
+    if options.metres_per_unit is not None:
+        check_positive("--metres-per-unit", options.metres_per_unit)
+    fps, frame, origin = 25.0, SimFrame(torch.zeros(3), torch.eye(3, dtype=torch.float64), 1.0), "by default"
+    summary = run_of(Path(options.source).resolve())
+    given = [options.up is not None, options.metres_per_unit is not None]
+    if summary is not None and not (all(given) and options.fps is not None):
+        try:
+            known = json.loads(summary.read_text(encoding="utf-8"))
+            frame, fps = SimFrame.from_summary(known), 1 / float(known["frame_dt_s"])
+        except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
+            raise ValueError(
+                f"{summary} cannot be used ({error}): give --up, --metres-per-unit and --fps instead."
+            ) from error
+        origin = f"from {summary.name} of the run"
+    metres = frame.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
+    if options.up is not None:
+        frame = SimFrame.fit(torch.zeros(1, 3), options.up, metres_per_unit=metres)
+    if any(given):
+        origin = "as given" if all(given) else f"as given, the rest {origin}"
+    return options.fps or fps, SimFrame(frame.origin, frame.rotation, metres), origin
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse and convert; 2 on bad input."""
+    parser = build_options()
+    return run_command(
+        lambda: export(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="fewer Gaussians"
+    )
+
+
+def export(options: argparse.Namespace) -> None:
+    """Convert, and say what was written."""
+    if options.fps is not None:
+        check_positive("--fps", options.fps)
+    if format_of(options.target) != "usd":
+        if options.up is not None or options.metres_per_unit is not None:
+            raise ValueError(
+                "--up and --metres-per-unit are for USD files, as no other format says which way is up: leave them "
+                "out, or let the target end in .usdc."
+            )
+        convert(options.source, options.target)
+    else:
+        fps, frame, origin = usd_settings(options)
+        convert(options.source, options.target, fps, frame.metres_per_unit, frame.rotation)
+        up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
+        print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
+    print(f"wrote {options.target}")

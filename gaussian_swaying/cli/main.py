@@ -1,0 +1,50 @@
+"""The installed program: ``gaussian-swaying sim``, ``train``, ``preview``, ``eval``, ``export`` and ``convert``."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+import gaussian_swaying
+from gaussian_swaying.cli import program
+
+COMMANDS = {
+    "sim": ("gaussian_swaying.simulation.config", "let the wind move a scene: splat in, video out"),
+    "train": ("gaussian_swaying.training.cli", "train Gaussians that lie on surfaces, from photos"),
+    "preview": ("gaussian_swaying.simulation.preview_cli", "look at a splat, and guess its first configuration"),
+    "eval": ("gaussian_swaying.cli.evaluate", "compare a run with a reference"),
+    "export": ("gaussian_swaying.cli.export", "convert a splat, or a run's splats to USD"),
+    "convert": ("gaussian_swaying.cli.convert", "turn a PhysGaussian configuration into a YAML file"),
+}
+"""Module with a ``main(arguments)``, and what it does, of each command."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        arguments: Its name and its own arguments; those of the process if None.
+
+    Returns:
+        The exit code of the command; 2 if there is no such command.
+    """
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if not given or given[0] in ("-h", "--help"):
+        print(f"usage: {program.INSTALLED} COMMAND ...\n")
+        for name, (_, what) in COMMANDS.items():
+            print(f"  {name:<9}{what}")
+        print(f"\n{program.INSTALLED} COMMAND --help lists the options of a command.")
+        return 0
+    if given[0] == "--version":
+        print(f"{program.INSTALLED} {gaussian_swaying.__version__}")
+        return 0
+    if given[0] not in COMMANDS:
+        close = difflib.get_close_matches(given[0], COMMANDS, 1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        print(f"error: There is no command {given[0]!r}{hint}: give one of {', '.join(COMMANDS)}.", file=sys.stderr)
+        return 2
+    program.called(given[0])
+    code: int = import_module(COMMANDS[given[0]][0]).main(given[1:])
+    return code

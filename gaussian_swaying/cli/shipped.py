@@ -1,0 +1,59 @@
+"""Configurations that come with the package, by name: ``--config flag`` for ``configs/sim/flag.yaml``."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import gaussian_swaying
+
+
+def folder() -> Path | None:
+    """Where the configurations are: within the installed package, or beside it in a checkout; None if nowhere."""
+    package = Path(gaussian_swaying.__file__).parent
+    found = [path for path in (package / "configs", package.parent / "configs") if (path / "sim").is_dir()]
+    return found[0] if found else None
+
+
+def names(kind: str) -> list[str]:
+    """Names of the configurations of a kind, ``sim`` or ``train``."""
+    root = folder()
+    return [] if root is None else sorted(path.stem for path in (root / kind).glob("*.yaml"))
+
+
+def with_shipped(arguments: Sequence[str], kind: str) -> list[str]:
+    """A command line whose ``--config NAME`` is the file of that name, where the name is no file of its own.
+
+    Args:
+        arguments: The command line.
+        kind: ``sim`` or ``train``.
+
+    Raises:
+        ValueError: If a name is neither a file nor a configuration that is shipped.
+    """
+    found: list[str] = []
+    for argument in arguments:
+        option, equals, value = argument.partition("=")
+        if found and found[-1] == "--config" and not argument.startswith("-"):
+            found.append(_file(argument, kind))
+        elif option == "--config" and equals:
+            found.append(f"--config={_file(value, kind)}")
+        else:
+            found.append(argument)
+    return found
+
+
+def _file(given: str, kind: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", given) or Path(given).exists():
+        return given
+    known, root = names(kind), folder()
+    if root is not None and given in known:
+        return str(root / kind / f"{given}.yaml")
+    close = difflib.get_close_matches(given, known, 1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    raise ValueError(
+        f"There is no file and no configuration {given!r}{hint}: give a YAML file to `--config`, or one of "
+        f"{', '.join(known) or 'those of a checkout'}."
+    )

@@ -1,0 +1,88 @@
+"""The installed program, and configurations by name."""
+
+import sys
+
+import pytest
+import yaml
+
+import gaussian_swaying
+from gaussian_swaying.cli import program, shipped
+from gaussian_swaying.cli.main import COMMANDS, main
+from gaussian_swaying.simulation.config import main as simulate
+from gaussian_swaying.simulation.continuing import command
+from gaussian_swaying.training.cli import make_cli
+
+
+@pytest.fixture(autouse=True)
+def _not_called():
+    yield
+    program._called.clear()
+
+
+def test_what_there_is(capsys):
+    assert main([]) == 0
+    out = capsys.readouterr().out
+    for name in COMMANDS:
+        assert f"\n  {name} " in out
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gaussian-swaying {gaussian_swaying.__version__}\n"
+    assert main(["exprot"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: There is no command 'exprot' (did you mean export?)")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_each_command_has_its_own_help(name, capsys):
+    with pytest.raises(SystemExit) as left:
+        main([name, "--help"])
+    assert left.value.code in (0, None)
+    assert f"gaussian-swaying {name}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_commands_that_are_printed_can_be_pasted(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["tools/sim.py", "--frames", "3"])
+    assert program.words("preview") == ["python", "tools/preview.py"]
+    assert command(["--frames", "3"], "--resume") == "python tools/sim.py --frames 3 --resume"
+    program.called("sim")
+    assert program.words("preview") == ["gaussian-swaying", "preview"]
+    assert command(["--frames", "3"], "--resume") == "gaussian-swaying sim --frames 3 --resume"
+
+
+def test_a_configuration_by_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small = [
+        "--scene.generator.init_args.spacing",
+        "0.05",
+        "--solver.dx",
+        "0.1",
+        "--solver.boundaries=[]",
+        "--camera.init_args.width",
+        "32",
+    ]
+    small += ["--camera.init_args.height", "18", "--recorder.video=false", "--frames", "2", "--device", "cpu"]
+    assert main(["sim", "--config", "flag", *small]) == 0
+    assert "wrote outputs/flag/summary.json" in capsys.readouterr().out
+    kept = yaml.safe_load((tmp_path / "outputs/flag/config.yaml").read_text())
+    assert kept["wind"]["flow"] == [6.0, 1.5, 0.0]
+    assert simulate(["--config=flga", *small]) == 2
+    error = capsys.readouterr().err
+    assert "no file and no configuration 'flga' (did you mean flag" in error
+    assert "ficus" in error
+    assert error.count("\n") == 1
+
+
+def test_a_file_comes_before_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "flag").write_text("frames: 3\n")
+    assert shipped.with_shipped(["--config", "flag", "--frames", "4"], "sim") == ["--config", "flag", "--frames", "4"]
+    (tmp_path / "flag").unlink()
+    file = str(shipped.folder() / "sim" / "flag.yaml")
+    assert shipped.with_shipped(["--config", "flag"], "sim") == ["--config", file]
+    assert shipped.with_shipped(["--config", "my/own.yaml"], "sim") == ["--config", "my/own.yaml"]
+
+
+def test_a_configuration_of_a_training_by_name():
+    cli = make_cli(["--config", "quick_cpu"], run=False)
+    assert cli.config["trainer"]["max_steps"] < 60_000
+    assert "quick_cpu" in shipped.names("train")
