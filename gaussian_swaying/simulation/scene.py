@@ -20,7 +20,6 @@ from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
     deform_all,
-    limit_deformed,
 )
 from gaussian_swaying.mpm.materials import ConstitutiveLaw, FixedCorotated
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
@@ -238,6 +237,7 @@ class SimulatedScene(nn.Module):
         for group in (outer, ~outer):  # what lies within takes no area from the surface
             areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
         self.max_stretch = scene.max_stretch
+        self._kept: tuple[MaterialPoints, Tensor] | None = None
         self.register_buffer("simulated", simulated)
         carried = faint.nonzero()[:, 0] if scene.faint == "carry" else simulated[:0]
         self.register_buffer("carried", carried)
@@ -373,21 +373,20 @@ class SimulatedScene(nn.Module):
     def _deform(
         self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """``deform_all`` and the limit of the scene."""
-        # the limit needs the rotations; on a GPU they cost next to nothing, and all of them are computed
-        wanted = rotations or (self.max_stretch is not None and F.device.type == "cuda")
-        deformed, normals, turns = deform_all(F, covariances, normals, wanted)
-        if self.max_stretch is not None:
-            deformed = limit_deformed(F, deformed, covariances, self.max_stretch, self._solid(), turns)
-        return deformed, normals, turns if rotations else None
+        """``deform_all`` with the limit of the scene."""
+        solid = None if self.max_stretch is None else self._solid()
+        return deform_all(F, covariances, normals, rotations, self.max_stretch, solid)
 
     def _solid(self) -> Tensor:
         """Which of the Gaussians that move keep their shape, as their law has no return map; bool, shape (M,)."""
-        laws, index = self.points.laws, self.points.law_index
-        count = len(self.simulated)
-        solid = torch.stack([self.simulated.new_full((), not law.plastic, dtype=torch.bool) for law in laws])
-        own = solid[:1].expand(count) if index is None else solid[index[:count]]
-        return torch.cat([own, own[self.anchor]])
+        if self._kept is None or self._kept[0] is not self.points:  # an edit brings other points
+            laws, index = self.points.laws, self.points.law_index
+            with torch.inference_mode(False):  # it outlives the call
+                solid = torch.tensor([not law.plastic for law in laws], device=self.simulated.device)
+                count = len(self.simulated)
+                own = solid[:1].expand(count) if index is None else solid[index[:count]]
+                self._kept = (self.points, torch.cat([own, own[self.anchor]]))
+        return self._kept[1]
 
     def on_gaussians(self, values: Tensor) -> Tensor:
         """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.
