@@ -184,7 +184,7 @@ def limit_deformed(
     """:func:`limit_stretch` with the shape that suits the material: its own where that still means something.
 
     A Gaussian of a solid goes back towards its shape at rest, turned with the material; one of a material that flows
-    towards a ball. On a CPU only those beyond the limit are computed; on a GPU all are, so that the host need not wait.
+    towards a ball. On a CPU only those beyond the limit are computed; elsewhere all are, so that no host waits.
 
     Args:
         deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
@@ -204,7 +204,7 @@ def limit_deformed(
     check_shape("covariances", covariances, len(deformation_gradient), 3, 3)
     check_shape("rest", rest, len(deformation_gradient), 3, 3)
     check_shape("solid", solid, len(deformation_gradient))
-    if covariances.device.type != "cuda":
+    if covariances.device.type == "cpu":
         beyond = (_trace(covariances) > max_stretch**2 * _trace(rest)).nonzero()[:, 0]
         if len(beyond) == 0:
             return covariances
@@ -321,7 +321,12 @@ def _cofactor_times(deformation_gradient: Tensor, normals: Tensor) -> tuple[Tens
 
 
 def deform_all(
-    deformation_gradient: Tensor, covariances: Tensor, normals: Tensor, rotations: bool = True
+    deformation_gradient: Tensor,
+    covariances: Tensor,
+    normals: Tensor,
+    rotations: bool = True,
+    max_stretch: float | None = None,
+    solid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Covariances, normals and rotations after a deformation, on a GPU in one kernel if triton is there.
 
@@ -330,9 +335,11 @@ def deform_all(
         covariances: Covariances A at rest [scene units^2], shape (N, 3, 3).
         normals: Unit normals N at rest, shape (N, 3).
         rotations: Whether the rotations are asked for.
+        max_stretch: Limit of :func:`limit_deformed`, above 1; None for none.
+        solid: Which keep their shape beyond that limit, bool, shape (N,); with ``max_stretch``.
 
     Returns:
-        :func:`deform_covariance`, :func:`deform_normal` and
+        :func:`deform_covariance` within the limit, :func:`deform_normal` and
         :func:`~gaussian_swaying.mpm.linalg.polar_rotation`, or None in its place.
 
     Raises:
@@ -347,12 +354,12 @@ def deform_all(
     if deformation_gradient.device.type == "cuda" and single and not wanted:
         kernels = _kernels()
         if kernels is not None:
-            return kernels.deform_all(*tensors, rotations)
-    return (
-        deform_covariance(deformation_gradient, covariances),
-        deform_normal(deformation_gradient, normals),
-        polar_rotation(deformation_gradient) if rotations else None,
-    )
+            return kernels.deform_all(*tensors, rotations, max_stretch, solid)
+    drawn = deform_covariance(deformation_gradient, covariances)
+    turns = polar_rotation(deformation_gradient) if rotations else None
+    if max_stretch is not None and solid is not None:
+        drawn = limit_deformed(deformation_gradient, drawn, covariances, max_stretch, solid, turns)
+    return drawn, deform_normal(deformation_gradient, normals), turns
 
 
 @functools.cache
@@ -363,8 +370,10 @@ def _kernels() -> ModuleType | None:
     try:
         kernels = importlib.import_module("gaussian_swaying.gaussians.surface_triton")
         matrix = torch.zeros(1, 3, 3, device="cuda")
+        solid = torch.ones(1, dtype=torch.bool, device="cuda")
         for rotations in (False, True):
-            kernels.deform_all(matrix, matrix, matrix[:, 0], rotations)
+            for limit in (None, 2.0):
+                kernels.deform_all(matrix, matrix, matrix[:, 0], rotations, limit, solid)
     except Exception as error:  # whatever it is, the definition does the same
         warnings.warn(f"triton cannot compile its kernels here ({error}): pictures take longer.", stacklevel=2)
         return None

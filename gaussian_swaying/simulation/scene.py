@@ -21,7 +21,6 @@ from gaussian_swaying.gaussians.surface import (
     DeformedGaussians,
     GaussianSurfaceModel,
     deform_all,
-    limit_deformed,
 )
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
@@ -270,6 +269,7 @@ class SimulatedScene(nn.Module):
             normal_of = simulated[source]
         carried = carried.nonzero()[:, 0]
         self.register_buffer("chosen", chosen.nonzero()[:, 0], persistent=False)
+        self._kept: tuple[MaterialPoints, Tensor] | None = None
         self.register_buffer("simulated", simulated)
         self.register_buffer("carried", carried)
         anchor, share = blend_weights(cloud.means[simulated], cloud.means[carried], followed)
@@ -412,21 +412,20 @@ class SimulatedScene(nn.Module):
     def _deform(
         self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """``deform_all`` and the limit of the scene."""
-        # the limit needs the rotations; on a GPU they cost next to nothing, and all of them are computed
-        wanted = rotations or (self.max_stretch is not None and F.device.type == "cuda")
-        deformed, normals, turns = deform_all(F, covariances, normals, wanted)
-        if self.max_stretch is not None:
-            deformed = limit_deformed(F, deformed, covariances, self.max_stretch, self._solid(), turns)
-        return deformed, normals, turns if rotations else None
+        """``deform_all`` with the limit of the scene."""
+        solid = None if self.max_stretch is None else self._solid()
+        return deform_all(F, covariances, normals, rotations, self.max_stretch, solid)
 
     def _solid(self) -> Tensor:
         """Which of the Gaussians that move keep their shape, as their law has no return map; bool, shape (M,)."""
-        laws, index = self.points.laws, self.points.law_index
-        count = len(self.simulated)
-        solid = torch.stack([self.simulated.new_full((), not law.plastic, dtype=torch.bool) for law in laws])
-        own = solid[:1].expand(count) if index is None else solid[index[:count]]
-        return torch.cat([own, own[self.anchor[:, 0]]])
+        if self._kept is None or self._kept[0] is not self.points:  # an edit brings other points
+            laws, index = self.points.laws, self.points.law_index
+            with torch.inference_mode(False):  # it outlives the call
+                solid = torch.tensor([not law.plastic for law in laws], device=self.simulated.device)
+                count = len(self.simulated)
+                own = solid[:1].expand(count) if index is None else solid[index[:count]]
+                self._kept = (self.points, torch.cat([own, own[self.anchor[:, 0]]]))
+        return self._kept[1]
 
     def _blend(self, values: Tensor) -> Tensor:
         """Values (C, K, ...) of what each carried Gaussian follows, as one, shape (C, ...)."""

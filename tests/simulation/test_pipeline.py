@@ -380,7 +380,9 @@ def test_a_picture_takes_few_operations(name, degree, make_cloud, make_pipeline,
     shader, settings = PICTURES[name]
     pipeline = make_pipeline(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings)
     state, camera = pipeline.start(), pipeline.camera_at(0)
-    monkeypatch.setattr(scene_module, "deform_all", lambda F, a, n, rotations: (a.neg(), n, F if rotations else None))
+    monkeypatch.setattr(
+        scene_module, "deform_all", lambda F, a, n, rotations, *limit: (a.neg(), n, F if rotations else None)
+    )
     spherical_harmonics._basis_by_product(torch.ones(1, 3), degree)
     monkeypatch.setattr(spherical_harmonics, "sh_basis", spherical_harmonics._basis_by_product)
     pipeline.shade(state, camera)  # what is kept is made

@@ -86,7 +86,7 @@ class SandScene(ProceduralScene):
             skin = skin.painted((0.13, 0.10, 0.08), self._in(x, y, 0.17 * side, 0.93, 0.05))
             skin = skin.painted(0.75 * colour, self._in(x, y, 0.36 * side, 1.14, 0.09))
             skin = skin.painted(0.75 * colour, self._in(x, y, 0.42 * side, -0.76, 0.12))
-        step = max(h, 0.03)
+        step = min(max(h, 0.03), 0.12)
         beach = floor(step, (0.66, 0.55, 0.39), flat=2.2, fade=(3.0, 9.0), ambient=0.35)
         # a little below, or it would cover the grains that lie on it: Gaussians are drawn in the order of their centres
         parts = [skin, beach.mapped(shift=(0.0, 0.1, -1.6 * step))]
