@@ -280,12 +280,12 @@ def test_a_seal(tmp_path):
 def test_states_that_the_kernels_made_are_whole(formulation, law, make_pipeline, tmp_path):
     """On a GPU, or here in Triton's interpreter: nothing in them is refused."""
     pytest.importorskip("triton")
-    from gaussian_swaying.mpm import materials
+    import gaussian_swaying
     from gaussian_swaying.simulation.scene import Material
 
     if law and formulation == "total":
         pytest.skip("what flows needs `updated`")
-    material = Material(E=300.0, density=30.0, law=getattr(materials, law)() if law else None)
+    material = Material(E=300.0, density=30.0, law=getattr(gaussian_swaying, law)() if law else None)
     pipeline = make_pipeline(formulation=formulation, transfer="triton", material=material, frame_dt=0.01)
     recorder = Recorder(images=False, video=False)
     pipeline.run(recorder, tmp_path / "run", 2, progress=False)
