@@ -17,6 +17,7 @@ import numpy as np
 
 from gaussian_swaying.cli import program
 from gaussian_swaying.cli.errors import parser_sentence, run_command
+from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.cli.yaml_limits import check_config_files
 from gaussian_swaying.gaussians.compact import read_gaussians
@@ -449,7 +450,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = _joined(sys.argv[1:] if arguments is None else arguments)
     parser = build_options()
     return run_command(
-        lambda: _preview(parser.parse_args(arguments)),
+        lambda: _preview(parser.parse_args(with_shipped(arguments, "sim"))),
         stopped="Stopped; nothing was written.",
         memory="a smaller --region, or fewer Gaussians",
         arguments=arguments,

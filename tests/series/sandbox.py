@@ -178,6 +178,6 @@ def _kind(status: int, said: str) -> str:
     if code == 1:
         return "bug"
     if code == 2:
-        last = said.strip().splitlines()[-1:] or [""]
-        return "refused" if "error: " in last[0] else "no sentence"
+        sentences = [line for line in said.splitlines() if "error: " in line]  # how to go on may follow it
+        return "refused" if len(sentences) == 1 else "no sentence"
     return "ran" if code == 0 else "killed"
