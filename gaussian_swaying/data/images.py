@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.data.lens import Lens, remap
 
 _PIXELS = 80_000_000  # and one more for each byte of the file: reading takes some 12 bytes a pixel
@@ -44,6 +45,7 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """
     import imageio.v3 as iio
 
+    _refuse_pipes(path)
     try:
         height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]
     except Exception as error:  # the readers of the formats raise what they like
@@ -71,6 +73,7 @@ def read_image(path: str | Path) -> Tensor:
     """
     import imageio.v3 as iio
 
+    _refuse_pipes(path)
     try:
         with cast(Any, iio.imopen(path, "r", plugin="pillow")) as file:
             mode = file.metadata(index=0)["mode"]
@@ -86,6 +89,12 @@ def read_image(path: str | Path) -> Tensor:
     if pixels.shape[-1] == 4 and bool((pixels[..., 3] == 255).all()):
         pixels = pixels[..., :3]
     return torch.from_numpy(np.array(pixels, dtype=np.uint8))
+
+
+def _refuse_pipes(path: str | Path) -> None:
+    """Raise ValueError if something other than a file has the name of an image; reading a pipe may never end."""
+    if Path(path).exists():
+        check_regular(path, "the image")
 
 
 def _unreadable(path: str | Path, error: Exception) -> ValueError:

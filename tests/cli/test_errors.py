@@ -192,10 +192,9 @@ def test_the_page_tells_how_to_complete(tmp_path):
     """The lines of the page, in bash, give the options of the command."""
     page = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
     line = next(line for line in page.splitlines() if line.startswith("complete "))
-    line = line.replace("python tools/sim.py", f"{sys.executable} {ROOT / 'tools/sim.py'}")
-    script = (
-        f'{line}\ncomplete -p sim.py\ncompgen -W "$(complete -p sim.py | sed "s/.*-W \'//; s/\' sim.py//")" -- --wind.'
-    )
+    name = "gaussian-swaying"
+    line = line.replace(f"$({name} sim", f"$({sys.executable} {ROOT / 'tools/sim.py'}")
+    script = f'{line}\ncompgen -W "$(complete -p {name} | sed "s/.*-W \'//; s/\' {name}//")" -- --wind.'
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert "--wind.flow" in done.stdout.split()

@@ -1,5 +1,7 @@
 """Files of every kind become bytes of the wanted size, or one sentence."""
 
+import os
+
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -93,3 +95,11 @@ def test_bad_images_are_named(tmp_path, pixels):
     Image.fromarray(np.zeros((4, 4), dtype=np.float32)).save(tmp_path / "float.tiff")
     with pytest.raises(ValueError, match=r"float\.tiff holds floating-point numbers"):
         read_image(tmp_path / "float.tiff")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="makes a named pipe")
+def test_a_pipe_keeps_nobody_waiting(tmp_path):
+    os.mkfifo(tmp_path / "a.png")
+    for read in (image_size, read_image):
+        with pytest.raises(ValueError, match=r"a\.png is no regular file but a device or a pipe"):
+            read(tmp_path / "a.png")
