@@ -101,7 +101,7 @@ def test_options(tool, folders, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["nowhere", "REFERENCE"], ["There is no run folder nowhere", "tools/sim.py"]),
+        (["nowhere", "REFERENCE"], ["There is no run folder nowhere", "folder of a simulation"]),
         (["RUN", "nowhere"], ["There is no reference folder nowhere"]),
         (["RUN", "REFERENCE", "--reference-offset", "1"], ["4 pictures of", "--frames 3"]),
         (["RUN", "REFERENCE", "--i3d", "i3d.pt"], ["There is no file i3d.pt", "none is downloaded"]),
