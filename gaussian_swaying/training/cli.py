@@ -224,13 +224,13 @@ def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
             raise
         raise (stop.__context__ if isinstance(stop.__context__, KeyboardInterrupt) else KeyboardInterrupt()) from None
     run_folder.release()
-    if cli.subcommand == "fit":
-        for name in ("point_cloud.ply", "panels", "checkpoints", "csv", "tensorboard"):
-            path = cli.model.folder / name
-            if path.exists():
-                print(f"wrote {path}")
-        if (cli.model.folder / "point_cloud.ply").exists():
-            print(f"next: {next_step(cli.model.folder, cli.datamodule)}")
+    made = ("point_cloud.ply", "panels", "checkpoints", "csv", "tensorboard") if cli.subcommand == "fit" else ("csv",)
+    for name in made:
+        path = cli.model.folder / name
+        if path.exists():
+            print(f"wrote {path}")
+    if cli.subcommand == "fit" and (cli.model.folder / "point_cloud.ply").exists():
+        print(f"next: {next_step(cli.model.folder, cli.datamodule)}")
     return 130 if cli.trainer.interrupted else 0
 
 

@@ -244,7 +244,9 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
     assert _contents(tmp_path) == before
     # looking at it adds to its log
     rows = _rows(folder)
+    capsys.readouterr()
     assert main(["validate", *_arguments(capture, folder), f"--ckpt_path={last}"]) == 0
+    assert f"wrote {folder}/csv\n" in capsys.readouterr().out
     *old, new = _rows(folder)
     assert [{name: row[name] for name in rows[0]} for row in old] == rows
     assert float(new["val/psnr"]) > 0
