@@ -14,20 +14,21 @@ if TYPE_CHECKING:
     from gaussian_swaying.aero.force import AeroForce, aero_force
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
     from gaussian_swaying.aero.wind_force import WindForce
-    from gaussian_swaying.data.capture import Capture, View, read_capture
-    from gaussian_swaying.data.capture_camera import CaptureCamera
-    from gaussian_swaying.data.datamodule import CaptureDataModule
-    from gaussian_swaying.data.generated_capture import GeneratedCapture
-    from gaussian_swaying.data.initial_points import initial_points
-    from gaussian_swaying.data.point_cloud import PointCloud
+    from gaussian_swaying.captures.capture import Capture, View, read_capture
+    from gaussian_swaying.captures.capture_camera import CaptureCamera
+    from gaussian_swaying.captures.generated_capture import GeneratedCapture
+    from gaussian_swaying.captures.initial_points import initial_points
+    from gaussian_swaying.captures.point_cloud import PointCloud
+    from gaussian_swaying.evaluation.compare import compare_run
+    from gaussian_swaying.gaussians.cloud import GaussianCloud
     from gaussian_swaying.gaussians.compact import read_gaussians
     from gaussian_swaying.gaussians.export import export_cloud, write_usd
     from gaussian_swaying.gaussians.filling import InteriorFilling
-    from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
-    from gaussian_swaying.gaussians.selection import Box, Cylinder, Sphere
-    from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+    from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+    from gaussian_swaying.gaussians.ply import read_ply, write_ply
+    from gaussian_swaying.geometry.frame import SimFrame
+    from gaussian_swaying.geometry.regions import Box, Cylinder, Sphere
     from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
-    from gaussian_swaying.metrics.compare import compare_run
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance, frechet_distance
     from gaussian_swaying.mpm.boundary import (
         Boundary,
@@ -53,44 +54,75 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
     from gaussian_swaying.mpm.solver import MPMSolver
     from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
-    from gaussian_swaying.rendering.camera import Camera
-    from gaussian_swaying.rendering.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
+    from gaussian_swaying.rendering.cameras.camera import Camera
+    from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
+    from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera
     from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
-    from gaussian_swaying.rendering.keyframes import CameraKey, KeyframedCamera
     from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
     from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
     from gaussian_swaying.simulation.edits import Edit
-    from gaussian_swaying.simulation.frame import SimFrame
-    from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera
-    from gaussian_swaying.simulation.physgaussian_space import Normalisation
+    from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
+    from gaussian_swaying.simulation.physgaussian.space import Normalisation
     from gaussian_swaying.simulation.pipeline import SimulationPipeline
-    from gaussian_swaying.simulation.recorder import Recorder
+    from gaussian_swaying.simulation.recording.recorder import Recorder
+    from gaussian_swaying.simulation.recording.trajectory import load_trajectory
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
-    from gaussian_swaying.simulation.trajectory import load_trajectory
+    from gaussian_swaying.training.data.datamodule import CaptureDataModule
     from gaussian_swaying.training.densification import DefaultDensification, MCMCDensification
     from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
     from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
-    "aero.force": ("AeroForce", "aero_force"),
-    "aero.wind": ("FlowKey", "GaussianGust", "SineSway", "SpatialWind", "UniformGust", "WindField"),
+    "aero.force": (
+        "AeroForce",
+        "aero_force",
+    ),
+    "aero.wind": (
+        "FlowKey",
+        "GaussianGust",
+        "SineSway",
+        "SpatialWind",
+        "UniformGust",
+        "WindField",
+    ),
     "aero.wind_force": ("WindForce",),
-    "data.capture": ("Capture", "View", "read_capture"),
-    "data.capture_camera": ("CaptureCamera",),
-    "data.datamodule": ("CaptureDataModule",),
-    "data.generated_capture": ("GeneratedCapture",),
-    "data.initial_points": ("initial_points",),
-    "data.point_cloud": ("PointCloud",),
+    "captures.capture": (
+        "Capture",
+        "View",
+        "read_capture",
+    ),
+    "captures.capture_camera": ("CaptureCamera",),
+    "captures.generated_capture": ("GeneratedCapture",),
+    "captures.initial_points": ("initial_points",),
+    "captures.point_cloud": ("PointCloud",),
+    "evaluation.compare": ("compare_run",),
+    "gaussians.cloud": ("GaussianCloud",),
     "gaussians.compact": ("read_gaussians",),
-    "gaussians.export": ("export_cloud", "write_usd"),
+    "gaussians.export": (
+        "export_cloud",
+        "write_usd",
+    ),
     "gaussians.filling": ("InteriorFilling",),
-    "gaussians.ply": ("GaussianCloud", "read_ply", "write_ply"),
-    "gaussians.selection": ("Box", "Cylinder", "Sphere"),
-    "gaussians.surface": ("GaussianSurfaceModel",),
-    "metrics.chamfer": ("ChamferDistance", "chamfer_distance"),
-    "metrics.compare": ("compare_run",),
-    "metrics.frechet_video": ("FrechetVideoDistance", "frechet_distance"),
+    "gaussians.model": ("GaussianSurfaceModel",),
+    "gaussians.ply": (
+        "read_ply",
+        "write_ply",
+    ),
+    "geometry.frame": ("SimFrame",),
+    "geometry.regions": (
+        "Box",
+        "Cylinder",
+        "Sphere",
+    ),
+    "metrics.chamfer": (
+        "ChamferDistance",
+        "chamfer_distance",
+    ),
+    "metrics.frechet_video": (
+        "FrechetVideoDistance",
+        "frechet_distance",
+    ),
     "mpm.boundary": (
         "Boundary",
         "EnclosingBox",
@@ -114,24 +146,52 @@ _HOMES = {
     "mpm.laws.snow": ("Snow",),
     "mpm.laws.spring_network": ("SpringNetwork",),
     "mpm.solver": ("MPMSolver",),
-    "mpm.state": ("GridSpec", "MPMState", "MaterialPoints"),
-    "rendering.camera": ("Camera",),
-    "rendering.camera_path": ("LookAtCamera", "OrbitCamera", "TransformsCamera"),
+    "mpm.state": (
+        "GridSpec",
+        "MPMState",
+        "MaterialPoints",
+    ),
+    "rendering.cameras.camera": ("Camera",),
+    "rendering.cameras.camera_path": (
+        "LookAtCamera",
+        "OrbitCamera",
+        "TransformsCamera",
+    ),
+    "rendering.cameras.keyframes": (
+        "CameraKey",
+        "KeyframedCamera",
+    ),
     "rendering.gsplat_renderer": ("GsplatRenderer",),
-    "rendering.keyframes": ("CameraKey", "KeyframedCamera"),
-    "rendering.shading": ("DiffuseShader", "PhongShader"),
+    "rendering.shading": (
+        "DiffuseShader",
+        "PhongShader",
+    ),
     "rendering.torch_renderer": ("TorchRenderer",),
-    "simulation.diagnostics": ("SimulationDiverged", "TearingGauge"),
+    "simulation.diagnostics": (
+        "SimulationDiverged",
+        "TearingGauge",
+    ),
     "simulation.edits": ("Edit",),
-    "simulation.frame": ("SimFrame",),
-    "simulation.physgaussian_camera": ("PhysGaussianCamera",),
-    "simulation.physgaussian_space": ("Normalisation",),
+    "simulation.physgaussian.camera": ("PhysGaussianCamera",),
+    "simulation.physgaussian.space": ("Normalisation",),
     "simulation.pipeline": ("SimulationPipeline",),
-    "simulation.recorder": ("Recorder",),
-    "simulation.scene": ("Material", "Scene", "SimulatedScene"),
-    "simulation.trajectory": ("load_trajectory",),
-    "training.densification": ("DefaultDensification", "MCMCDensification"),
-    "training.losses": ("LossInputs", "LossTerm", "TotalLoss"),
+    "simulation.recording.recorder": ("Recorder",),
+    "simulation.recording.trajectory": ("load_trajectory",),
+    "simulation.scene": (
+        "Material",
+        "Scene",
+        "SimulatedScene",
+    ),
+    "training.data.datamodule": ("CaptureDataModule",),
+    "training.densification": (
+        "DefaultDensification",
+        "MCMCDensification",
+    ),
+    "training.losses": (
+        "LossInputs",
+        "LossTerm",
+        "TotalLoss",
+    ),
     "training.module": ("SplatTrainer",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

@@ -9,7 +9,7 @@ from torch import nn
 
 from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.aero.wind import GaussianGust, Modulation, SineSway, UniformGust, WindField
-from gaussian_swaying.gaussians.selection import Box, Everything, Not, Union
+from gaussian_swaying.geometry.regions import Box, Everything, Not, Union
 from gaussian_swaying.mpm import boundary
 from gaussian_swaying.mpm.boundary import Boundary, PinnedRegion, Plane, VelocityBox
 

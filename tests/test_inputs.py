@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gaussian_swaying._inputs import check_archive, check_regular, read_json
-from gaussian_swaying.data.images import image_size
+from gaussian_swaying.captures.images import image_size
 
 
 def test_a_pipe_and_a_device_are_no_files(tmp_path):

@@ -28,12 +28,13 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, deform_patch
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.scenes.procedural import FlagScene
 
 NAMES = ("wind speed", "Young's modulus")
 TRUTH = (6.0, 4.0e3)  # m/s, Pa

@@ -3,7 +3,7 @@
 import sys
 
 import gaussian_swaying.cli  # noqa: F401  (sets up threads, before torch is imported)
-from gaussian_swaying.training.cli import main
+from gaussian_swaying.cli.train import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.mpm.linalg_triton import cofactor, cross3, dot3
+from gaussian_swaying.geometry.linalg_triton import cofactor, cross3, dot3
 
 
 @triton.jit

@@ -11,7 +11,7 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.wind import SpatialWind, WindField
-from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
 from gaussian_swaying.mpm.state import MPMState
 

@@ -14,7 +14,7 @@ from itertools import pairwise
 import torch
 
 from gaussian_swaying.cli.streams import SafeStream, safe_streams
-from gaussian_swaying.simulation.signals import exit_code
+from gaussian_swaying.runs.signals import exit_code
 
 OK, BUG, BAD_INPUT = 0, 1, 2
 

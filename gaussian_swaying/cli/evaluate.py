@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gaussian_swaying.cli import program
+from gaussian_swaying import _program as program
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.simulation.config import resolve_device
 
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def compare(options: argparse.Namespace) -> None:
     """Compare, print the table and say what was written."""
-    from gaussian_swaying.metrics.compare import evaluate, table  # they need torchmetrics
+    from gaussian_swaying.evaluation.compare import evaluate, table  # they need torchmetrics
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
     output = Path(options.output or Path(options.run) / "eval")

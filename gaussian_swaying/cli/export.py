@@ -6,11 +6,11 @@ from pathlib import Path
 
 import torch
 
+from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.cli import program
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.export import SUFFIXES, convert, format_of
-from gaussian_swaying.simulation.frame import SimFrame
+from gaussian_swaying.geometry.frame import SimFrame
 
 
 def build_options() -> argparse.ArgumentParser:

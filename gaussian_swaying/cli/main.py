@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import gaussian_swaying
-from gaussian_swaying.cli import program
+from gaussian_swaying import _program as program
 
 COMMANDS = {
-    "sim": ("gaussian_swaying.simulation.config", "let the wind move a scene: splat in, video out"),
-    "train": ("gaussian_swaying.training.cli", "train Gaussians that lie on surfaces, from photos"),
-    "preview": ("gaussian_swaying.simulation.preview_cli", "look at a splat, and guess its first configuration"),
+    "sim": ("gaussian_swaying.cli.simulate", "let the wind move a scene: splat in, video out"),
+    "train": ("gaussian_swaying.cli.train", "train Gaussians that lie on surfaces, from photos"),
+    "preview": ("gaussian_swaying.cli.preview", "look at a splat, and guess its first configuration"),
     "eval": ("gaussian_swaying.cli.evaluate", "compare a run with a reference"),
     "export": ("gaussian_swaying.cli.export", "convert a splat, or a run's splats to USD"),
     "convert": ("gaussian_swaying.cli.convert", "turn a PhysGaussian configuration into a YAML file"),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 _RAYS = 32  # directions in which the cell of a patch is measured
 _SLAB = 0.75  # half thickness of one sheet, in neighbour spacings

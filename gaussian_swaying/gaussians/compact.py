@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.gaussians.ply import GaussianCloud, check_sizes_and_rotations, read_binary_header, read_ply
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.ply import check_sizes_and_rotations, read_binary_header, read_ply
 from gaussian_swaying.gaussians.ply_table import read_element, read_header
-from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
 
 CHUNK = 256  # Gaussians that share a range of values in a compressed .ply
 _SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])

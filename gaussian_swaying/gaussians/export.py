@@ -15,11 +15,13 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying._files import atomic
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
-from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
-from gaussian_swaying.simulation.files import atomic
+from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.patches import smallest_axis_normal
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 SUFFIXES = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
 """Formats, and how their files' names end."""

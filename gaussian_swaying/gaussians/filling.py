@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 MAX_CELLS = 30_000_000  # of the density grid: 120 MB, and some ten times that while it is used
 _BLUR = 0.5  # standard deviation of the blur that keeps thin Gaussians from falling between cell centres, in cells

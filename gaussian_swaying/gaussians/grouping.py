@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 
 @torch.no_grad()

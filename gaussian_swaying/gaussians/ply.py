@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import re
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from gaussian_swaying._checks import check_shape
+from gaussian_swaying._files import atomic
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply_table import PlyHeader, read_element, read_header
-from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
-from gaussian_swaying.simulation.files import atomic
 
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -27,68 +21,6 @@ _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
 _OPAQUE_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, as opaque as float32 tells apart from 1
-
-
-@dataclass(frozen=True, slots=True)
-class GaussianCloud:
-    """3D Gaussians in storage form, as a 3DGS .ply file holds them.
-
-    Attributes:
-        means: Centres [scene units], shape (N, 3).
-        quats: Rotations as quaternions wxyz, not normalised, shape (N, 4).
-        scales: Natural logarithm of the standard deviations [scene units] along the axes, shape (N, 3).
-        opacities: Logit of the opacity, shape (N,).
-        sh: Spherical harmonics coefficients of the colour, constant first, shape (N, K, 3) with K = 1, 4, 9 or 16.
-        normals: Surface normals that came with the Gaussians, shape (N, 3), or None.
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
-        TypeError: If one is not a tensor.
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh: Tensor
-    normals: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        check_shape("means", self.means, None, 3)
-        count = self.means.shape[0]
-        sizes: dict[str, tuple[int | None, ...]] = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3)}
-        sizes |= {"opacities": (count,), "sh": (count, None, 3)}
-        if self.normals is not None:
-            sizes["normals"] = (count, 3)
-        for name, size in sizes.items():
-            tensor = getattr(self, name)
-            check_shape(name, tensor, *size)
-            if tensor.ndim != len(size):
-                raise ValueError(f"Expected `{name}` to have {len(size)} dimensions, but got {tuple(tensor.shape)}.")
-        sh_degree(self.sh.shape[1])
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 3."""
-        return sh_degree(self.sh.shape[1])
-
-    def to(self, *args: Any, **kwargs: Any) -> GaussianCloud:
-        """Copy with every tensor moved or cast by :meth:`torch.Tensor.to`."""
-        return self._map(lambda tensor: tensor.to(*args, **kwargs))
-
-    def select(self, mask: Tensor) -> GaussianCloud:
-        """The Gaussians that a boolean mask (N,) or an index tensor (M,) picks."""
-        if mask.dtype == torch.bool:
-            check_shape("mask", mask, len(self))
-        return self._map(lambda tensor: tensor[mask])
-
-    def _map(self, function: Callable[[Tensor], Tensor]) -> GaussianCloud:
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        changed: dict[str, Any] = {name: None if t is None else function(t) for name, t in fields.items()}
-        return GaussianCloud(**changed)
 
 
 def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -176,7 +108,7 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     """
     from plyfile import PlyData, PlyElement
 
-    from gaussian_swaying.gaussians.surface import smallest_axis_normal
+    from gaussian_swaying.geometry.patches import smallest_axis_normal
 
     path = Path(path)
     if len(cloud) == 0:

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
-from gaussian_swaying.gaussians.surface import quat_to_rotation
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 _VISIBLE = 0.25  # opacity down to which a Gaussian counts as surface
 _NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: those amid a square of four

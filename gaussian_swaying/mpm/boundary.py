@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._graphs import Recordable
-from gaussian_swaying.gaussians.selection import Region
+from gaussian_swaying.geometry.regions import Region
 
 
 class FrameLike(Protocol):

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.linalg import matmul3
+from gaussian_swaying.geometry.linalg import matmul3
 
 
 def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: float) -> Tensor:

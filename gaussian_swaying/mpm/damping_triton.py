@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
 
-from gaussian_swaying.mpm.linalg_triton import matmul, scale9, transpose
+from gaussian_swaying.geometry.linalg_triton import matmul, scale9, transpose
 
 
 @triton.jit

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
+from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Impulse, Nodes
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
-from gaussian_swaying.mpm.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.mpm.recompute import recompute
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed

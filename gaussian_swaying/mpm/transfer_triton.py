@@ -19,16 +19,9 @@ Rows of node arrays: in ``total`` displacement and velocity, each in four column
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import axpy9, largest, largest_eigenvalue, matmul, scale9, transpose
 from gaussian_swaying.mpm.damping_triton import kelvin_voigt_pk1
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff, pk1
-from gaussian_swaying.mpm.linalg_triton import (
-    axpy9,
-    largest,
-    largest_eigenvalue,
-    matmul,
-    scale9,
-    transpose,
-)
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""

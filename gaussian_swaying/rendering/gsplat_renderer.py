@@ -4,15 +4,15 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.gaussians.spherical_harmonics import sh_degree
-from gaussian_swaying.rendering.base import (
+from gaussian_swaying.gaussians.harmonics import sh_degree
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import (
     RenderOutput,
     ScreenGaussians,
     SplatOutput,
     check_gaussians,
     finite_gaussians,
 )
-from gaussian_swaying.rendering.camera import Camera
 
 
 def gsplat_works() -> bool:
@@ -205,7 +205,7 @@ class GsplatRenderer(nn.Module):
         camera: Camera,
         background: Tensor | None = None,
     ) -> RenderOutput:
-        """Render one picture, see :class:`~gaussian_swaying.rendering.base.Renderer`."""
+        """Render one picture, see :class:`~gaussian_swaying.rendering.protocol.Renderer`."""
         return render_gsplat(means, covariances, opacities, colors, camera, background, self.eps2d)
 
     def render_splat(
@@ -219,7 +219,7 @@ class GsplatRenderer(nn.Module):
         background: Tensor | None = None,
         absgrad: bool = False,
     ) -> SplatOutput:
-        """Render one picture in training, see :class:`~gaussian_swaying.rendering.base.SplatRenderer`.
+        """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`.
 
         In float32. Harmonics and covariances are left to gsplat's kernels, which differentiate them too; Gaussians
         that are not finite are not looked for.

@@ -14,16 +14,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
-from gaussian_swaying.gaussians.surface import covariance
-from gaussian_swaying.rendering.base import (
+from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import (
     RenderOutput,
     ScreenGaussians,
     SplatOutput,
     check_gaussians,
     finite_gaussians,
 )
-from gaussian_swaying.rendering.camera import Camera
 
 MIN_ALPHA = 1.0 / 255.0
 """A Gaussian adds nothing to a pixel where its alpha is smaller."""
@@ -333,7 +333,7 @@ class TorchRenderer(nn.Module):
         camera: Camera,
         background: Tensor | None = None,
     ) -> RenderOutput:
-        """Render one picture, see :class:`~gaussian_swaying.rendering.base.Renderer`."""
+        """Render one picture, see :class:`~gaussian_swaying.rendering.protocol.Renderer`."""
         return render_torch(means, covariances, opacities, colors, camera, background, self.eps2d, self.max_pairs)
 
     def render_splat(
@@ -347,7 +347,7 @@ class TorchRenderer(nn.Module):
         background: Tensor | None = None,
         absgrad: bool = False,
     ) -> SplatOutput:
-        """Render one picture in training, see :class:`~gaussian_swaying.rendering.base.SplatRenderer`."""
+        """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`."""
         if absgrad:
             raise ValueError("TorchRenderer has no absolute gradients: leave `absgrad` off, or train on a GPU.")
         camera = camera.to(means.device, means.dtype)

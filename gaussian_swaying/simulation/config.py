@@ -4,36 +4,29 @@ from __future__ import annotations
 
 import sys
 from argparse import SUPPRESS, Action
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
+from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.cli import program
-from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.cli.shipped import with_shipped
-from gaussian_swaying.cli.suggestions import guessing
-from gaussian_swaying.cli.yaml_limits import check_config_files, limit_yaml
-from gaussian_swaying.data.capture_camera import CaptureCamera
+from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.mpm.boundary import RegionInFrame
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera_path import CameraPath, OrbitCamera
-from gaussian_swaying.rendering.keyframes import KeyframedCamera
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
+from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.continuing import how_to_resume
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.physgaussian import convert, read_config, to_yaml
-from gaussian_swaying.simulation.physgaussian_camera import PhysGaussianCamera
-from gaussian_swaying.simulation.physgaussian_space import Normalisation
+from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
+from gaussian_swaying.simulation.physgaussian.convert import convert, read_config, to_yaml
+from gaussian_swaying.simulation.physgaussian.space import Normalisation
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
-from gaussian_swaying.simulation.signals import stop_signals
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -215,81 +208,3 @@ def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[Simulat
         edits=parts.edits,
     )
     return pipeline, parts.recorder
-
-
-def config_text(parser: ArgumentParser, settings: Namespace) -> str:
-    """The settings that decide the result, as YAML."""
-    kept = settings.clone()
-    for name in RUN_ONLY:
-        kept.pop(name, None)
-    return str(parser.dump(kept, skip_validation=True))
-
-
-def output_folder(settings: Namespace) -> Path:
-    """The folder asked for, or one named after the config file."""
-    if settings.output:
-        return Path(settings.output)
-    files = [str(file) for file in settings.config or []]
-    return Path("outputs") / (Path(files[-1]).stem if files else "run")
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse, build, run.
-
-    Args:
-        arguments: Command line; that of the process if None.
-
-    Returns:
-        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM,
-        129 by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    parser = build_parser()
-    started: list[SimulationPipeline] = []
-
-    def advice(error: BaseException) -> str | None:
-        """How to go on from the checkpoint that the run has left, if it has left one."""
-        if not started or started[0].resumable is None:
-            return None
-        return how_to_resume(*started[0].resumable, arguments, isinstance(error, SimulationDiverged))
-
-    return run_command(
-        lambda: _simulate(parser, arguments, started),
-        stopped="Stopped; what was recorded is kept.",
-        advice=advice,
-        memory="a smaller `scene.region`, a coarser `solver.dx` or a smaller picture",
-        expected=(SimulationDiverged,),
-        arguments=arguments,
-    )
-
-
-def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[SimulationPipeline]) -> None:
-    """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
-    arguments = with_shipped(arguments, "sim")
-    check_config_files(arguments)
-    with guessing(parser):
-        settings = parser.parse_args(arguments)
-    pipeline, recorder = build_pipeline(parser, settings)
-    folder = output_folder(settings)
-    scene = pipeline.scene
-    by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
-    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {pipeline.device}")
-    if scene.filled:
-        print(f"{scene.filled:,} points fill the inside")
-    print(scene.frame.describe())
-    extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
-    text = config_text(parser, settings)
-    started.append(pipeline)
-    with stop_signals():
-        summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
-    seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
-    print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
-    if summary["torn_particles"]:
-        print(
-            f"warning: {summary['torn_particles']} particles are farther than two cells from a neighbour, so the "
-            "material fell apart numerically: use `solver.formulation: total`, or a coarser `solver.dx`.",
-            file=sys.stderr,
-        )
-    beside = [folder / name for name in ("diagnostics.csv", "checkpoint.pt", "config.yaml")]
-    for file in [*pipeline.files, *(file for file in beside if file.exists())]:
-        print(f"wrote {file}")

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
-from gaussian_swaying.mpm.linalg import determinant, matmul3, symmetric_eigenvalues
+from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.simulation.health import particle_of_extremes

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.gaussians.selection import Region
-from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.scene import SimulatedScene

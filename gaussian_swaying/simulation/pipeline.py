@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import platform
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,23 +13,27 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
-import gaussian_swaying
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.surface import DeformedGaussians, covariance_to_quat_scale, deform_patch
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
+from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering import passes
-from gaussian_swaying.rendering.base import Renderer, RenderOutput, make_renderer
-from gaussian_swaying.rendering.camera import Camera
-from gaussian_swaying.rendering.camera_path import CameraPath
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation import signals
-from gaussian_swaying.simulation.checkpoint import check_state, unreadable
+from gaussian_swaying.runs import signals
+from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     SimulationDiverged,
@@ -42,9 +45,9 @@ from gaussian_swaying.simulation.diagnostics import (
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.recorder import Recorder, check_camera_name, frame_folder
+from gaussian_swaying.simulation.recording.checkpoint import check_state, unreadable
+from gaussian_swaying.simulation.recording.recorder import Recorder, check_camera_name, frame_folder
 from gaussian_swaying.simulation.scene import SimulatedScene
-from gaussian_swaying.simulation.seal import sha256
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
@@ -414,7 +417,7 @@ class SimulationPipeline(nn.Module):
 
     def cloud(self, gaussians: DeformedGaussians) -> GaussianCloud:
         """Deformed Gaussians in storage form, harmonics turned with the patches."""
-        from gaussian_swaying.gaussians.spherical_harmonics import rotate_sh
+        from gaussian_swaying.gaussians.harmonics import rotate_sh
 
         cloud = self.scene.model.to_cloud()
         quats, scales = covariance_to_quat_scale(gaussians.covariances)
@@ -767,26 +770,3 @@ class _PeakMemory:
             host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
         device = torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
         return {"host": host, "device": device}
-
-
-def describe_device(device: torch.device) -> str:
-    """Name of the processor or GPU, with the number of threads."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
-
-
-def versions() -> dict[str, str]:
-    """Versions that a number depends on."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {"python": platform.python_version(), "gaussian_swaying": gaussian_swaying.__version__}
-    for name in ("torch", "gsplat", "numpy"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-__all__ = ["SimulationPipeline", "describe_device", "versions"]

@@ -9,24 +9,22 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.grouping import blend_weights, group_points
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
+from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
+from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
-from gaussian_swaying.gaussians.surface import (
-    DeformedGaussians,
-    GaussianSurfaceModel,
-    deform_all,
-)
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.patches import deform_all
+from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
-from gaussian_swaying.simulation.frame import SimFrame
 
 
 @dataclass
@@ -107,7 +105,7 @@ class Scene:
         wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
             those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
         max_stretch: How many times its size at rest a Gaussian is drawn at most (see
-            :func:`~gaussian_swaying.gaussians.surface.limit_deformed`), in pictures and exports; null for no limit.
+            :func:`~gaussian_swaying.geometry.covariances.limit_deformed`), in pictures and exports; null for no limit.
             Nothing changes below the limit. Beyond it a Gaussian would be a streak: there two parts of the object that
             share cells of the grid were pulled apart, or a material flowed.
         layers: Layers of material points through the thickness: 1, a membrane that folds without resistance, or 3,

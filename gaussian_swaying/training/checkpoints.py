@@ -10,8 +10,8 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from gaussian_swaying.simulation.files import atomic, kind_of
-from gaussian_swaying.simulation.seal import check_seal, seal
+from gaussian_swaying._files import atomic, kind_of
+from gaussian_swaying.runs.seal import check_seal, seal
 from gaussian_swaying.training.densification import PARAMETERS
 
 _FIELDS = {"densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen"}

@@ -10,7 +10,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
-from gaussian_swaying.simulation.files import check_regular, write_table
+from gaussian_swaying._files import check_regular, write_table
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:

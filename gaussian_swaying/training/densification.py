@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.subdivision import split_large
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
-from gaussian_swaying.rendering.base import ScreenGaussians
+from gaussian_swaying.rendering.protocol import ScreenGaussians
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """Parameters of a :class:`GaussianSurfaceModel`; a training has one optimiser for each."""

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 
 def gaussians_from_points(

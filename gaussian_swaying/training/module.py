@@ -18,11 +18,12 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
-from gaussian_swaying.rendering.base import SplatOutput, SplatRenderer, make_renderer
-from gaussian_swaying.rendering.camera import Camera
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.losses import SSIM_TAPS, LossInputs, LossTerm, TotalLoss
 from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
@@ -127,7 +128,7 @@ def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: i
 
 
 class SplatTrainer(lightning.LightningModule):
-    """Trains a :class:`~gaussian_swaying.gaussians.surface.GaussianSurfaceModel` on photos with known cameras.
+    """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
     A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one. Its
     random numbers come from a stream of their own, which starts from the seed and is kept in checkpoints, so that
@@ -157,7 +158,7 @@ class SplatTrainer(lightning.LightningModule):
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
 
     Attributes:
-        renderer: What draws; that of :func:`~gaussian_swaying.rendering.base.make_renderer` if it is None.
+        renderer: What draws; that of :func:`~gaussian_swaying.rendering.factory.make_renderer` if it is None.
 
     Raises:
         ValueError: If a value is out of range.

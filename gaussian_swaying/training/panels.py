@@ -10,30 +10,15 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
-from gaussian_swaying.rendering.base import Renderer
-from gaussian_swaying.rendering.camera import Camera
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.protocol import Renderer
 
-_RAMP = ((0.27, 0.00, 0.33), (0.23, 0.32, 0.55), (0.13, 0.57, 0.55), (0.37, 0.79, 0.38), (0.99, 0.91, 0.14))
 # the very files that torchvision would download
 _BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
 LPIPS_SIDE = 32
 """Fewest pixels on a side that the backbones of LPIPS take."""
-
-
-def color_ramp(values: Tensor) -> Tensor:
-    """Colours from dark blue (0) to yellow (1), even in lightness.
-
-    Args:
-        values: Numbers, clamped to 0 to 1, shape (...).
-
-    Returns:
-        RGB, shape (..., 3).
-    """
-    stops = torch.tensor(_RAMP, dtype=values.dtype, device=values.device)
-    place = values.clamp(0.0, 1.0) * (len(_RAMP) - 1)
-    below = place.floor().long().clamp_max(len(_RAMP) - 2)
-    return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None])
 
 
 @torch.no_grad()
@@ -69,7 +54,7 @@ def panel(
         some = areas[:: len(areas) // 100_000 + 1]  # quantile takes only so many
         low, high = some.quantile(0.05), some.quantile(0.95)
         areas = (areas - low) / (high - low).clamp_min(1e-6)
-    drawn = [renderer(*gaussians, colors, camera).color for colors in (normal_colors, color_ramp(areas))]
+    drawn = [renderer(*gaussians, colors, camera).color for colors in (normal_colors, colormap(areas))]
     return torch.cat([photo.to(image), image, *drawn], dim=1).clamp(0.0, 1.0)
 
 

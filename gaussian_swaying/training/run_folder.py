@@ -11,10 +11,9 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger
 
-from gaussian_swaying.simulation.files import remove_temporaries
-from gaussian_swaying.simulation.lock import FolderLock
-from gaussian_swaying.simulation.output import MARKER, claim_folder, hold_folder, mark
-from gaussian_swaying.simulation.resume import check_names
+from gaussian_swaying._files import remove_temporaries
+from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
+from gaussian_swaying.runs.lock import FolderLock
 
 _FILES = ["run.json", "point_cloud.ply", "csv/metrics.csv", "csv/config.yaml"]
 _FOLDERS = ["checkpoints", "panels", "csv", "tensorboard"]

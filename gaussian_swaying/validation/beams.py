@@ -7,7 +7,7 @@ import math
 import torch
 
 from gaussian_swaying._checks import check_choice
-from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import Boundary, PinnedRegion
 from gaussian_swaying.validation.settings import Axial, Result, Settings, block, follow
 

@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from gaussian_swaying.data.generated_capture import GeneratedCapture
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.captures.generated_capture import GeneratedCapture
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 
 
 @torch.no_grad()

@@ -8,9 +8,10 @@ import torch
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel, rotation_to_quat
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.geometry.rotations import rotation_to_quat
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.validation.settings import Result
 
 RADIUS, SIDE = 0.5, 0.8  # [m]

@@ -8,7 +8,7 @@ import torch
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 

@@ -6,11 +6,12 @@ import pytest
 import yaml
 
 import gaussian_swaying
-from gaussian_swaying.cli import program, shipped
+from gaussian_swaying import _program as program
+from gaussian_swaying.cli import shipped
+from gaussian_swaying.cli.continuing import command
 from gaussian_swaying.cli.main import COMMANDS, main
-from gaussian_swaying.simulation.config import main as simulate
-from gaussian_swaying.simulation.continuing import command
-from gaussian_swaying.training.cli import make_cli
+from gaussian_swaying.cli.simulate import main as simulate
+from gaussian_swaying.cli.train import make_cli
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
-from gaussian_swaying.gaussians.surface import quat_to_rotation
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

@@ -5,10 +5,11 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_compressed_ply, read_gaussians, read_splat
 from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.simulation.scene import Scene
 
 

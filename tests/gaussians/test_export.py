@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.export import (
     SUFFIXES,
     UsdFilm,
@@ -18,8 +19,8 @@ from gaussian_swaying.gaussians.export import (
     usd_arrays,
     write_usd,
 )
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
-from gaussian_swaying.gaussians.surface import quat_to_rotation
+from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 SH_DC = 0.28209479177387814
 

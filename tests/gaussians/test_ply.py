@@ -9,8 +9,9 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
-from gaussian_swaying.gaussians.surface import smallest_axis_normal
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 REST = {0: 0, 1: 9, 2: 24, 3: 45}
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
@@ -359,7 +360,7 @@ def test_a_pipe_is_refused(tmp_path):
 
 def test_only_the_element_of_the_gaussians_is_read(tmp_path):
     """Elements before and after it are passed over, lists too if they come after."""
-    from gaussian_swaying.data.procedural import FlagScene
+    from gaussian_swaying.scenes.procedural import FlagScene
 
     cloud = FlagScene(spacing=0.3).generate()
     write_ply(tmp_path / "flag.ply", cloud)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.area import coverage_area
-from gaussian_swaying.gaussians.neighbours import nearest_neighbours
 from gaussian_swaying.gaussians.subdivision import split_large, subdivide
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 
 def _sheet(side, spacing, size, opacity=0.99):

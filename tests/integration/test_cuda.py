@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.selection import Box, Cylinder, Everything, Not, Sphere, Union
+from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.boundary import (
     EnclosingBox,
     Handle,
@@ -18,9 +20,7 @@ from gaussian_swaying.mpm.boundary import (
 )
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.config import main
-from gaussian_swaying.simulation.frame import SimFrame
-from gaussian_swaying.simulation.trajectory import load_trajectory
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 
 pytestmark = pytest.mark.gpu
 FLAG = str(Path(__file__).resolve().parents[2] / "configs" / "sim" / "flag.yaml")

@@ -12,11 +12,11 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from gaussian_swaying.simulation.checkpoint import read_checkpoint, write_checkpoint
-from gaussian_swaying.simulation.config import main
+from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.trajectory import load_trajectory
+from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 
 ROOT = Path(__file__).parents[2]
 PIN = (

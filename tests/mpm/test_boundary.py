@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.selection import Box, Cylinder, Everything, Not, Sphere, Union
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.boundary import (
     EnclosingBox,
     Handle,
@@ -21,7 +22,6 @@ from gaussian_swaying.mpm.boundary import (
 )
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.frame import SimFrame
 
 FORMULATIONS = ["total", "updated"]
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.mpm import dispatch, linalg
+from gaussian_swaying.geometry import linalg
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm import dispatch
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.laws import law as law_module
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated

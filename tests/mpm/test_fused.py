@@ -17,7 +17,7 @@ from gaussian_swaying import _graphs
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.gaussians.selection import Box, Everything
+from gaussian_swaying.geometry.regions import Box, Everything
 from gaussian_swaying.mpm.boundary import (
     Boundary,
     EnclosingBox,

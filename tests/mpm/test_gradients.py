@@ -9,8 +9,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter
 
 from gaussian_swaying.aero.force import aero_force
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean

@@ -9,7 +9,9 @@ from pkgutil import iter_modules
 import pytest
 import torch
 
-from gaussian_swaying.mpm import laws, linalg
+from gaussian_swaying.geometry import linalg
+from gaussian_swaying.geometry.linalg import spectrum
+from gaussian_swaying.mpm import laws
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
 from gaussian_swaying.mpm.laws.foam import Foam
@@ -22,7 +24,6 @@ from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
-from gaussian_swaying.mpm.linalg import spectrum
 
 LAWS = {
     "fixed corotated": FixedCorotated(),

@@ -8,12 +8,12 @@ import pytest
 import torch
 import yaml
 
+from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.laws import LAWS
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.config import main
-from gaussian_swaying.simulation.trajectory import load_trajectory
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 
 try:
     from gaussian_swaying.mpm import fused
@@ -28,7 +28,7 @@ LAW = '''
 import torch
 
 from gaussian_swaying import ConstitutiveLaw
-from gaussian_swaying.mpm.linalg import matmul3
+from gaussian_swaying.geometry.linalg import matmul3
 
 
 class Saint(ConstitutiveLaw):
@@ -67,7 +67,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import matmul, transpose
+from gaussian_swaying.geometry.linalg_triton import matmul, transpose
 
 
 @triton.jit

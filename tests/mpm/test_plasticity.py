@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying.geometry.linalg import from_principal, spectrum
 from gaussian_swaying.mpm.laws.fluid import fluid_flow
 from gaussian_swaying.mpm.laws.foam import viscoplastic
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
 from gaussian_swaying.mpm.laws.sand import cone_slope, drucker_prager
 from gaussian_swaying.mpm.laws.shared import lame_parameters, von_mises
 from gaussian_swaying.mpm.laws.snow import snow_plasticity
-from gaussian_swaying.mpm.linalg import from_principal, spectrum
 
 E, NU = torch.tensor(3000.0, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
 MU, LAM = lame_parameters(E, NU)

@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.camera import Camera, look_at_camera, orbit_camera, rotation_from_z
+from gaussian_swaying.geometry.rotations import rotation_from_z
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera, orbit_camera
 
 
 def test_look_at_puts_the_target_at_the_centre_and_up_at_the_top(device, dtype, project):

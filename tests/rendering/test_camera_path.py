@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.camera import orbit_camera
-from gaussian_swaying.rendering.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
+from gaussian_swaying.rendering.cameras.camera import orbit_camera
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
 
 
 def test_orbit_path_scales_with_the_object_and_turns_with_time():

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.base import make_renderer
-from gaussian_swaying.rendering.camera import look_at_camera
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, rasterize_splat, render_gsplat
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 

@@ -6,9 +6,9 @@ from itertools import pairwise
 import pytest
 import torch
 
-from gaussian_swaying.rendering.camera import look_at_camera
-from gaussian_swaying.rendering.camera_path import OrbitCamera
-from gaussian_swaying.rendering.keyframes import CameraKey, KeyframedCamera, interpolate_keys
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera, interpolate_keys
 
 CENTER, UP = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 TIMES = [0.0, 1.0, 1.5, 4.0]

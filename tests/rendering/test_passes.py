@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.base import RenderOutput
-from gaussian_swaying.rendering.camera import look_at_camera
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import (
-    colormap,
     depth_colors,
     depth_steps,
     facing,
@@ -16,6 +15,7 @@ from gaussian_swaying.rendering.passes import (
     normal_colors,
     scalar_colors,
 )
+from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.rendering.torch_renderer import render_torch
 
 

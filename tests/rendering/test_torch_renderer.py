@@ -5,10 +5,11 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.gaussians import surface
-from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
-from gaussian_swaying.rendering.base import finite_gaussians, make_renderer
-from gaussian_swaying.rendering.camera import Camera, look_at_camera
+from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.geometry import covariances
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.protocol import finite_gaussians
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
 
 WIDTH, HEIGHT = 20, 14
@@ -286,7 +287,7 @@ def test_a_splat_as_it_is_stored():
     background = torch.tensor([0.2, 0.4, 0.6])
     renderer = TorchRenderer()
     colors = sh_to_color(sh, means - camera.position)
-    expected = renderer(means, surface.covariance(quats, log_scales), opacities, colors, camera, background)
+    expected = renderer(means, covariances.covariance(quats, log_scales), opacities, colors, camera, background)
     tensors = [t.requires_grad_() for t in (means, quats, log_scales, opacities, sh)]
     result = renderer.render_splat(*tensors, camera, background)
     torch.testing.assert_close(result.color, expected.color)

@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.rendering.camera_path import TransformsCamera
-from gaussian_swaying.rendering.transforms_json import camera_from_transforms
+from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
+from gaussian_swaying.rendering.cameras.transforms_json import camera_from_transforms
 
 # Blender camera at (1, 2, 3) that looks along +x with z up: OpenGL axes right = -y, up = +z, backward = -x.
 POSE = [[0.0, 0.0, -1.0, 1.0], [-1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]

@@ -24,11 +24,12 @@ def commands() -> dict[str, Callable[[list[str]], int | None]]:
     """Each command by its name, as a function of its arguments that gives the exit code."""
     import torch
 
+    from gaussian_swaying.captures.capture import read_capture
+    from gaussian_swaying.cli import preview as preview_cli
+    from gaussian_swaying.cli import train as training
     from gaussian_swaying.cli.errors import run_command
-    from gaussian_swaying.data.capture import read_capture
-    from gaussian_swaying.simulation import preview_cli
-    from gaussian_swaying.simulation.config import build_parser, main
-    from gaussian_swaying.training import cli as training
+    from gaussian_swaying.cli.simulate import main
+    from gaussian_swaying.simulation.config import build_parser
 
     torch.set_num_threads(1)
     build_parser()  # imports what it needs

@@ -24,7 +24,7 @@ WEIGHTS = (8, 2, 1, 2, 3, 4, 1)
 @functools.cache
 def _run() -> Path:
     """A run of two frames, with its checkpoint."""
-    from gaussian_swaying.simulation.config import main
+    from gaussian_swaying.cli.simulate import main
 
     folder = Path(tempfile.mkdtemp(prefix="series-run-")) / "run"
     given = [*SMALL, "--recorder.checkpoint_every", "1"]

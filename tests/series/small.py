@@ -19,8 +19,8 @@ SMALL += ["--camera.init_args.width", "32", "--camera.init_args.height", "18"]
 @functools.cache
 def splat_bytes() -> bytes:
     """A flag of 96 Gaussians as a .ply file."""
-    from gaussian_swaying.data.procedural import FlagScene
     from gaussian_swaying.gaussians.ply import write_ply
+    from gaussian_swaying.scenes.procedural import FlagScene
 
     with tempfile.TemporaryDirectory() as folder:
         write_ply(Path(folder) / "flag.ply", FlagScene(spacing=0.1).generate())

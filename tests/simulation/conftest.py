@@ -7,12 +7,13 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
-from gaussian_swaying.gaussians.ply import GaussianCloud, write_ply
-from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera_path import OrbitCamera
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 

@@ -8,8 +8,8 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.gaussians.spherical_harmonics import SH_DC
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.foam import Foam
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
@@ -17,9 +17,9 @@ from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
-from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.scene import Material, MaterialRegion
-from gaussian_swaying.simulation.trajectory import load_trajectory
 
 FREE_HALF = [0.55, None, None], [None, None, None]
 WHITE = [0.95, 0.95, 0.95]

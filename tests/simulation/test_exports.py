@@ -6,9 +6,9 @@ import torch
 
 from gaussian_swaying.gaussians.export import read_usd_frame
 from gaussian_swaying.gaussians.ply import read_ply
-from gaussian_swaying.gaussians.surface import covariance
-from gaussian_swaying.simulation import recorder as recorder_module
-from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.simulation.recording import recorder as recorder_module
+from gaussian_swaying.simulation.recording.recorder import Recorder
 
 QUIET = {"video": False, "images": False, "trajectory": False}
 

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.simulation.health import advice, extremes, particle_of_extremes
-from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material
 
 WHERE = torch.tensor([[0.0, 0, 0], [1.0, 2, 3], [4.0, 5, 6]])

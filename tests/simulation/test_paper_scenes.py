@@ -7,9 +7,10 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.cli.simulate import output_folder
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.simulation.config import build_parser, build_pipeline, output_folder
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
 
 CONFIGS = Path(__file__).parents[2] / "configs/sim"
 # E, nu, density, C_D, C_F, C_L, flow, from the paper's table of parameters

@@ -10,17 +10,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, WindField
-from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians import spherical_harmonics
+from gaussian_swaying.gaussians import harmonics
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.ply import read_ply
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.base import finite_gaussians, make_renderer
-from gaussian_swaying.rendering.camera_path import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+from gaussian_swaying.rendering.protocol import finite_gaussians
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import scene as scene_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, diagnose
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
@@ -296,7 +297,7 @@ def test_colours_turn_with_the_object(make_cloud, make_pipeline):
 
 
 def test_only_moving_gaussians_are_shaded(make_cloud, make_pipeline):
-    from gaussian_swaying.gaussians.selection import Box
+    from gaussian_swaying.geometry.regions import Box
 
     cloud = make_cloud(degree=0)
     opacities = cloud.opacities.clone()
@@ -383,8 +384,8 @@ def test_a_picture_takes_few_operations(name, degree, make_cloud, make_pipeline,
     monkeypatch.setattr(
         scene_module, "deform_all", lambda F, a, n, rotations, *limit: (a.neg(), n, F if rotations else None)
     )
-    spherical_harmonics._basis_by_product(torch.ones(1, 3), degree)
-    monkeypatch.setattr(spherical_harmonics, "sh_basis", spherical_harmonics._basis_by_product)
+    harmonics._basis_by_product(torch.ones(1, 3), degree)
+    monkeypatch.setattr(harmonics, "sh_basis", harmonics._basis_by_product)
     pipeline.shade(state, camera)  # what is kept is made
     with _Operations() as operations:
         gaussians, colours = pipeline.shade(state, camera)

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_swaying.simulation.config import build_parser, main
+from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.simulation.config import build_parser
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"
 

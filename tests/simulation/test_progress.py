@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation import pipeline as pipeline_module
 from gaussian_swaying.simulation import progress as progress_module
-from gaussian_swaying.simulation.config import main
 from gaussian_swaying.simulation.progress import RunProgress
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"

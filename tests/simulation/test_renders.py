@@ -7,9 +7,10 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.rendering.camera_path import OrbitCamera
-from gaussian_swaying.rendering.passes import colormap, mean_depth
-from gaussian_swaying.simulation.recorder import Recorder, frame_folder, video_file
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.passes import mean_depth
+from gaussian_swaying.simulation.recording.recorder import Recorder, frame_folder, video_file
 
 SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5)
 ALL = ["color", "depth", "normal", "force"]
@@ -100,7 +101,7 @@ def test_the_force_is_that_of_the_wind(make_pipeline):
 
 def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     """Faint ones take that of the neighbour that carries them; those outside the region have none."""
-    from gaussian_swaying.gaussians.selection import Box
+    from gaussian_swaying.geometry.regions import Box
 
     cloud = make_cloud()
     cloud.opacities[5] = -6.0

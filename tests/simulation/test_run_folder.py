@@ -10,9 +10,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from gaussian_swaying.simulation.files import kind_of, remove_temporaries, temporary_name, write_json
-from gaussian_swaying.simulation.recorder import Recorder
-from gaussian_swaying.simulation.trajectory import load_trajectory
+from gaussian_swaying._files import kind_of, remove_temporaries, temporary_name, write_json
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 
 FRAMES = 3
 

@@ -5,11 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.simulation.preview_picture import classify
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.preview.picture import classify
 from gaussian_swaying.simulation.scene import POINTS_PER_CELL, Material
 
 

@@ -6,14 +6,14 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.mpm.linalg import polar_rotation
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 
 LEFT = Box([None, None, None], [0.5, None, None])

@@ -11,16 +11,17 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.data.solid_scene import SolidScene
+from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.gaussians.selection import Box, Not, Sphere
+from gaussian_swaying.geometry.regions import Box, Not, Sphere
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.camera_path import OrbitCamera
-from gaussian_swaying.simulation.config import build_parser, build_pipeline, main
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.solid import SolidScene
+from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.recorder import Recorder
+from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 
 ROOT = Path(__file__).parents[2]

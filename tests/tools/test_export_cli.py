@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gaussian_swaying.data.procedural import FlagScene
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.scenes.procedural import FlagScene
 
 ROOT = Path(__file__).parents[2]
 

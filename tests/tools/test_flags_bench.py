@@ -49,8 +49,9 @@ def test_pictures_have_the_size_of_the_reference(tmp_path):
 
 def test_gaussians_turned_to_the_reference(tmp_path):
     """Normals are those of the nearest vertex, the normal's own axis is the one that was turned, sizes stay."""
-    from gaussian_swaying.gaussians.ply import GaussianCloud, read_ply, write_ply
-    from gaussian_swaying.gaussians.surface import smallest_axis_normal
+    from gaussian_swaying.gaussians.cloud import GaussianCloud
+    from gaussian_swaying.gaussians.ply import read_ply, write_ply
+    from gaussian_swaying.geometry.patches import smallest_axis_normal
 
     generator = torch.Generator().manual_seed(0)
     quats = torch.randn(50, 4, generator=generator)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.data.capture import read_capture
-from gaussian_swaying.rendering.camera_path import TransformsCamera
+from gaussian_swaying.captures.capture import read_capture
+from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
 
 TOOLS = Path(__file__).parents[2] / "tools" / "datasets"
 NAMES = ("blender_cloth", "blender_checks", "blender_images", "flag_reference", "make_flag_dataset")

@@ -17,15 +17,15 @@ import torch
 import yaml
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 
+from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.cli.errors import parser_sentence
-from gaussian_swaying.data.generated_capture import GeneratedCapture
+from gaussian_swaying.cli.preview import main as preview
+from gaussian_swaying.cli.simulate import main as simulate
+from gaussian_swaying.cli.train import main, make_cli
 from gaussian_swaying.gaussians.ply import read_ply
-from gaussian_swaying.simulation.config import main as simulate
-from gaussian_swaying.simulation.lock import FolderLock
-from gaussian_swaying.simulation.preview_cli import main as preview
-from gaussian_swaying.simulation.seal import seal
-from gaussian_swaying.simulation.signals import StoppedBySignal
-from gaussian_swaying.training.cli import main, make_cli
+from gaussian_swaying.runs.lock import FolderLock
+from gaussian_swaying.runs.seal import seal
+from gaussian_swaying.runs.signals import StoppedBySignal
 from gaussian_swaying.training.densification import PARAMETERS
 from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
 from gaussian_swaying.training.quiet import silence_advertisements

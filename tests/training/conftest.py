@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from gaussian_swaying.data.order import EndlessShuffle
-from gaussian_swaying.data.procedural import FlagScene
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
-from gaussian_swaying.rendering.camera import look_at_camera
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.training.data.order import EndlessShuffle
 from gaussian_swaying.training.initial import gaussians_from_points
 
 

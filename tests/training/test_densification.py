@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
-from gaussian_swaying.rendering.base import ScreenGaussians
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.rendering.protocol import ScreenGaussians
 from gaussian_swaying.training.densification import (
     PARAMETERS,
     DefaultDensification,

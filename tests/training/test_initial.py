@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.spherical_harmonics import sh_to_color
+from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.training.initial import gaussians_from_points
 
 

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from gaussian_swaying.simulation.lock import FolderLocked
-from gaussian_swaying.simulation.output import MARKER
+from gaussian_swaying.runs.folder import MARKER
+from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.training.run_folder import RunFolder
 
 

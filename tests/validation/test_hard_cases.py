@@ -16,11 +16,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
-from gaussian_swaying.data.procedural import FlagScene, ProceduralScene
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.selection import Box, Everything
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.geometry.linalg import determinant, singular_values
+from gaussian_swaying.geometry.regions import Box, Everything
 from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
@@ -31,12 +32,12 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.snow import Snow
-from gaussian_swaying.mpm.linalg import determinant, singular_values
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.rendering.camera_path import OrbitCamera
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
-from gaussian_swaying.simulation.pipeline import SimulationPipeline, describe_device, versions
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 
 FORMULATIONS = ["total", "updated"]

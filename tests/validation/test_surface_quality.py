@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.data.generated_capture import GeneratedCapture
-from gaussian_swaying.gaussians.ply import GaussianCloud
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
+from gaussian_swaying.captures.generated_capture import GeneratedCapture
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.validation.surface_quality import surface_quality
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.gaussians.selection import Box
-from gaussian_swaying.gaussians.surface import deform_patch
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints

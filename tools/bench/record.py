@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from gaussian_swaying.simulation.pipeline import describe_device, versions
+from gaussian_swaying._provenance import describe_device, versions
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"

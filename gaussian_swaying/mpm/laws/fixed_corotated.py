@@ -6,8 +6,8 @@ import math
 
 from torch import Tensor
 
+from gaussian_swaying.geometry.linalg import cofactor, determinant, matmul3, polar_rotation, symmetric_eigenvalues
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
-from gaussian_swaying.mpm.linalg import cofactor, determinant, matmul3, polar_rotation, symmetric_eigenvalues
 
 
 def fixed_corotated_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.linalg import cofactor, determinant
 from gaussian_swaying.mpm.laws.law import PlasticLaw
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, volumetric_moduli
-from gaussian_swaying.mpm.linalg import cofactor, determinant
 
 FLUID_LIMIT = 0.5
 """Volume ratio below which the pressure of a fluid goes on as its tangent."""

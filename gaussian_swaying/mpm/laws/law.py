@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying.mpm.linalg import from_principal, matmul3, spectrum
+from gaussian_swaying.geometry.linalg import from_principal, matmul3, spectrum
 
 
 class ConstitutiveLaw(nn.Module, ABC):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.linalg import cofactor, determinant
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, continued_log, log_slope, volumetric_moduli
-from gaussian_swaying.mpm.linalg import cofactor, determinant
 
 
 def neo_hookean_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.linalg import determinant, divided_differences, matmul3, symmetric_eigenvalues
+from gaussian_swaying.geometry.linalg import determinant, divided_differences, matmul3, symmetric_eigenvalues
 
 LOG_LIMIT = 0.05
 """Stretch, or volume ratio, below which logarithms go on as their tangent."""

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from bench.record import ROOT
-from gaussian_swaying.metrics.compare import compare_run
+from gaussian_swaying.evaluation.compare import compare_run
 
 sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts, which find each other in their own folder
 
@@ -142,9 +142,10 @@ def turn_to_reference(splat: Path, cloth: Path, target: Path) -> None:
     import numpy as np
     import torch
 
-    from gaussian_swaying.gaussians.neighbours import nearest_neighbours
     from gaussian_swaying.gaussians.ply import read_ply, write_ply
-    from gaussian_swaying.gaussians.surface import quat_to_rotation, rotation_to_quat, smallest_axis_normal
+    from gaussian_swaying.geometry.neighbours import nearest_neighbours
+    from gaussian_swaying.geometry.patches import smallest_axis_normal
+    from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
     cloud = read_ply(splat)
     with np.load(cloth) as reference:

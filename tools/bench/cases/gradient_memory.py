@@ -12,7 +12,7 @@ import time
 import torch
 
 from gaussian_swaying.aero.force import aero_force
-from gaussian_swaying.gaussians.selection import Box
+from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.validation.flags import HEIGHT, WIDTH, flag_points
 from gaussian_swaying.validation.settings import Settings

@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-from gaussian_swaying.data.datamodule import CaptureDataModule, TrainingImage
-from gaussian_swaying.data.generated_datamodule import GeneratedDataModule
-from gaussian_swaying.data.order import EndlessShuffle
-from gaussian_swaying.gaussians.surface import GaussianSurfaceModel
-from gaussian_swaying.rendering.base import make_renderer
-from gaussian_swaying.training.cli import make_cli
+from gaussian_swaying.cli.train import make_cli
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.training.data.datamodule import CaptureDataModule, TrainingImage
+from gaussian_swaying.training.data.generated_datamodule import GeneratedDataModule
+from gaussian_swaying.training.data.order import EndlessShuffle
 from gaussian_swaying.training.losses import photometric_loss
 from gaussian_swaying.training.module import LearningRates, means_rate
 from gaussian_swaying.training.panels import panel

@@ -13,9 +13,9 @@ from typing import Any
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import scaled_product, svd3, where3, where9
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.triton.twin import twin_of
-from gaussian_swaying.mpm.linalg_triton import scaled_product, svd3, where3, where9
 
 ROW = tl.constexpr(6)  # columns of the table: which stress, which flow (-1 for none), four numbers
 

@@ -3,8 +3,7 @@
 import triton
 import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
 
-from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import (
+from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
     largest,
@@ -14,6 +13,7 @@ from gaussian_swaying.mpm.linalg_triton import (
     square9,
     transpose,
 )
+from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 
 @triton.jit

@@ -3,10 +3,10 @@
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import cofactor
 from gaussian_swaying.mpm.laws.fluid import FLUID_LIMIT
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import cofactor
 
 FLUID_FLOOR = tl.constexpr(FLUID_LIMIT)
 

@@ -3,6 +3,7 @@
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import dot3, svd3
 from gaussian_swaying.mpm.laws.triton.shared import (
     EPSILON,
     LOG_FLOOR,
@@ -12,7 +13,6 @@ from gaussian_swaying.mpm.laws.triton.shared import (
     spectral_modulus,
 )
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import dot3, svd3
 
 
 @triton.jit

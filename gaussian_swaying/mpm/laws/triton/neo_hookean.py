@@ -3,9 +3,9 @@
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, matmul, transpose
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import axpy9, cofactor, matmul, transpose
 
 
 @triton.jit

@@ -3,10 +3,10 @@
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import where3
 from gaussian_swaying.mpm.laws.triton.hencky import energy, principal, wave
 from gaussian_swaying.mpm.laws.triton.shared import drawn_back, log, split_strain
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import where3
 
 
 @triton.jit

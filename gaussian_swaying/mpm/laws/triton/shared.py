@@ -5,9 +5,9 @@ import math
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import dot3, largest, largest_eigenvalue
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT
 from gaussian_swaying.mpm.laws.shared import ROOT as _ROOT
-from gaussian_swaying.mpm.linalg_triton import dot3, largest, largest_eigenvalue
 
 LOG_FLOOR = tl.constexpr(LOG_LIMIT)
 LOG_OF_FLOOR = tl.constexpr(math.log(LOG_LIMIT))

@@ -3,10 +3,10 @@
 import triton
 import triton.language as tl
 
+from gaussian_swaying.geometry.linalg_triton import clamp
 from gaussian_swaying.mpm.laws.snow import SNOW_RANGE
 from gaussian_swaying.mpm.laws.triton.fixed_corotated import corotated_stress
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
-from gaussian_swaying.mpm.linalg_triton import clamp
 
 SNOW_LOW = tl.constexpr(SNOW_RANGE[0])
 SNOW_HIGH = tl.constexpr(SNOW_RANGE[1])

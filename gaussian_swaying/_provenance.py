@@ -1,0 +1,29 @@
+"""Where and with what a number was made: device and versions."""
+
+from __future__ import annotations
+
+import platform
+
+import torch
+
+import gaussian_swaying
+
+
+def describe_device(device: torch.device) -> str:
+    """Name of the processor or GPU, with the number of threads."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
+
+
+def versions() -> dict[str, str]:
+    """Versions that a number depends on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"python": platform.python_version(), "gaussian_swaying": gaussian_swaying.__version__}
+    for name in ("torch", "gsplat", "numpy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

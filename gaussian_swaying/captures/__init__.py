@@ -1,0 +1,1 @@
+"""Photos with known cameras: readers, lenses, pixels and points."""

@@ -1,0 +1,262 @@
+"""Captured scenes: images with their cameras, and the points that came with them."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice
+from gaussian_swaying.captures.colmap import colmap_model, read_colmap
+from gaussian_swaying.captures.images import PosedImage, check_image_size, image_size, load_image
+from gaussian_swaying.captures.lens import Lens
+from gaussian_swaying.captures.point_cloud import read_ply_points
+from gaussian_swaying.captures.transforms import find_image, read_transforms, transforms_files
+from gaussian_swaying.rendering.cameras.camera import Camera
+
+FORMATS = ("auto", "colmap", "transforms")
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One image of a capture with the camera that took it.
+
+    Attributes:
+        name: Path of the image as the capture's files give it.
+        image_path: The image on disk.
+        camera: Pinhole camera of the pixels that :meth:`load` returns, float32.
+        split: ``train``, ``val`` or ``test``.
+        lens: Lens of the image on disk.
+        downscale: How many pixels on a side of the undistorted image become one.
+    """
+
+    name: str
+    image_path: Path
+    camera: Camera
+    split: str
+    lens: Lens
+    downscale: int = 1
+
+    def load(self) -> Tensor:
+        """Read the pixels, undistorted and made smaller, see :func:`~gaussian_swaying.captures.images.load_image`.
+
+        Returns:
+            Dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha.
+
+        Raises:
+            ValueError: If the image cannot be read any more.
+        """
+        return load_image(self.image_path, self.lens, self.downscale)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """A captured scene; no pixels are in memory.
+
+    Attributes:
+        path: Where it was read from.
+        views: Its views, sorted by name.
+        center: Mean position of the training cameras [scene units], float32, shape (3,).
+        extent: 1.1 times the largest distance of a training camera from ``center`` [scene units], which 3DGS scales
+            its learning rates and thresholds by.
+        points: Points that came with the capture [scene units], float32, shape (P, 3), or None.
+        colors: Their colours in 0 to 1, float32, shape (P, 3), or None.
+    """
+
+    path: Path
+    views: tuple[View, ...]
+    center: Tensor
+    extent: float
+    points: Tensor | None = None
+    colors: Tensor | None = None
+
+    def split(self, name: str) -> tuple[View, ...]:
+        """Views of ``train``, ``val`` or ``test``, sorted by name."""
+        check_choice("name", name, SPLITS)
+        return tuple(view for view in self.views if view.split == name)
+
+
+def read_capture(
+    path: str | os.PathLike[str],
+    format: str = "auto",
+    downscale: int = 1,
+    test_every: int = 8,
+    images: str = "images",
+) -> Capture:
+    """Read the cameras of a capture and check that its images are there and have the right size.
+
+    Lens distortion is taken out: the cameras are the pinhole cameras of the undistorted, cropped images. Where a
+    folder ``images_2``, ``images_4`` ... made for the wanted size stands beside the images, it is read instead.
+
+    Args:
+        path: Folder with ``sparse/0`` or ``sparse`` (COLMAP), with ``transforms.json`` or with
+            ``transforms_train.json``; or a transforms.json itself.
+        format: ``colmap``, ``transforms``, or ``auto`` for the first of these that is there.
+        downscale: How many pixels on a side become one.
+        test_every: Every how many-th image, in the order of the names and from the first, is for testing; 0 for none.
+            Where the capture's files say what is for training and testing, they are followed instead.
+        images: Folder of the images of a COLMAP model.
+
+    Returns:
+        The capture.
+
+    Raises:
+        FileNotFoundError: If ``path`` does not exist.
+        ValueError: If a file, a field or an image is bad, or nothing is left to train on. The message names it and
+            the remedy.
+
+    Warns:
+        UserWarning: Once, with the number of frames that were left out because they have no image.
+    """
+    root = Path(path)
+    check_choice("format", format, FORMATS)
+    _check_count("downscale", downscale, 1)
+    _check_count("test_every", test_every, 0)
+    if not root.exists():
+        raise FileNotFoundError(f"{root} does not exist; check the path of the capture.")
+    model = colmap_model(root) if format != "transforms" and root.is_dir() else None
+    points: Tensor | None = None
+    colors: Tensor | None = None
+    if model is not None:
+        folder = root / images
+        if not folder.is_dir():
+            raise ValueError(f"{root} has no folder {images}/ with the images of its COLMAP model: set `images`.")
+        posed, missing, cloud = read_colmap(model, folder)
+        points, colors = (None, None) if cloud is None else cloud
+    elif format != "colmap" and transforms_files(root):
+        folder = root if root.is_dir() else root.parent
+        posed, missing, file = read_transforms(root)
+        if file is not None:
+            cloud_of_file, _ = read_ply_points(file)
+            points, colors = cloud_of_file.points, cloud_of_file.colors
+    else:
+        wanted = {"colmap": "sparse/0 or sparse", "transforms": "transforms.json or transforms_train.json"}
+        names = " or ".join(wanted.values()) if format == "auto" else wanted[format]
+        raise ValueError(f"{root} is not a capture: it has no {names}; give the folder that holds it.")
+    if not posed:
+        first = f", the first of them {missing[0]}" if missing else ""
+        raise ValueError(f"{root} has no images: all {len(missing)} are missing{first}; put them beside its cameras.")
+    posed = sorted(posed, key=lambda item: item.name)
+    splits = _splits(root, posed, test_every)
+    views = tuple(_view(root, item, split, downscale) for item, split in zip(posed, splits, strict=True))
+    eyes = torch.stack([view.camera.position.double() for view in views if view.split == "train"])
+    center = eyes.mean(0)
+    extent = 1.1 * float((eyes - center).norm(dim=-1).max())
+    if not extent > 0:
+        raise ValueError(
+            f"All {len(eyes)} training cameras of {root} stand at the same place, so its depth cannot be learned: "
+            "add images from elsewhere, or lower `test_every` to 0."
+        )
+    if missing:
+        warnings.warn(
+            f"{root}: left out {len(missing)} of {len(missing) + len(posed)} frames that have no image, the first of "
+            f"them {missing[0]}.",
+            UserWarning,
+            stacklevel=2,
+        )
+    return Capture(root, views, center.float(), extent, points, colors)
+
+
+def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
+    """The point whose summed squared distance to all optical axes is least.
+
+    Args:
+        cameras: At least one camera.
+
+    Returns:
+        The point [scene units], float64, shape (3,); NaN if the axes are parallel.
+    """
+    axes = torch.stack([camera.world_to_camera[2, :3].double() for camera in cameras])
+    eyes = torch.stack([camera.position.double() for camera in cameras])
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    matrix = across.sum(0)
+    if float(torch.linalg.eigvalsh(matrix)[0]) < 1e-6 * len(cameras):
+        return torch.full((3,), float("nan"), dtype=torch.float64)
+    return torch.linalg.solve(matrix, (across @ eyes[..., None]).sum(0)[:, 0])
+
+
+def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
+    """The point nearest to all optical axes, if most cameras have it before them.
+
+    Args:
+        cameras: At least one camera.
+
+    Returns:
+        The point [scene units], float64, shape (3,); None if they look at no common point.
+    """
+    focus = nearest_to_axes(cameras)
+    if not bool(torch.isfinite(focus).all()):
+        return None
+    depths = [c.world_to_camera[2, :3].double() @ focus + c.world_to_camera[2, 3].double() for c in cameras]
+    return focus if 2 * sum(bool(depth > 0) for depth in depths) > len(cameras) else None
+
+
+def view_reach(cameras: Sequence[Camera], focus: Tensor) -> float:
+    """How far to a side of a point (3,) the median camera sees [scene units]."""
+    reach = []
+    for camera in cameras:
+        distance = math.dist(camera.position.tolist(), focus.tolist())
+        across = 0.5 * camera.width / float(camera.intrinsics[0, 0])
+        upward = 0.5 * camera.height / float(camera.intrinsics[1, 1])
+        reach.append(distance * max(across, upward))
+    return sorted(reach)[len(reach) // 2]
+
+
+def _check_count(name: str, value: int, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ValueError(f"Expected `{name}` to be a whole number of at least {least}, but got {value!r}.")
+
+
+def _splits(root: Path, posed: list[PosedImage], test_every: int) -> list[str]:
+    """Split of each image; an image that the files leave out of their own split is for training."""
+    if any(item.split is not None for item in posed):
+        splits = [item.split or "train" for item in posed]
+        remedy = "add images to its train split"
+    else:
+        splits = ["test" if test_every and index % test_every == 0 else "train" for index in range(len(posed))]
+        remedy = "raise `test_every`, or set it to 0 to test on no image"
+    if "train" not in splits:
+        raise ValueError(f"The train split of {root} is empty, all {len(posed)} images are for testing: {remedy}.")
+    return splits
+
+
+def _view(root: Path, item: PosedImage, split: str, downscale: int) -> View:
+    """Check an image on disk against its lens and make the view of the wanted size."""
+    path, lens, factor = item.path, item.lens, downscale
+    small = _made_smaller(root, path, downscale) if downscale > 1 else None
+    if small is not None:
+        width, height = image_size(small)
+        if max(abs(width - lens.width / downscale), abs(height - lens.height / downscale)) >= 1:
+            raise ValueError(
+                f"The image {small} has {width} x {height} pixels, but {downscale} times smaller than its camera is "
+                f"{lens.width / downscale:g} x {lens.height / downscale:g}: remove the folder, or make it again."
+            )
+        path, lens, factor = small, lens.resized(width, height), 1
+    else:
+        check_image_size(path, image_size(path), lens)
+    try:
+        seen = lens.undistorted().averaged(factor)
+    except ValueError as error:
+        raise ValueError(f"The image {path} of {root}: {error}") from error
+    world_to_camera = item.world_to_camera.float()
+    camera = Camera(world_to_camera, seen.intrinsics().float(), seen.width, seen.height)
+    return View(item.name, path, camera, split, lens, factor)
+
+
+def _made_smaller(root: Path, path: Path, downscale: int) -> Path | None:
+    """The same image in the folder ``<folder>_<downscale>`` beside the folder of the images, or None."""
+    top = root if root.is_dir() else root.parent
+    try:
+        parts = path.relative_to(top).parts
+    except ValueError:
+        return None
+    if len(parts) < 2:
+        return None
+    return find_image(top / f"{parts[0]}_{downscale}", "/".join(parts[1:]))

@@ -1,0 +1,159 @@
+"""The cameras of a capture as camera paths of a run: one of them, or a journey through all."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying.captures.colmap import colmap_model, read_colmap_views
+from gaussian_swaying.captures.transforms import transforms_files
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
+from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, resized_intrinsics
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.cameras.keyframes import INTERPOLATIONS, interpolate_keys
+from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms
+
+
+def read_views(
+    path: str | Path, width: int | None = None, height: int | None = None, near: float = 0.01
+) -> list[tuple[str, Camera]]:
+    """Read the cameras of a capture; its images need not be there.
+
+    Args:
+        path: A transforms.json, a folder with one (or with ``transforms_train.json`` ...), a COLMAP model, or a folder
+            with ``sparse/0`` or ``sparse``, which is preferred.
+        width: Width of the images to render [pixels]; by default that of the capture.
+        height: Height of the images to render [pixels], likewise.
+        near: Near plane [scene units].
+
+    Returns:
+        Name and camera of each view, sorted by name. Lens distortion is left out: they are the pinhole cameras of the
+        same focal lengths.
+
+    Raises:
+        ValueError: If there are no cameras, or a file is bad. The message names it and the remedy.
+    """
+    root = Path(path)
+    model = root if any((root / f"images{end}").is_file() for end in (".bin", ".txt")) else colmap_model(root)
+    views: list[tuple[str, Camera]] = []
+    if model is not None:
+        for name, lens, world_to_camera in read_colmap_views(model):
+            numbers = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy)
+            intrinsics, columns, rows = resized_intrinsics(*numbers, width, height)
+            camera = Camera(world_to_camera, intrinsics, columns, rows, near)
+            views.append((name, camera.to(dtype=torch.get_default_dtype())))
+    else:
+        for file, _ in transforms_files(root):
+            data = load_transforms(file)
+            for index, frame in enumerate(data["frames"]):
+                name = str(frame.get("file_path", index)).replace("\\", "/").removeprefix("./")
+                views.append((name, camera_of_transforms(file, data, index, width, height, near)))
+    if not views:
+        raise ValueError(
+            f"`{path}` holds no cameras: give a transforms.json, a COLMAP model (cameras and images, .bin or .txt), or "
+            "the folder that holds one."
+        )
+    return sorted(views, key=lambda view: view[0])
+
+
+class CaptureCamera(CameraPath):
+    """Cameras of a ``transforms.json`` or a COLMAP model: one of them, or a journey through all in the order of names.
+
+    The files are read at the first frame; the images need not be there. Lens distortion is left out.
+
+    Args:
+        path: A transforms.json, a COLMAP model, or a folder that holds one.
+        view: Name of the view to stand at, with or without folder and extension, or its number from 0 in the order of
+            the names; null to travel through all.
+        seconds_per_view: Time from one view to the next [s]; the journey ends at the last.
+        interpolation: Between views: ``smooth`` or ``linear``, as of KeyframedCamera.
+        width: Image width [pixels]; by default that of the capture.
+        height: Image height [pixels]; by default that of the capture.
+        near: Near plane [scene units].
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a number is out of range; at the first frame, if the files are bad or have no such view, or if
+            views of different sizes are to be travelled through without ``width`` and ``height``.
+    """
+
+    captured = True
+
+    def __init__(
+        self,
+        path: str | Path,
+        view: int | str | None = None,
+        seconds_per_view: float = 0.5,
+        interpolation: str = "smooth",
+        width: int | None = None,
+        height: int | None = None,
+        near: float = 0.01,
+    ) -> None:
+        check_positive("seconds_per_view", seconds_per_view)
+        check_choice("interpolation", interpolation, INTERPOLATIONS)
+        check_positive("near", near)
+        self.path, self.view, self.seconds_per_view = path, view, float(seconds_per_view)
+        self.interpolation, self.near = interpolation, float(near)
+        self.width = None if width is None else check_pixels("width", width)
+        self.height = None if height is None else check_pixels("height", height)
+        self._cameras: list[Camera] = []
+        self._rows: list[list[float]] = []
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame, see :meth:`CameraPath.__call__`."""
+        if not self._cameras:
+            self._read()
+        if len(self._cameras) == 1:
+            return self._cameras[0].to(center.device, center.dtype)
+        times = [k * self.seconds_per_view for k in range(len(self._cameras))]
+        row = torch.tensor(interpolate_keys(times, self._rows, time, self.interpolation), dtype=torch.float64)
+        eye, quat, (fx, fy, cx, cy) = row[:3], row[3:7], row[7:].tolist()
+        world_to_camera = torch.eye(4, dtype=torch.float64)
+        world_to_camera[:3, :3] = quat_to_rotation(quat)
+        world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ eye
+        intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        first = self._cameras[0]
+        camera = Camera(world_to_camera, intrinsics, first.width, first.height, self.near)
+        return camera.to(center.device, center.dtype)
+
+    def _read(self) -> None:
+        views = read_views(self.path, self.width, self.height, self.near)
+        if self.view is not None:
+            self._cameras = [views[self._index([name for name, _ in views])][1]]
+            return
+        cameras = [camera for _, camera in views]
+        sizes = {(camera.width, camera.height) for camera in cameras}
+        if len(sizes) > 1:
+            raise ValueError(
+                f"The views of `{self.path}` have {len(sizes)} different sizes, which one video cannot show: set both "
+                "`width` and `height` of the camera."
+            )
+        eyes = torch.stack([camera.position for camera in cameras]).double()
+        quats = rotation_to_quat(torch.stack([camera.world_to_camera[:3, :3] for camera in cameras]).double())
+        for k, _ in enumerate(pairwise(cameras)):  # of the two signs of a quaternion, that of the shorter way
+            if float(quats[k] @ quats[k + 1]) < 0:
+                quats[k + 1] = -quats[k + 1]
+        lenses = torch.stack([camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]).double()
+        self._rows = torch.cat([eyes, quats, lenses], dim=1).tolist()
+        self._cameras = cameras
+
+    def _index(self, names: list[str]) -> int:
+        if isinstance(self.view, int):
+            if not 0 <= self.view < len(names):
+                raise ValueError(
+                    f"`{self.path}` has no view {self.view}: set `view` between 0 and {len(names) - 1}, or to a name."
+                )
+            return self.view
+        view = str(self.view).removeprefix("./")
+        for short in (lambda name: name, lambda name: Path(name).name, lambda name: Path(name).stem):
+            found = [k for k, name in enumerate(names) if short(name) == view]
+            if len(found) == 1:
+                return found[0]
+        raise ValueError(
+            f"`{self.path}` has no view `{view}`, or several: set `view` to one of {len(names)} names such as "
+            f"{names[0]}."
+        )

@@ -1,0 +1,235 @@
+"""Captures described by a sparse COLMAP model, binary or text."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.captures.images import PosedImage
+from gaussian_swaying.captures.lens import NO_DISTORTION, Lens
+
+# name and number of parameters of each camera model, by COLMAP's numbering
+_MODELS = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)
+_READABLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+def colmap_model(path: Path) -> Path | None:
+    """The folder with the sparse model of a capture: ``sparse/0``, then ``sparse``; None if there is none."""
+    for folder in (path / "sparse" / "0", path / "sparse"):
+        if any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    return None
+
+
+def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str], tuple[Tensor, Tensor] | None]:
+    """Read a sparse model: ``cameras``, ``images`` and, if there, ``points3D``, each as .bin or else .txt.
+
+    Args:
+        model: Folder of the model.
+        images: Folder that the names of the images are relative to.
+
+    Returns:
+        The images that exist, the names of those that do not, and positions [scene units] and colours in 0 to 1 of
+        the points, each float32 of shape (P, 3), or None.
+
+    Raises:
+        ValueError: If a file is missing or damaged, or a camera model has a distortion that cannot be undone here.
+    """
+    posed: list[PosedImage] = []
+    missing: list[str] = []
+    for name, lens, world_to_camera in read_colmap_views(model):
+        path = images / name
+        if path.is_file():
+            posed.append(PosedImage(name, path, lens, world_to_camera))
+        else:
+            missing.append(name)
+    if not any((model / f"points3D{suffix}").is_file() for suffix in (".bin", ".txt")):
+        return posed, missing, None
+    table: np.ndarray = _read(model, "points3D", _binary_points, _text_points)
+    if not np.isfinite(table).all():
+        raise ValueError(f"The COLMAP model {model} has points3D that are NaN or infinite: export the model again.")
+    if len(table) == 0:
+        return posed, missing, None
+    points, colors = torch.from_numpy(table[:, :3]).float(), torch.from_numpy(table[:, 3:]).float() / 255
+    return posed, missing, (points, colors)
+
+
+def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
+    """Read the cameras of a sparse model alone; the images themselves need not be there.
+
+    Args:
+        model: Folder of the model.
+
+    Returns:
+        Name, lens and world-to-camera matrix (float64, shape (4, 4)) of each image, in the order of the file.
+
+    Raises:
+        ValueError: If a file is missing or damaged, or a camera model has a distortion that cannot be undone here.
+    """
+    lenses: dict[int, Lens] = _read(model, "cameras", _binary_cameras, _text_cameras)
+    rows: list[tuple[str, tuple[float, ...], int]] = _read(model, "images", _binary_images, _text_images)
+    views = []
+    for name, pose, camera in rows:
+        where = f"The image {name} of the COLMAP model {model}"
+        if camera not in lenses:
+            raise ValueError(f"{where} names camera {camera}, which is not in `cameras`: export the model again.")
+        views.append((name, lenses[camera], _pose(where, pose)))
+    return views
+
+
+def _pose(where: str, pose: tuple[float, ...]) -> Tensor:
+    """World-to-camera matrix from a quaternion wxyz and a translation."""
+    length = math.hypot(*pose[:4])
+    if not all(math.isfinite(item) for item in pose) or length < 1e-6:
+        raise ValueError(f"{where} has the pose {list(pose)}, which is not rigid: export the model again.")
+    w, x, y, z = (item / length for item in pose[:4])
+    tx, ty, tz = pose[4:]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), tx],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), ty],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), tz],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+class _UnknownLensError(Exception):
+    """A whole file with a lens that cannot be undone here, as against a damaged one."""
+
+
+def _lens(identity: int, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
+    """Lens of a COLMAP camera."""
+    if model not in _READABLE:
+        raise _UnknownLensError(
+            f"camera {identity} has the model {model}, whose distortion cannot be undone here (only "
+            f"{', '.join(_READABLE)}): run `colmap image_undistorter` and give its output"
+        )
+    if len(values) != dict(_MODELS)[model]:
+        raise ValueError(f"camera {identity} of model {model} has {len(values)} parameters")
+    if model in ("PINHOLE", "OPENCV"):
+        fx, fy, cx, cy, *rest = values
+    else:
+        fx, cx, cy, *rest = values
+        fy = fx
+    distortion = (*rest, *NO_DISTORTION)[:5]  # k1, k2, p1, p2 in this order in every model that has them
+    return Lens(fx, fy, cx, cy, width, height, distortion)
+
+
+def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable[[Iterator[list[str]]], Any]) -> Any:
+    """Parse one file of the model, or raise an error that names it."""
+    file = model / f"{name}.bin"
+    if not file.is_file():
+        file = model / f"{name}.txt"
+    try:
+        check_regular(file, name)
+        if file.suffix == ".bin":
+            return binary(file.read_bytes())
+        lines = file.read_text(encoding="utf-8").splitlines()
+        return text(line.split() for line in lines if not line.lstrip().startswith("#"))
+    except OSError as error:
+        raise ValueError(
+            f"Cannot read {name} of the COLMAP model {model} ({error.strerror}): give cameras, images and points3D, "
+            "all .bin or all .txt."
+        ) from error
+    except _UnknownLensError as error:
+        raise ValueError(f"In the COLMAP file {file} {error}.") from error
+    except (struct.error, IndexError, ValueError) as error:
+        raise ValueError(f"The COLMAP file {file} is damaged ({error}): export the model again.") from error
+
+
+class _Bytes:
+    """Reads numbers of a little-endian binary file one after the other."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.place = data, 0
+
+    def take(self, form: str) -> tuple[Any, ...]:
+        values = struct.unpack_from("<" + form, self.data, self.place)
+        self.place += struct.calcsize("<" + form)
+        return values
+
+    def word(self) -> str:
+        end = self.data.index(b"\0", self.place)
+        value = self.data[self.place : end].decode("utf-8")
+        self.place = end + 1
+        return value
+
+    def skip(self, count: int) -> None:
+        self.place += count
+        if self.place > len(self.data):
+            raise ValueError("it ends too early")
+
+
+def _binary_cameras(data: bytes) -> dict[int, Lens]:
+    source, result = _Bytes(data), {}
+    for _ in range(source.take("Q")[0]):
+        identity, model, width, height = source.take("iiQQ")
+        if not 0 <= model < len(_MODELS):
+            raise _UnknownLensError(f"camera {identity} has the unknown model {model}: use one of {_READABLE}")
+        name, count = _MODELS[model]
+        result[identity] = _lens(identity, name, width, height, source.take(f"{count}d"))
+    return result
+
+
+def _text_cameras(lines: Iterator[list[str]]) -> dict[int, Lens]:
+    result = {}
+    for words in lines:
+        if words:
+            values = tuple(float(word) for word in words[4:])
+            result[int(words[0])] = _lens(int(words[0]), words[1], int(words[2]), int(words[3]), values)
+    return result
+
+
+def _binary_images(data: bytes) -> list[tuple[str, tuple[float, ...], int]]:
+    source, result = _Bytes(data), []
+    for _ in range(source.take("Q")[0]):
+        _identity, *pose, camera = source.take("i7di")
+        result.append((source.word(), tuple(pose), camera))
+        source.skip(24 * source.take("Q")[0])
+    return result
+
+
+def _text_images(lines: Iterator[list[str]]) -> list[tuple[str, tuple[float, ...], int]]:
+    result = []
+    for words in lines:
+        if words:
+            result.append((" ".join(words[9:]), tuple(float(word) for word in words[1:8]), int(words[8])))
+            if not words[9:]:
+                raise ValueError(f"image {words[0]} has no name")
+            next(lines, None)  # the points that it sees, an empty line if none
+    return result
+
+
+def _binary_points(data: bytes) -> np.ndarray:
+    source, result = _Bytes(data), []
+    for _ in range(source.take("Q")[0]):
+        _identity, x, y, z, red, green, blue, _error, seen = source.take("Q3d3BdQ")
+        result.append((x, y, z, red, green, blue))
+        source.skip(8 * seen)
+    return np.array(result, dtype=np.float64).reshape(-1, 6)
+
+
+def _text_points(lines: Iterator[list[str]]) -> np.ndarray:
+    rows = [[float(word) for word in words[1:7]] for words in lines if words]
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)

@@ -1,0 +1,343 @@
+"""A capture made in code: photographs of a rippled flag whose true surface is known."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+
+_STEPS = 24  # samples along a ray between which the first crossing is looked for
+_LIGHT = (0.4, -0.8, 0.45)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueSurface:
+    """A surface as triangles.
+
+    Attributes:
+        vertices: Points on the surface [m], float64, shape (V, 3).
+        faces: Triangles as indices of vertices, shape (T, 3).
+        normals: Unit normals at the vertices, on the -y side, float64, shape (V, 3).
+        colors: Colours that a camera sees there, in 0 to 1, shape (V, 3).
+        area: Area of one side of the smooth surface [m²].
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    normals: Tensor
+    colors: Tensor
+    area: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueView:
+    """What a camera sees, averaged over each pixel where it is a colour, at the pixel's centre else.
+
+    Attributes:
+        colors: Colours in 0 to 1, multiplied with alpha, shape (H, W, 3).
+        alpha: Share of the pixel that the surface covers, shape (H, W).
+        depth: Depth along the optical axis [m], infinite where the ray misses, shape (H, W).
+        normals: Unit normal towards the camera, zero where the ray misses, shape (H, W, 3).
+    """
+
+    colors: Tensor
+    alpha: Tensor
+    depth: Tensor
+    normals: Tensor
+
+
+class GeneratedCapture:
+    """Photographs of a rippled, patterned flag from all around, with its true normals and area.
+
+    The flag is the sheet y = f(x, z) over 0 <= x <= ``width``, 0 <= z <= ``height``, in metres, a ripple that grows
+    from the pole side at x = 0. It is drawn by intersecting a ray with the sheet for each sample of each pixel, so what
+    the images show is the true surface and no splat. Light is in the colours and the same for both sides and all
+    cameras. The cameras stand on a sphere around the flag, evenly spread, from 35 degrees below to 60 above, with z up.
+
+    Args:
+        views: Number of images.
+        size: Width and height of the images [pixels].
+        width: Length of the flag along x [m].
+        height: Length along z [m].
+        ripple: Amplitude of the ripple at the free end [m].
+        waves: Number of waves along x.
+        distance: Of the cameras from the centre of the flag [m].
+        fov: Field of view [degrees].
+        samples: Each pixel is the mean of this number of samples on a side.
+        seed: Of the pattern and the places of the cameras.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
+
+    def __init__(
+        self,
+        views: int = 60,
+        size: int = 400,
+        width: float = 1.2,
+        height: float = 0.8,
+        ripple: float = 0.08,
+        waves: float = 1.5,
+        distance: float = 2.2,
+        fov: float = 40.0,
+        samples: int = 2,
+        seed: int = 0,
+    ) -> None:
+        for name, count in (("views", views), ("size", size), ("samples", samples)):
+            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+                raise ValueError(f"Expected `{name}` to be a positive whole number, but got {count!r}.")
+        for name, value in (("width", width), ("height", height), ("waves", waves), ("distance", distance)):
+            check_positive(name, value)
+        check_positive("ripple", ripple, allow_zero=True)
+        if not 0.0 < fov < 180.0:
+            raise ValueError(f"Expected `fov` to be between 0 and 180 degrees (both excluded), but got {fov}.")
+        if distance <= math.hypot(0.5 * width, ripple, 0.5 * height):
+            raise ValueError(f"Expected `distance` to keep the cameras outside the flag, but got {distance} m.")
+        self.views, self.size, self.samples, self.seed = views, size, samples, seed
+        self.width, self.height, self.ripple, self.waves = float(width), float(height), float(ripple), float(waves)
+        self.distance, self.fov = float(distance), float(fov)
+        generator = torch.Generator().manual_seed(seed)
+        self._phase = 2 * math.pi * float(torch.rand((), generator=generator))
+        self._turn = 2 * math.pi * float(torch.rand((), generator=generator))
+        self._waves = (torch.rand(6, 3, generator=generator) * torch.tensor([40.0, 40.0, 2 * math.pi])).tolist()
+
+    # ---- the sheet
+
+    def _ripple(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor, float, float]:
+        """Phase of the ripple, its amplitude [m], and the slopes of the phase along x and z [1/m]."""
+        k, tilt = 2 * math.pi * self.waves / self.width, 1.2 / self.height
+        return k * x + tilt * z + self._phase, (self.ripple / self.width) * x, k, tilt
+
+    def elevation(self, x: Tensor, z: Tensor) -> Tensor:
+        """The height y = f(x, z) of the sheet [m], of the shape of ``x``."""
+        phase, amplitude, _, _ = self._ripple(x, z)
+        return amplitude * torch.sin(phase)
+
+    def slopes(self, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives of :meth:`elevation` along x and z, each of the shape of ``x``."""
+        phase, amplitude, k, tilt = self._ripple(x, z)
+        turned = amplitude * torch.cos(phase)
+        return (self.ripple / self.width) * torch.sin(phase) + k * turned, tilt * turned
+
+    def normals(self, x: Tensor, z: Tensor) -> Tensor:
+        """Unit normals on the -y side, shape (..., 3)."""
+        along, upward = self.slopes(x, z)
+        return functional.normalize(torch.stack([along, -torch.ones_like(along), upward], -1), dim=-1)
+
+    def colors(self, x: Tensor, z: Tensor) -> Tensor:
+        """Colours in 0 to 1 that a camera sees: a pattern times diffuse light, shape (..., 3)."""
+        u, v = x / self.width, z / self.height
+        bands = x.new_tensor([[0.83, 0.30, 0.18], [0.95, 0.92, 0.85], [0.13, 0.33, 0.55]])
+        band = ((1 - v) * 3).long().clamp(0, 2)
+        pattern = bands[band]
+        disc = torch.hypot(x - 0.5 * self.width, z - 0.5 * self.height) < 0.2 * self.height
+        pattern = torch.where(disc[..., None], x.new_tensor([0.93, 0.68, 0.20]), pattern)
+        checks = ((u * 24).floor() + (v * 16).floor()) % 2
+        weave = sum(torch.sin(a * u + b * v + phase) for a, b, phase in self._waves) / len(self._waves)
+        light = functional.normalize(x.new_tensor(_LIGHT), dim=0)
+        shade = 0.4 + 0.6 * (self.normals(x, z) @ light).abs()
+        return (pattern * ((0.8 + 0.2 * checks + 0.12 * weave) * shade)[..., None]).clamp(0, 1)
+
+    def surface(self, columns: int = 240, rows: int = 160) -> TrueSurface:
+        """The sheet as a mesh of ``columns`` x ``rows`` squares, cut into triangles."""
+        x = torch.linspace(0, self.width, columns + 1, dtype=torch.float64)
+        z = torch.linspace(0, self.height, rows + 1, dtype=torch.float64)
+        gx, gz = (grid.reshape(-1) for grid in torch.meshgrid(x, z, indexing="ij"))
+        corner = (torch.arange(columns)[:, None] * (rows + 1) + torch.arange(rows)).reshape(-1)
+        across, above, both = corner + rows + 1, corner + 1, corner + rows + 2
+        faces = torch.cat([torch.stack([corner, across, both], -1), torch.stack([corner, both, above], -1)])
+        vertices = torch.stack([gx, self.elevation(gx, gz), gz], -1)
+        return TrueSurface(vertices, faces, self.normals(gx, gz), self.colors(gx, gz).float(), self.area())
+
+    def area(self, cells: int = 1000) -> float:
+        """Area of one side of the sheet [m²], by the midpoint rule."""
+        x = (torch.arange(cells, dtype=torch.float64) + 0.5) * (self.width / cells)
+        z = (torch.arange(cells, dtype=torch.float64) + 0.5) * (self.height / cells)
+        along, upward = self.slopes(*torch.meshgrid(x, z, indexing="ij"))
+        return float((1 + along**2 + upward**2).sqrt().mean()) * self.width * self.height
+
+    def nearest(self, points: Tensor, iterations: int = 20) -> tuple[Tensor, Tensor]:
+        """Nearest points on the sheet, by Gauss-Newton steps in its tangent plane from the point straight below.
+
+        Args:
+            points: Points [m], shape (N, 3). For one that is further away than the sheet's radius of curvature, another
+                point than the nearest may be found.
+            iterations: Number of steps.
+
+        Returns:
+            The points on the sheet [m] and the unit normals there, both float64, shape (N, 3).
+        """
+        points = points.detach().double()
+        x, z = points[:, 0].clamp(0, self.width), points[:, 2].clamp(0, self.height)
+        for _ in range(iterations):
+            along, upward = self.slopes(x, z)
+            dx, dy, dz = points[:, 0] - x, points[:, 1] - self.elevation(x, z), points[:, 2] - z
+            right, up = dx + along * dy, dz + upward * dy
+            xx, xz, zz = 1 + along.square(), along * upward, 1 + upward.square()
+            determinant = xx * zz - xz.square()
+            x = (x + (zz * right - xz * up) / determinant).clamp(0, self.width)
+            z = (z + (xx * up - xz * right) / determinant).clamp(0, self.height)
+        return torch.stack([x, self.elevation(x, z), z], -1), self.normals(x, z)
+
+    # ---- the pictures
+
+    def cameras(self) -> list[Camera]:
+        """The cameras, in float64, in the order of the images."""
+        center = (0.5 * self.width, 0.0, 0.5 * self.height)
+        low, high = math.sin(math.radians(-35.0)), math.sin(math.radians(60.0))
+        cameras = []
+        for index in range(self.views):
+            # two irrational steps: all views, and every eighth of them, are spread evenly
+            share = ((index + 0.5) * 0.5 * (math.sqrt(5) - 1)) % 1.0
+            sine = low + (high - low) * share
+            azimuth = self._turn + 2 * math.pi * ((index * (math.sqrt(2) - 1)) % 1.0)
+            flat = math.sqrt(1 - sine * sine)
+            ray = (flat * math.cos(azimuth), flat * math.sin(azimuth), sine)
+            eye = [c + self.distance * r for c, r in zip(center, ray, strict=True)]
+            up = (0.0, 0.0, 1.0)
+            cameras.append(look_at_camera(eye, center, up, self.fov, self.size, self.size, dtype=torch.float64))
+        return cameras
+
+    def render(self, camera: Camera) -> TrueView:
+        """Draw the sheet by ray casting.
+
+        Args:
+            camera: Any pinhole camera.
+
+        Returns:
+            The view, float32.
+        """
+        packed = self._pixels(camera)
+        column = torch.arange(camera.width, dtype=torch.float64) + 0.5
+        row = torch.arange(camera.height, dtype=torch.float64) + 0.5
+        hit, distance, x, z = self._cast(camera, row, column)
+        facing = self.normals(x, z)
+        eye = camera.position.float()
+        seen = torch.stack([x, self.elevation(x, z), z], -1) - eye
+        facing = torch.where((facing * seen).sum(-1, keepdim=True) > 0, -facing, facing) * hit[..., None]
+        depth = torch.where(hit, distance, torch.full_like(distance, math.inf))
+        return TrueView(packed[..., :3].contiguous(), packed[..., 3].contiguous(), depth, facing)
+
+    def _pixels(self, camera: Camera) -> Tensor:
+        """Colours multiplied with alpha, and alpha, shape (H, W, 4)."""
+        n = self.samples
+        column = (torch.arange(camera.width * n, dtype=torch.float64) + 0.5) / n
+        row = (torch.arange(camera.height * n, dtype=torch.float64) + 0.5) / n
+        hit, _, x, z = self._cast(camera, row, column)
+        packed = torch.zeros(*hit.shape, 4)
+        packed[hit] = functional.pad(self.colors(x[hit], z[hit]), (0, 1), value=1.0)
+        return functional.avg_pool2d(packed.permute(2, 0, 1)[None], n)[0].permute(1, 2, 0)
+
+    def _cast(self, camera: Camera, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Whether each ray hits, depth of the hit, and its x and z; of shape (rows, columns)."""
+        intrinsics, view = camera.intrinsics.double(), camera.world_to_camera.double()
+        v, u = torch.meshgrid(
+            (row - intrinsics[1, 2]) / intrinsics[1, 1], (column - intrinsics[0, 2]) / intrinsics[0, 0], indexing="ij"
+        )
+        rays = (torch.stack([u, v, torch.ones_like(u)], -1) @ view[:3, :3]).float().reshape(-1, 3)  # at depth 1
+        eye = camera.position.double().float()
+        # where the ray is inside the box of the flag
+        slack = 1.0001 * self.ripple + 1e-5
+        low, high = eye.new_tensor([0.0, -slack, 0.0]), eye.new_tensor([self.width, slack, self.height])
+        safe = torch.where(rays.abs() < 1e-9, torch.full_like(rays, 1e-9), rays)
+        bounds = torch.stack([(low - eye) / safe, (high - eye) / safe])
+        enter, leave = bounds.amin(0).amax(-1).clamp_min(camera.near), bounds.amax(0).amin(-1)
+        inside = (enter < leave).nonzero()[:, 0]
+        hit = torch.zeros(len(rays), dtype=torch.bool)
+        depth, x, z = (torch.zeros(len(rays)) for _ in range(3))
+        for chunk in inside.split(1 << 17):
+            found, t = self._first_crossing(eye, rays[chunk], enter[chunk], leave[chunk])
+            met = chunk[found]
+            place = eye + t[:, None] * rays[met]
+            hit[met], depth[met], x[met], z[met] = True, t, place[:, 0], place[:, 2]
+        shape = v.shape
+        return hit.reshape(shape), depth.reshape(shape), x.reshape(shape), z.reshape(shape)
+
+    def _first_crossing(self, eye: Tensor, rays: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor]:
+        """Which rays cross the sheet between two depths, and the first depth where those do."""
+
+        def above(t: Tensor, rays: Tensor) -> Tensor:
+            x, y, z = (eye[axis] + t * rays[:, axis] for axis in range(3))
+            return y - self.elevation(x, z)
+
+        values = above(enter + torch.linspace(0, 1, _STEPS + 1)[:, None] * (leave - enter), rays)
+        change = (values[:-1] > 0) != (values[1:] > 0)
+        found, first = change.any(0), change.int().argmax(0)
+        rays, enter, width, first = rays[found], enter[found], ((leave - enter) / _STEPS)[found], first[found]
+        left = enter + first * width
+        right = left + width
+        side = above(left, rays) > 0
+        for _ in range(12):
+            middle = 0.5 * (left + right)
+            before = (above(middle, rays) > 0) == side
+            left, right = torch.where(before, middle, left), torch.where(before, right, middle)
+        return found, 0.5 * (left + right)
+
+    # ---- files
+
+    def write(self, folder: str | os.PathLike[str], threads: int = 2) -> Path:
+        """Write the capture: ``images/``, ``transforms.json``, ``mesh.ply`` and ``truth.npz``.
+
+        ``truth.npz`` holds ``vertices``, ``faces``, ``normals`` and ``area`` of :class:`TrueSurface`. Images are PNG
+        with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
+
+        Args:
+            folder: Folder to write, new or empty.
+            threads: Number of images in work at a time.
+
+        Returns:
+            The folder.
+
+        Raises:
+            ValueError: If the folder holds files already.
+        """
+        from imageio.v3 import imwrite
+        from plyfile import PlyData, PlyElement
+
+        folder = Path(folder)
+        if folder.exists() and any(folder.iterdir()):
+            raise ValueError(f"{folder} is not empty: give a new folder for the generated capture.")
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        cameras = self.cameras()
+
+        def draw(index: int) -> dict[str, object]:
+            camera = cameras[index]
+            packed = self._pixels(camera)
+            packed[..., :3] = (packed[..., :3] / packed[..., 3:].clamp_min(1e-6)).clamp(0, 1)
+            pixels = packed.mul(255).round().to(torch.uint8)
+            imwrite(folder / "images" / f"{index:04d}.png", pixels.numpy(), compress_level=3)
+            pose = torch.linalg.inv(camera.world_to_camera) * torch.tensor([1.0, -1.0, -1.0, 1.0]).double()
+            return {"file_path": f"images/{index:04d}.png", "transform_matrix": pose.tolist()}
+
+        with ThreadPoolExecutor(max(threads, 1)) as pool:
+            frames = list(pool.map(draw, range(self.views)))
+        truth = self.surface()
+        arrays = {name: getattr(truth, name).numpy() for name in ("vertices", "faces", "normals")}
+        np.savez_compressed(folder / "truth.npz", area=np.float64(truth.area), **arrays)
+        rows = np.zeros(len(truth.vertices), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in _RGB])
+        shades = (truth.colors * 255).round().to(torch.uint8)
+        for column, axis in enumerate("xyz"):
+            rows[axis], rows[_RGB[column]] = truth.vertices[:, column].numpy(), shades[:, column].numpy()
+        triangles = np.zeros(len(truth.faces), dtype=[("vertex_indices", "<i4", (3,))])
+        triangles["vertex_indices"] = truth.faces.numpy()
+        elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(triangles, "face")]
+        PlyData(elements, byte_order="<").write(str(folder / "mesh.ply"))
+        focal = float(cameras[0].intrinsics[0, 0])
+        fields: dict[str, object] = {"camera_angle_x": math.radians(self.fov), "fl_x": focal, "fl_y": focal}
+        fields |= {"cx": 0.5 * self.size, "cy": 0.5 * self.size, "w": self.size, "h": self.size, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(fields, indent=1), encoding="utf-8")
+        return folder
+
+
+_RGB = ("red", "green", "blue")

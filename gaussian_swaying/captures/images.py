@@ -1,0 +1,178 @@
+"""Photographs on disk and the pixels that training sees: read, composited, undistorted, made smaller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.captures.lens import Lens, remap
+
+_PIXELS = 80_000_000  # and one more for each byte of the file: reading takes some 12 bytes a pixel
+_WITH_ALPHA = ("RGBA", "LA", "PA", "P", "La", "RGBa")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedImage:
+    """What a capture's files say about one image.
+
+    Attributes:
+        name: Path of the image as the files give it.
+        path: The image on disk.
+        lens: Its intrinsics and size.
+        world_to_camera: Pose with OpenCV axes, float64, shape (4, 4).
+        split: ``train``, ``val`` or ``test`` where the files say so, else None.
+    """
+
+    name: str
+    path: Path
+    lens: Lens
+    world_to_camera: Tensor
+    split: str | None = None
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height of an image file [pixels], from its header.
+
+    Raises:
+        ValueError: If the file is missing, is not an image, or has far more pixels than its size lets one expect.
+    """
+    import imageio.v3 as iio
+
+    _refuse_pipes(path)
+    try:
+        height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]
+    except Exception as error:  # the readers of the formats raise what they like
+        raise _unreadable(path, error) from error
+    if width * height > _PIXELS + Path(path).stat().st_size:
+        raise ValueError(
+            f"The image {path} announces {width:,} x {height:,} pixels, too many for its size: make it smaller, or "
+            "delete it to leave it out."
+        )
+    return int(width), int(height)
+
+
+def read_image(path: str | Path) -> Tensor:
+    """Read an image of 8 or 16 bits, grey or colour, with or without alpha.
+
+    Args:
+        path: File in any format that Pillow reads; of an animation the first picture. Rotation tags are ignored, as
+            tools that find camera poses ignore them.
+
+    Returns:
+        Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) if the alpha channel says anything.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or holds numbers that are not colours.
+    """
+    import imageio.v3 as iio
+
+    _refuse_pipes(path)
+    try:
+        with cast(Any, iio.imopen(path, "r", plugin="pillow")) as file:
+            mode = file.metadata(index=0)["mode"]
+            deep = mode.startswith("I")
+            convert = None if deep or mode == "F" else "RGBA" if mode in _WITH_ALPHA else "RGB"
+            pixels = np.asarray(file.read(index=0, mode=convert))
+    except Exception as error:  # the readers of the formats raise what they like
+        raise _unreadable(path, error) from error
+    if mode == "F":
+        raise ValueError(f"The image {path} holds floating-point numbers: convert it to 8-bit PNG or JPEG.")
+    if deep:
+        pixels = np.repeat((pixels.astype(np.int64) // 257).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
+    if pixels.shape[-1] == 4 and bool((pixels[..., 3] == 255).all()):
+        pixels = pixels[..., :3]
+    return torch.from_numpy(np.array(pixels, dtype=np.uint8))
+
+
+def _refuse_pipes(path: str | Path) -> None:
+    """Raise ValueError if something other than a file has the name of an image; reading a pipe may never end."""
+    if Path(path).exists():
+        check_regular(path, "the image")
+
+
+def _unreadable(path: str | Path, error: Exception) -> ValueError:
+    if not Path(path).is_file():
+        return ValueError(f"The image {path} does not exist: restore it, or remove its entry.")
+    first = str(error).strip().split("\n")[0] or type(error).__name__
+    return ValueError(f"The image {path} cannot be read ({first}): copy it again, or delete it to leave it out.")
+
+
+def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
+    """Read an image, take the distortion out and average it down.
+
+    Alpha is multiplied into the colours first, so that what is transparent bleeds into nothing.
+
+    Args:
+        path: The file.
+        lens: Its lens.
+        downscale: Each pixel of the result is the mean of a square of this many pixels on a side.
+
+    Returns:
+        Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha. Their lens is
+        ``lens.undistorted().averaged(downscale)``.
+
+    Raises:
+        ValueError: If the file cannot be read or does not have the size of ``lens``.
+    """
+    pixels = read_image(path)
+    check_image_size(path, (pixels.shape[1], pixels.shape[0]), lens)
+    if downscale == 1 and not lens.distorted and pixels.shape[-1] == 3:
+        return pixels
+    image = pixels.permute(2, 0, 1).float()
+    if len(image) == 4:
+        image[:3] *= image[3:] / 255
+    if lens.distorted:
+        image = remap(image, lens, lens.undistorted())
+    if downscale > 1:
+        image = average_down(image, downscale)
+    return image.round_().clamp_(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous()
+
+
+def check_image_size(path: str | Path, size: tuple[int, int], lens: Lens) -> None:
+    """Raise ValueError unless an image of ``size`` (width, height) [pixels] fits its lens."""
+    if size != (lens.width, lens.height):
+        raise ValueError(
+            f"The image {path} has {size[0]} x {size[1]} pixels, but its camera has {lens.width} x {lens.height}: "
+            "put the image that the camera was made for in its place, or correct the size in the camera file."
+        )
+
+
+def average_down(image: Tensor, factor: int) -> Tensor:
+    """Mean over squares of ``factor`` x ``factor`` pixels; what does not fill one is cut off below and on the right.
+
+    Args:
+        image: Floating-point picture, channels first, shape (C, H, W).
+        factor: Side of the squares [pixels].
+
+    Returns:
+        The smaller picture, shape (C, H // factor, W // factor).
+    """
+    return functional.avg_pool2d(image[None], factor)[0]
+
+
+def straight_colors(pixels: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Colours and alpha of the pixels that :func:`load_image` returns.
+
+    Args:
+        pixels: Dtype uint8, shape (..., 3), or (..., 4) with colours that are multiplied with alpha.
+
+    Returns:
+        Colours in 0 to 1 as float32, shape (..., 3), not multiplied with alpha and black where it is 0; alpha, shape
+        (..., 1), or None without it. The picture in front of a background is colours alpha + (1 - alpha) background.
+
+    Example:
+        >>> straight_colors(torch.tensor([51, 0, 0, 51], dtype=torch.uint8))
+        (tensor([1., 0., 0.]), tensor([0.2000]))
+    """
+    if pixels.shape[-1] == 3:
+        return pixels.float() / 255, None
+    values = pixels.float()
+    alpha = values[..., 3:]
+    return (values[..., :3] / alpha.clamp_min(1)).clamp_max(1), alpha / 255

@@ -1,0 +1,184 @@
+"""Points that Gaussians start from: those of a capture, of a file, of a mesh, or at random."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.captures.capture import Capture, common_focus, view_reach
+from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, read_ply_points, sample_mesh
+
+_ATTEMPTS = 100
+
+
+def initial_points(
+    capture: Capture,
+    source: str | os.PathLike[str] = "auto",
+    count: int = 100_000,
+    seed: int = 0,
+    half_side: float | None = None,
+) -> PointCloud:
+    """Points that the training of a capture starts from.
+
+    Random points are not nearer to a camera than half of its distance to the point that all cameras look at: what
+    starts there ends as haze that only this camera sees.
+
+    Args:
+        capture: The capture.
+        source: ``capture`` for the points that came with it, ``random`` for a cube, ``auto`` for the former if there
+            are any and else the latter, or a file: .ply with points, .ply or .obj with a mesh.
+        count: Number of points in the cube or on the mesh. Points of a capture or a file are all taken.
+        seed: Of the random numbers.
+        half_side: Half the side of the cube [scene units]. The default is what the median camera sees to either side
+            of the point that all cameras look at.
+
+    Returns:
+        The points.
+
+    Raises:
+        ValueError: If the source does not exist or is not usable, or the cameras look at no common point.
+    """
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"Expected `count` to be a positive whole number, but got {count!r}.")
+    if source == "capture" or (source == "auto" and capture.points is not None):
+        if capture.points is None or capture.colors is None:
+            raise ValueError(
+                f"The capture {capture.path} came with no points: set the initial points to random or to a file."
+            )
+        return PointCloud(capture.points, capture.colors)
+    if source in ("auto", "random"):
+        center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
+        return _away_from_cameras(capture, center, reach, count, seed)
+    if source == "consistent":
+        return consistent_points(capture, count, seed, half_side)
+    path = Path(source)
+    if path.suffix.lower() == ".obj":
+        return sample_mesh(*read_obj_mesh(path), count=count, seed=seed)
+    if path.suffix.lower() == ".ply":
+        vertices, faces = read_ply_points(path)
+        return vertices if faces is None else sample_mesh(vertices, faces, count, seed)
+    raise ValueError(
+        f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply or .obj file."
+    )
+
+
+def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -> PointCloud:
+    """Points of random colour, uniform in an upright cube.
+
+    Args:
+        center: Centre of the cube [scene units], shape (3,).
+        half_side: Half its side [scene units].
+        count: Number of points.
+        seed: Of the random numbers.
+    """
+    check_vector("center", center)
+    check_positive("half_side", half_side)
+    generator = torch.Generator().manual_seed(seed)
+    draw = torch.rand(count, 6, generator=generator)
+    return PointCloud(center.float() + half_side * (2 * draw[:, :3] - 1), draw[:, 3:].contiguous())
+
+
+def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: int, seed: int) -> PointCloud:
+    """Random points of a cube, of which those close to a camera are drawn again."""
+    points = colors = torch.zeros(0, 3)
+    for attempt in range(_ATTEMPTS):
+        more = random_points(center, reach, count, seed + 1_000_003 * attempt)
+        kept = _clear(capture, center, more.points)
+        points, colors = torch.cat([points, more.points[kept]]), torch.cat([colors, more.colors[kept]])
+        if len(points) >= count:
+            return PointCloud(points[:count], colors[:count])
+    raise ValueError(
+        f"The cameras of {capture.path} leave no room for random initial points between them: set the initial points "
+        "to consistent or to a .ply or .obj file, or give a larger half side."
+    )
+
+
+def _clear(capture: Capture, center: Tensor, points: Tensor) -> Tensor:
+    """Which points (N, 3) no camera has closer than half its distance to the centre, shape (N,)."""
+    eyes = torch.stack([view.camera.position for view in capture.split("train")]).float()
+    limit = 0.5 * (eyes - center.float()).norm(dim=-1)
+    return torch.cat([(torch.cdist(part, eyes) >= limit).all(-1) for part in points.split(1 << 16)])
+
+
+def consistent_points(
+    capture: Capture, count: int, seed: int = 0, half_side: float | None = None, candidates: int = 8, width: int = 160
+) -> PointCloud:
+    """Points at which the photos agree on a colour: of random candidates, those whose colour varies least.
+
+    In the spirit of space carving by photo-consistency (Kutulakos & Seitz 2000), without its test of occlusion. Half
+    of the candidates are uniform in the cube of :func:`initial_points`, the others around it, as dense per logarithm of
+    the distance up to ten times its half side; each half gives half of the points, so that the background has some.
+
+    Args:
+        capture: The capture; photos with alpha are taken in front of black.
+        count: Number of points.
+        seed: Of the random numbers.
+        half_side: Half the side of the cube [scene units]; that of :func:`initial_points` by default.
+        candidates: Number of candidates for each point.
+        width: Width to which the photos are reduced [pixels].
+
+    Returns:
+        The points, with the mean of the colours that the photos show there.
+
+    Raises:
+        ValueError: If fewer than ``count`` candidates are in three photos and not close to a camera.
+    """
+    center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
+    generator = torch.Generator().manual_seed(seed)
+    inner = candidates * (count - count // 2)
+    outer = candidates * (count // 2)
+    near = 2 * torch.rand(inner, 3, generator=generator) - 1
+    ray = torch.nn.functional.normalize(torch.randn(outer, 3, generator=generator), dim=-1)
+    far = ray * 10.0 ** torch.rand(outer, 1, generator=generator)
+    points = center.float() + reach * torch.cat([near, far])
+    clear = _clear(capture, center, points)
+    seen, total, squares = torch.zeros(len(points)), torch.zeros(len(points), 3), torch.zeros(len(points))
+    for view in capture.split("train"):
+        pixels = view.load()[..., :3].permute(2, 0, 1)[None].float() / 255
+        height = max(round(width * pixels.shape[2] / pixels.shape[3]), 1)
+        photo = torch.nn.functional.interpolate(pixels, (height, width), mode="area")[0]
+        camera = view.camera
+        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        scale = local[:, :2] / depth.clamp_min(1e-6)[:, None]
+        column = ((scale[:, 0] * camera.intrinsics[0, 0] + camera.intrinsics[0, 2]) * (width / camera.width)).floor()
+        row = ((scale[:, 1] * camera.intrinsics[1, 1] + camera.intrinsics[1, 2]) * (height / camera.height)).floor()
+        inside = (depth > camera.near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        found = photo[:, row[inside].long(), column[inside].long()].T
+        seen[inside] += 1
+        total[inside] += found
+        squares[inside] += found.square().sum(-1)
+    mean = total / seen.clamp_min(1)[:, None]
+    spread = squares / seen.clamp_min(1) - mean.square().sum(-1)
+    spread[(seen < 3) | ~clear] = math.inf
+    parts = ((spread[:inner], 0, count - count // 2), (spread[inner:], inner, count // 2))
+    chosen = torch.cat([begin + part.topk(number, largest=False).indices for part, begin, number in parts])
+    missing = int(spread[chosen].isinf().sum())
+    if missing:
+        raise ValueError(
+            f"Only {count - missing} of {count} consistent points are in three photos or more: set a smaller "
+            "`point_count`, or the initial points to random."
+        )
+    return PointCloud(points[chosen], mean[chosen].clamp(0.0, 1.0))
+
+
+def _focus(capture: Capture) -> Tensor:
+    """The point nearest to all optical axes, or an error if the cameras do not look at it."""
+    focus = common_focus([view.camera for view in capture.split("train")])
+    if focus is None:
+        raise ValueError(
+            f"The cameras of {capture.path} look at no common point, so no cube for random initial points is known: "
+            "set the initial points to a .ply or .obj file."
+        )
+    return focus
+
+
+def _view_cube(capture: Capture) -> tuple[Tensor, float]:
+    """Centre and half side of the cube that the median camera sees."""
+    focus = _focus(capture)
+    return focus, view_reach([view.camera for view in capture.split("train")], focus)

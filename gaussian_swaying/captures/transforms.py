@@ -1,0 +1,153 @@
+"""Captures described by ``transforms.json``: NeRF and Blender, instant-ngp, Nerfstudio, BlenderNeRF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gaussian_swaying.captures.images import PosedImage, image_size
+from gaussian_swaying.captures.lens import Lens
+from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_intrinsics, read_number, read_pose
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+_SPLITS = ("train", "val", "test")
+_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_OTHER_COEFFICIENTS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
+
+
+def transforms_files(path: Path) -> list[tuple[Path, str | None]]:
+    """The camera files of a capture with the split that each holds, or an empty list if there are none.
+
+    Args:
+        path: A folder with ``transforms.json`` or ``transforms_{train,val,test}.json``, or one such file.
+    """
+    if path.suffix == ".json":
+        return [(path, None)]
+    single = path / "transforms.json"
+    if single.is_file():
+        return [(single, None)]
+    files: list[tuple[Path, str | None]] = [(path / f"transforms_{split}.json", split) for split in _SPLITS]
+    return [(file, split) for file, split in files if file.is_file()]
+
+
+def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | None]:
+    """Read the cameras of a capture in the style of NeRF, Blender, instant-ngp or Nerfstudio.
+
+    Intrinsics come from the frame or from the top of the file, as in
+    :func:`~gaussian_swaying.rendering.cameras.transforms_json.camera_from_transforms`; a missing ``w`` and ``h`` is
+    the size of the image. ``file_path`` may lack its extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and
+    ``p2``. A file per split, or lists ``train_filenames``, ``val_filenames`` and ``test_filenames``, say what is
+    for training.
+
+    Args:
+        path: Folder or file, see :func:`transforms_files`.
+
+    Returns:
+        The images that exist, the names of those that do not, and a point cloud that belongs to the capture or None.
+
+    Raises:
+        ValueError: If a file or a field is bad. The message names it and the remedy.
+    """
+    images: list[PosedImage] = []
+    missing: list[str] = []
+    points: Path | None = None
+    for file, split in transforms_files(path):
+        data, where = load_transforms(file), f"`{file}`"
+        listed = _listed_splits(where, data)
+        for index, frame in enumerate(data["frames"]):
+            name = _file_path(where, index, frame)
+            pose = read_pose(where, index, frame)
+            check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
+            image = find_image(file.parent, name)
+            if image is None:
+                missing.append(name)
+                continue
+            lens = _read_lens(where, _merged(data, frame), image)
+            own = split if listed is None else listed.get(name)
+            images.append(PosedImage(name, image, lens, torch.linalg.inv(pose), own))
+        for candidate in (data.get("ply_file_path"), "points3d.ply"):
+            if points is None and isinstance(candidate, str) and (file.parent / candidate).is_file():
+                points = file.parent / candidate
+    return images, missing, points
+
+
+def _merged(data: dict[str, object], frame: dict[str, object]) -> dict[str, object]:
+    """Fields of a frame, and those of the top where it has none; the top's focal length yields to the frame's angle."""
+    hidden: set[str] = set()
+    for axis, other in ("xy", "yx"):
+        if f"fl_{axis}" in frame or f"camera_angle_{axis}" in frame:
+            hidden |= {f"fl_{axis}", f"camera_angle_{axis}"}
+        if f"camera_angle_{axis}" in frame:  # a zoom: pixels stay square unless the frame says otherwise
+            hidden |= {f"fl_{other}", f"camera_angle_{other}"}
+    return {name: value for name, value in data.items() if name not in hidden} | frame
+
+
+def check_rigid(what: str, pose: torch.Tensor, tolerance: float = 1e-3) -> None:
+    """Raise ValueError unless a matrix (4, 4) is a rigid motion; ``what`` begins the sentence."""
+    rotation, row = pose[:3, :3], pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+    error = max(
+        float((rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max()), float((pose[3] - row).abs().max())
+    )
+    if not error <= tolerance:
+        raise ValueError(
+            f"{what} is not rigid (off by {error:.3g} from a rotation and a shift): apply the scale of the camera and "
+            "export it again."
+        )
+    if float(torch.linalg.det(rotation)) < 0:
+        raise ValueError(f"{what} is a reflection: make the axes of the camera right-handed and export it again.")
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """The image that a file path means, with or without its extension; None if there is none."""
+    base = folder / name
+    if base.is_file():
+        return base
+    for stem in (name, str(Path(name).with_suffix(""))) if Path(name).suffix.lower() in _SUFFIXES else (name,):
+        for suffix in _SUFFIXES:
+            if (folder / f"{stem}{suffix}").is_file():
+                return folder / f"{stem}{suffix}"
+    return None
+
+
+def _file_path(where: str, index: int, frame: dict[str, Any]) -> str:
+    value = frame.get("file_path")
+    if not isinstance(value, str) or not value:
+        raise ValueError(
+            f"The field `frames[{index}].file_path` of the camera file {where} is {value!r}: set it to an image."
+        )
+    return value.replace("\\", "/").removeprefix("./")
+
+
+def _listed_splits(where: str, data: dict[str, Any]) -> dict[str, str] | None:
+    """Split of each file name as Nerfstudio's lists give it, or None without such lists."""
+    result: dict[str, str] = {}
+    for split in _SPLITS:
+        names = data.get(f"{split}_filenames")
+        if names is None:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"The field `{split}_filenames` of the camera file {where} must be a list of file paths.")
+        result |= {name.replace("\\", "/").removeprefix("./"): split for name in names}
+    return result or None
+
+
+def _read_lens(where: str, fields: dict[str, Any], image: Path) -> Lens:
+    model = "a fisheye lens" if fields.get("is_fisheye") else fields.get("camera_model", "OPENCV")
+    if model not in _PINHOLE_MODELS:
+        raise ValueError(
+            f"The camera file {where} asks for {model} (`camera_model`, `is_fisheye`): only "
+            f"{', '.join(_PINHOLE_MODELS)} can be read; undistort the images with the tool that found the cameras."
+        )
+    for name in _OTHER_COEFFICIENTS:
+        if read_number(where, fields, name):
+            raise ValueError(
+                f"The field `{name}` of the camera file {where} is not 0: only k1, k2, k3, p1 and p2 can be undone "
+                "here; undistort the images first."
+            )
+    width, height = image_size(image)
+    given = {name: value for name, value in fields.items() if value is not None}
+    w, h, fx, fy, cx, cy = read_intrinsics(where, {"w": width, "h": height, **given}, None, None)
+    distortion = tuple(read_number(where, fields, name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
+    return Lens(fx, fy, cx, cy, round(w), round(h), distortion)

@@ -1,0 +1,99 @@
+"""``gaussian-swaying sim``: parse, build, run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gaussian_swaying._yaml_limits import check_config_files
+from gaussian_swaying.cli.continuing import how_to_resume
+from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.runs.signals import stop_signals
+from gaussian_swaying.simulation.config import RUN_ONLY, build_parser, build_pipeline
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse, build, run.
+
+    Args:
+        arguments: Command line; that of the process if None.
+
+    Returns:
+        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM,
+        129 by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+    """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    parser = build_parser()
+    started: list[SimulationPipeline] = []
+
+    def advice(error: BaseException) -> str | None:
+        """How to go on from the checkpoint that the run has left, if it has left one."""
+        if not started or started[0].resumable is None:
+            return None
+        return how_to_resume(*started[0].resumable, arguments, isinstance(error, SimulationDiverged))
+
+    return run_command(
+        lambda: _simulate(parser, arguments, started),
+        stopped="Stopped; what was recorded is kept.",
+        advice=advice,
+        memory="a smaller `scene.region`, a coarser `solver.dx` or a smaller picture",
+        expected=(SimulationDiverged,),
+        arguments=arguments,
+    )
+
+
+def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[SimulationPipeline]) -> None:
+    """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
+    arguments = with_shipped(arguments, "sim")
+    check_config_files(arguments)
+    with guessing(parser):
+        settings = parser.parse_args(arguments)
+    pipeline, recorder = build_pipeline(parser, settings)
+    folder = output_folder(settings)
+    scene = pipeline.scene
+    by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
+    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {pipeline.device}")
+    if scene.filled:
+        print(f"{scene.filled:,} points fill the inside")
+    print(scene.frame.describe())
+    extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
+    text = config_text(parser, settings)
+    started.append(pipeline)
+    with stop_signals():
+        summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
+    seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
+    print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
+    if summary["torn_particles"]:
+        print(
+            f"warning: {summary['torn_particles']} particles are farther than two cells from a neighbour, so the "
+            "material fell apart numerically: use `solver.formulation: total`, or a coarser `solver.dx`.",
+            file=sys.stderr,
+        )
+    beside = [folder / name for name in ("diagnostics.csv", "checkpoint.pt", "config.yaml")]
+    for file in [*pipeline.files, *(file for file in beside if file.exists())]:
+        print(f"wrote {file}")
+
+
+def output_folder(settings: Namespace) -> Path:
+    """The folder asked for, or one named after the config file."""
+    if settings.output:
+        return Path(settings.output)
+    files = [str(file) for file in settings.config or []]
+    return Path("outputs") / (Path(files[-1]).stem if files else "run")
+
+
+def config_text(parser: ArgumentParser, settings: Namespace) -> str:
+    """The settings that decide the result, as YAML."""
+    kept = settings.clone()
+    for name in RUN_ONLY:
+        kept.pop(name, None)
+    return str(parser.dump(kept, skip_validation=True))

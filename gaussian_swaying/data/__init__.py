@@ -1,1 +1,0 @@
-"""Scenes made in code and readers of other people's data."""

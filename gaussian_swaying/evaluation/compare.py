@@ -1,0 +1,474 @@
+"""A run beside a reference, frame by frame: pictures, surface and, with a network, video. Numbers, a table, files."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying._files import atomic, write_json
+from gaussian_swaying._inputs import check_archive, read_json
+from gaussian_swaying._provenance import describe_device, versions
+from gaussian_swaying.captures.images import image_size, read_image
+from gaussian_swaying.evaluation.comparison_picture import comparison_picture
+from gaussian_swaying.evaluation.reference import Cloth, frame_files, read_cloth, surface_points
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.rotations import rotation_from_z
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.simulation.recording.video import VideoEncoder
+
+if TYPE_CHECKING:
+    from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
+
+_SSIM_WINDOW = 11
+
+
+def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
+    """PSNR and SSIM of torchmetrics, for values from 0 to 1.
+
+    Args:
+        image: Picture of the run, shape (H, W, 3).
+        target: Picture of the reference, of the same shape.
+
+    Returns:
+        ``psnr_db`` (infinite for equal pictures), ``ssim`` and ``mse``, the mean square of the differences.
+
+    Raises:
+        ValueError: If the shapes differ or the pictures are smaller than the window of SSIM, 11 pixels.
+    """
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+    check_shape("target", target, "H", "W", 3)
+    check_shape("image", image, *target.shape)
+    if min(target.shape[:2]) < _SSIM_WINDOW:
+        raise ValueError(
+            f"Expected pictures of at least 11 x 11 pixels, but got {target.shape[1]} x {target.shape[0]}."
+        )
+    one, two = (picture.permute(2, 0, 1)[None] for picture in (image, target))
+    return {
+        "psnr_db": float(peak_signal_noise_ratio(one, two, data_range=1.0)),
+        "ssim": float(structural_similarity_index_measure(one, two, data_range=1.0)),  # type: ignore[arg-type]
+        "mse": float((one - two).square().mean()),
+    }
+
+
+def compare_run(
+    run: str | os.PathLike[str],
+    reference: str | os.PathLike[str],
+    *,
+    reference_offset: int = 0,
+    frames: int | None = None,
+    side: float | None = None,
+    points: int = 10_000,
+    seed: int = 0,
+    device: str | torch.device = "cpu",
+    fvd: FrechetVideoDistance | None = None,
+    video: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Compare a run with a reference, frame by frame.
+
+    Frame i of the run, which is at rest at i = 0, belongs to frame i + ``reference_offset`` of the reference. Frames
+    are counted from 0 in the order of their numbers.
+
+    Pictures are compared if both folders have ``frames/*.png`` (the reference's may lie in ``video/``). Surfaces are if
+    the reference has ``cloth.npz`` (see :func:`read_cloth`) and the run ``trajectory.npz``: points drawn from the
+    reference's surface against the simulated Gaussians, moved from the frame of the simulation to that of the scene, in
+    metres. The Chamfer distance is the average of the two mean distances, so two equal sheets at a distance h have h.
+    How much of it is due to sampling tells ``sampling_m``, the distance between that many random points of the
+    reference and as many others as there are particles.
+
+    Args:
+        run: Folder of a run, as a simulation writes it.
+        reference: Folder of the reference.
+        reference_offset: Number of the reference's frame that belongs to frame 0 of the run; may be negative.
+        frames: Compare only so many frames; by default all, and then both must have equally many.
+        side: Longer side of the reference's surface [m]; by default that of ``cloth.npz``, if it has one.
+        points: Number of points on the reference's surface, and largest number of particles.
+        seed: Of the points.
+        device: Where the metrics are computed.
+        fvd: Computes the Fréchet video distance; None for none. What it has seen before is forgotten.
+        video: An .mp4 of reference, run and error side by side; None for none.
+        progress: Show a progress bar.
+
+    Returns:
+        What ``eval.json`` holds: ``mean`` and ``worst`` over the frames and ``per_frame``, with ``psnr_db``, ``ssim``,
+        ``mse``, ``chamfer_m`` and its two terms ``run_to_reference_m`` and ``reference_to_run_m``; ``psnr_of_mean_db``,
+        the PSNR of the mean square over all frames; ``chamfer_share``, the mean Chamfer distance over ``side_m``;
+        ``fvd`` with its protocol; ``skipped``, what was not compared and why; sizes, numbers, seed, device and
+        versions. What is not finite is None.
+
+    Raises:
+        ValueError: If a folder is missing or does not hold what it should, numbers of frames or sizes differ, or there
+            is nothing to compare.
+        OSError: If the video cannot be written.
+    """
+    run, reference, device = Path(run), Path(reference), torch.device(device)
+    check_positive("points", points)
+    if frames is not None:
+        check_positive("frames", frames)
+    if side is not None:
+        check_positive("side", side)
+    summary = _read_summary(run)
+    if not reference.is_dir():
+        raise ValueError(f"There is no reference folder {reference}: give one with frames/*.png or cloth.npz.")
+    skipped: list[str] = []
+    run_pictures, pictures = frame_files(run), frame_files(reference) or frame_files(reference / "video")
+    has_surface, has_particles = (reference / "cloth.npz").exists(), (run / "trajectory.npz").exists()
+    if not (run_pictures and pictures):
+        skipped.append(f"pictures: {reference if run_pictures else run} has no frames/*.png")
+    if not (has_surface and has_particles):
+        missing = reference / "cloth.npz" if not has_surface else run / "trajectory.npz"
+        skipped.append(f"surface: there is no {missing}")
+    if len(skipped) == 2:
+        raise ValueError(f"Nothing can be compared ({'; '.join(skipped)}): record the run with images or trajectory.")
+    with_pictures, with_surface = bool(run_pictures and pictures), has_surface and has_particles
+    cloth = read_cloth(reference / "cloth.npz") if with_surface else None
+    counts: dict[str, tuple[int, int]] = {}
+    if with_pictures:
+        counts["pictures"] = (len(run_pictures), len(pictures))
+    if cloth is not None:
+        counts["surfaces"] = (_trajectory_length(run / "trajectory.npz"), len(cloth.positions))
+    first, first_reference = max(0, -reference_offset), max(0, reference_offset)
+    count = _common_count(run, reference, counts, first, first_reference, frames)
+    run_pictures, pictures = run_pictures[first:][:count], pictures[first_reference:][:count]
+    size = _common_size(run, reference, run_pictures, pictures) if with_pictures else None
+    if fvd is not None:
+        if not with_pictures:
+            raise ValueError(f"The Fréchet video distance needs pictures ({skipped[0]}): leave out its network.")
+        if count < fvd.clip_length + fvd.stride:
+            raise ValueError(
+                f"Two clips of {fvd.clip_length} frames need {fvd.clip_length + fvd.stride} frames, but {count} are "
+                "compared: lower `clip_length`, or leave out the network."
+            )
+        fvd.to(device)
+        fvd.reset()
+    surface = None if cloth is None else _Surface(run, summary, cloth, first_reference, points, seed, device)
+
+    encoder = None
+    if video is not None and with_pictures:
+        encoder = VideoEncoder(Path(video), 1 / float(summary.get("frame_dt_s") or 0.04))
+    small: dict[bool, list[Tensor]] = {True: [], False: []}
+    rows: list[dict[str, Any]] = []
+    try:
+        for number in tqdm(range(count), unit="frame", disable=not progress, file=sys.stderr):
+            row: dict[str, Any] = {"frame": first + number, "reference_frame": first_reference + number}
+            if with_pictures:
+                image, target = (_read_frame(files[number], device) for files in (run_pictures, pictures))
+                row |= picture_errors(image, target)
+                if encoder is not None:
+                    labels = (f"reference, frame {row['reference_frame']}", f"run, frame {row['frame']}")
+                    encoder.write(comparison_picture(target, image, labels))
+                if fvd is not None:
+                    for real, picture in ((True, target), (False, image)):
+                        small[real].append(fvd.prepare(picture.permute(2, 0, 1)))
+            if surface is not None:
+                row |= surface.distances(first + number, first_reference + number)
+            rows.append(row)
+        video_distance: dict[str, Any] | None = None
+        if fvd is not None:
+            for real, pile in small.items():
+                fvd.update(torch.stack(pile), real=real)
+            video_distance = {"fvd": float(fvd.compute()), **fvd.protocol()}
+        if encoder is not None:
+            encoder.finish()
+    finally:
+        if encoder is not None:
+            encoder.abort()
+
+    names = [name for name in rows[0] if name not in ("frame", "reference_frame")]
+    mean = {name: float(np.mean([row[name] for row in rows])) for name in names}
+    higher_is_better = ("psnr_db", "ssim")
+    worst = {n: (min if n in higher_is_better else max)(row[n] for row in rows) for n in names}
+    result: dict[str, Any] = {
+        "run": str(run),
+        "reference": str(reference),
+        "frames": count,
+        "first_frame": first,
+        "first_reference_frame": first_reference,
+        "reference_offset": reference_offset,
+        "size": None if size is None else list(size),
+        "mean": mean,
+        "worst": worst,
+        "fvd": video_distance,
+        "skipped": skipped,
+        "seed": seed,
+        "device": describe_device(device),
+        "versions": versions() | {"torchmetrics": version("torchmetrics")},
+        "run_status": summary.get("status"),
+    }
+    if with_pictures:
+        result["psnr_of_mean_db"] = -10 * math.log10(mean["mse"]) if mean["mse"] > 0 else math.inf
+    if surface is not None and cloth is not None:
+        side = side if side is not None else cloth.side
+        result |= surface.about() | {"side_m": side, "chamfer_share": mean["chamfer_m"] / side if side else None}
+    return dict(_finite(result | {"per_frame": rows}))
+
+
+def table(result: dict[str, Any]) -> str:
+    """The numbers of :func:`compare_run` as Markdown, which also reads as plain text."""
+    mean, worst = result["mean"], result["worst"]
+    rows: list[tuple[str, str, str]] = []
+    if "psnr_db" in mean:
+        rows.append(("PSNR [dB]", _number(mean["psnr_db"], ".2f"), _number(worst["psnr_db"], ".2f")))
+        rows.append(("PSNR of the mean square [dB]", _number(result["psnr_of_mean_db"], ".2f"), ""))
+        rows.append(("SSIM", _number(mean["ssim"], ".4f"), _number(worst["ssim"], ".4f")))
+    if "chamfer_m" in mean:
+        side = result["side_m"]
+        for label, name in (
+            ("Chamfer distance, average of both directions", "chamfer_m"),
+            ("run to reference", "run_to_reference_m"),
+            ("reference to run", "reference_to_run_m"),
+        ):
+            rows.append((f"{label} [mm]", _number(1e3 * mean[name], ".2f"), _number(1e3 * worst[name], ".2f")))
+            if side and name == "chamfer_m":
+                shares = [_number(1e2 * value[name] / side, ".2f") for value in (mean, worst)]
+                rows.append((f"the same / longer side of {side:g} m [%]", shares[0], shares[1]))
+        rows.append(("of two random samples of the reference [mm]", _number(1e3 * result["sampling_m"], ".2f"), ""))
+    if result["fvd"] is not None:
+        rows.append(("FVD", _number(result["fvd"]["fvd"], ".5g"), ""))
+    header = ("", f"mean of {result['frames']} frames", "worst frame")
+    widths = [max(len(row[column]) for row in (header, *rows)) for column in range(3)]
+    lines = [_line(header, widths), f"|{'-' * (widths[0] + 2)}|{'-' * (widths[1] + 1)}:|{'-' * (widths[2] + 1)}:|"]
+    lines += [_line(row, widths) for row in rows]
+    lines += ["", f"Run `{result['run']}`, reference `{result['reference']}`: frame 0 of the run belongs to frame "]
+    lines[-1] += f"{result['reference_offset']} of the reference."
+    if result["size"]:
+        lines += [f"Pictures of {result['size'][0]} x {result['size'][1]} pixels."]
+    if "chamfer_m" in mean:
+        lines += [
+            f"Surfaces: {result['reference_points']} points of the reference, {result['run_points']} of "
+            f"{result['particles']} particles of the run, seed {result['seed']}."
+        ]
+        if not result["side_m"]:
+            lines += ["No longer side is known, so no share of it is given: --side gives it."]
+    if result["fvd"] is not None:
+        lines += [
+            "FVD: " + ", ".join(f"{name} {value}" for name, value in result["fvd"].items() if name != "fvd") + "."
+        ]
+    lines += [f"Not compared: {reason}." for reason in result["skipped"]]
+    found = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
+    lines += [f"Computed on {result['device']}; {found}."]
+    return "\n".join(lines) + "\n"
+
+
+def evaluate(
+    run: str | os.PathLike[str],
+    reference: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    video: bool = True,
+    **options: Any,
+) -> dict[str, Any]:
+    """Compare and write ``eval.json``, ``eval.md`` and ``comparison.mp4`` to a folder; each whole or not at all.
+
+    Args:
+        run: Folder of a run.
+        reference: Folder of the reference.
+        output: Where to write; what an earlier comparison left there is replaced.
+        video: Whether to make the video.
+        options: Further arguments of :func:`compare_run`.
+
+    Returns:
+        What :func:`compare_run` returns.
+
+    Raises:
+        ValueError: As :func:`compare_run`, or if the folder cannot be made; nothing is written then.
+        OSError: If a file cannot be written.
+    """
+    folder = Path(output)
+    _read_summary(Path(run))  # before the folder, which may lie within, is made
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"The output folder {folder} cannot be written ({error.strerror or error}): choose another with --output."
+        ) from error
+    try:
+        made = folder / "comparison.mp4"
+        result = compare_run(run, reference, video=made if video else None, **options)
+        if not (video and result["size"]):
+            made.unlink(missing_ok=True)  # that of an earlier comparison
+        write_json(folder / "eval.json", result)
+        with atomic(folder / "eval.md") as temporary:
+            temporary.write_text(table(result), encoding="utf-8")
+    except BaseException:
+        with suppress(OSError):  # those that hold something stay
+            for path in missing:
+                path.rmdir()
+        raise
+    return result
+
+
+class _Surface:
+    """Chamfer distances between the particles of a run and the surface of a reference."""
+
+    def __init__(
+        self,
+        run: Path,
+        summary: dict[str, Any],
+        cloth: Cloth,
+        first_reference: int,
+        points: int,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.trajectory, self.cloth = run / "trajectory.npz", cloth
+        self.points, self.seed, self.device = points, seed, device
+        self.frame = _sim_frame(run, summary)
+        recorded = len(load_trajectory(self.trajectory, 0)[0])
+        surface = summary.get("surface_particles") or summary.get("simulated_gaussians")
+        self.particles = min(int(surface or recorded), recorded)  # others come after them
+        generator = torch.Generator().manual_seed(seed)
+        self.chosen = torch.randperm(self.particles, generator=generator)[:points].sort().values
+        others = surface_points(cloth.positions[first_reference], cloth.faces, len(self.chosen), seed + 1)
+        self.sampling = self._distances(others, first_reference)["chamfer_m"]
+
+    def distances(self, frame: int, reference_frame: int) -> dict[str, float]:
+        position = load_trajectory(self.trajectory, frame)[0]
+        if not bool(torch.isfinite(position).all()):
+            raise ValueError(
+                f"{self.trajectory} has positions that are NaN or infinite at frame {frame}: compare the frames before "
+                "with --frames."
+            )
+        in_scene = self.frame.point_to_scene(position[self.chosen].double()) * self.frame.metres_per_unit
+        return self._distances(in_scene.float(), reference_frame)
+
+    def _distances(self, points: Tensor, reference_frame: int) -> dict[str, float]:
+        from gaussian_swaying.metrics.chamfer import nearest_distances
+
+        surface = surface_points(self.cloth.positions[reference_frame], self.cloth.faces, self.points, self.seed)
+        there, back = (float(d.mean()) for d in nearest_distances(points.to(self.device), surface.to(self.device)))
+        return {"chamfer_m": 0.5 * (there + back), "run_to_reference_m": there, "reference_to_run_m": back}
+
+    def about(self) -> dict[str, Any]:
+        return {
+            "chamfer": "average of the mean distances [m] from the run to the reference and back",
+            "particles": self.particles,
+            "run_points": len(self.chosen),
+            "reference_points": self.points,
+            "sampling_m": self.sampling,
+        }
+
+
+def _read_summary(run: Path) -> dict[str, Any]:
+    if not run.is_dir():
+        raise ValueError(f"There is no run folder {run}: give the folder of a simulation.")
+    try:
+        return dict(read_json(run / "summary.json", "summary"))
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(
+            f"The run {run} has no readable summary.json: give the folder of a finished simulation."
+        ) from error
+
+
+def _sim_frame(run: Path, summary: dict[str, Any]) -> SimFrame:
+    """The frame of the simulation, from the numbers of the summary or else from its line for people."""
+    if "sim_frame" in summary:
+        try:
+            return SimFrame.from_summary(summary)
+        except ValueError as error:
+            raise ValueError(f"The summary.json of {run} cannot be used: {error}.") from error
+    line = re.fullmatch(r"1 scene unit = (\S+) m; origin (\[.*\]); up (\[.*\]) .*", str(summary.get("frame")))
+    if line is None:
+        raise ValueError(f"The summary.json of {run} does not say where the scene lies (`frame`): run it again.")
+    origin = torch.tensor(json.loads(line[2]), dtype=torch.float64)
+    return SimFrame(origin, rotation_from_z(json.loads(line[3])).T, float(line[1]))
+
+
+def _trajectory_length(path: Path) -> int:
+    try:
+        with np.load(check_archive(path, "the run")) as arrays:
+            return len(arrays.files) // 2
+    except Exception as error:  # not a zip, truncated, ...
+        raise ValueError(f"{path} cannot be read as a trajectory ({error}): run the simulation again.") from error
+
+
+def _common_count(
+    run: Path,
+    reference: Path,
+    counts: dict[str, tuple[int, int]],
+    first: int,
+    first_reference: int,
+    frames: int | None,
+) -> int:
+    """The number of frames to compare."""
+    left = [(of_run - first, of_reference - first_reference) for of_run, of_reference in counts.values()]
+    shared = min(min(pair) for pair in left)
+    told = ", ".join(
+        f"{of_run} {name} of {run} and {of_reference} of {reference}" for name, (of_run, of_reference) in counts.items()
+    )
+    begins = f"beginning with frame {first} of the run and {first_reference} of the reference"
+    if shared < 1:
+        raise ValueError(f"There are {told}, so nothing is left {begins}: correct --reference-offset.")
+    if frames is not None:
+        if frames > shared:
+            raise ValueError(f"There are {told}, so {begins} only {shared} frames can be compared: lower --frames.")
+        return frames
+    if any(pair != (shared, shared) for pair in left):
+        raise ValueError(
+            f"The numbers of frames differ: there are {told}, {begins}; compare the first ones with --frames {shared}, "
+            "or correct --reference-offset."
+        )
+    return shared
+
+
+def _common_size(run: Path, reference: Path, ours: Sequence[Path], theirs: Sequence[Path]) -> tuple[int, int]:
+    """Width and height of all pictures [pixels]."""
+    size, wanted = image_size(ours[0]), image_size(theirs[0])
+    if size != wanted:
+        raise ValueError(
+            f"The pictures of {run} have {size[0]} x {size[1]} pixels, but those of {reference} {wanted[0]} x "
+            f"{wanted[1]}: render the run with `camera.init_args.width` and `height` of the reference."
+        )
+    for path in (*ours, *theirs):
+        if (other := image_size(path)) != size:
+            raise ValueError(
+                f"The picture {path} has {other[0]} x {other[1]} pixels, but the first one {size[0]} x {size[1]}: make "
+                "it again."
+            )
+    if min(size) < _SSIM_WINDOW:
+        raise ValueError(f"The pictures have {size[0]} x {size[1]} pixels, but SSIM needs 11 x 11: make larger ones.")
+    return size
+
+
+def _read_frame(path: Path, device: torch.device) -> Tensor:
+    """A picture from 0 to 1, float32, shape (H, W, 3)."""
+    pixels = read_image(path)
+    if pixels.shape[-1] != 3:
+        raise ValueError(f"The picture {path} has transparent pixels: render it in front of its background.")
+    return pixels.to(device).float() / 255
+
+
+def _finite(value: Any) -> Any:
+    """The same with None in place of what JSON has no number for."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _number(value: float | None, form: str) -> str:
+    return "infinite" if value is None else format(value, form)
+
+
+def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
+    return f"| {cells[0]:<{widths[0]}} | {cells[1]:>{widths[1]}} | {cells[2]:>{widths[2]}} |"
+
+
+__all__ = ["compare_run", "evaluate", "picture_errors", "table"]

@@ -1,0 +1,115 @@
+"""What the folder of a reference holds: pictures in order, and a surface that moves."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying._inputs import check_archive
+from gaussian_swaying.captures.point_cloud import PointCloud, sample_mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloth:
+    """The surface of a reference.
+
+    Attributes:
+        positions: Vertices of each frame in the axes and from the origin of the scene [m], float32, shape (T, V, 3).
+        faces: Triangles as indices of vertices, shape (F, 3).
+        side: Its longer side at rest [m], if the file says so.
+    """
+
+    positions: Tensor
+    faces: Tensor
+    side: float | None = None
+
+
+def read_cloth(path: str | os.PathLike[str]) -> Cloth:
+    """Read ``cloth.npz``: ``positions`` (T, V, 3) [m] and ``faces`` (F, 3), or (F, 4), whose squares are halved.
+
+    The longer side [m] is ``side``, or else the larger of ``width`` and ``height`` in the JSON text ``settings``, if
+    they are there.
+
+    Raises:
+        ValueError: If the file is missing or damaged, lacks an array, or one has a wrong shape or value.
+    """
+    try:
+        with np.load(check_archive(path, "the reference")) as arrays:
+            found = {name: arrays[name] for name in ("positions", "faces", "side", "settings") if name in arrays}
+    except Exception as error:  # not there, not a zip, pickled, ...
+        raise ValueError(f"The surface {path} cannot be read ({error}): make the reference again.") from error
+    for name in ("positions", "faces"):
+        if name not in found:
+            raise ValueError(f"The surface {path} has no array `{name}`: make the reference again.")
+    positions = torch.from_numpy(found["positions"].astype(np.float32))
+    faces = torch.from_numpy(found["faces"].astype(np.int64))
+    if positions.dim() != 3 or positions.shape[-1] != 3 or len(positions) == 0:
+        raise ValueError(f"Expected `positions` of {path} of shape (T, V, 3), but got {tuple(positions.shape)}.")
+    if faces.dim() != 2 or faces.shape[-1] not in (3, 4) or len(faces) == 0:
+        raise ValueError(f"Expected `faces` of {path} of shape (F, 3) or (F, 4), but got {tuple(faces.shape)}.")
+    if faces.shape[-1] == 4:
+        faces = torch.cat([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+    if int(faces.min()) < 0 or int(faces.max()) >= positions.shape[1]:
+        raise ValueError(f"Expected `faces` of {path} to hold indices from 0 to {positions.shape[1] - 1}.")
+    if not bool(torch.isfinite(positions).all()):
+        raise ValueError(f"Expected `positions` of {path} to be finite: make the reference again.")
+    return Cloth(positions, faces, _side(path, found))
+
+
+def _side(path: str | os.PathLike[str], found: dict[str, Any]) -> float | None:
+    if "side" in found:
+        side = float(found["side"])
+    else:
+        settings = json.loads(str(found.get("settings", "{}")))
+        if not {"width", "height"} <= set(settings):
+            return None
+        side = float(max(settings["width"], settings["height"]))
+    check_positive(f"side of {path}", side)
+    return side
+
+
+def surface_points(vertices: Tensor, faces: Tensor, count: int, seed: int = 0) -> Tensor:
+    """Points drawn evenly by area from a triangle mesh; the same seed gives the same points of the same mesh.
+
+    Args:
+        vertices: Vertices [m], shape (V, 3).
+        faces: Triangles, shape (F, 3).
+        count: Number of points.
+        seed: Of the random numbers.
+
+    Returns:
+        Points [m], float32, shape (count, 3).
+
+    Raises:
+        ValueError: If the mesh has no area or a face names a vertex that does not exist.
+    """
+    return sample_mesh(PointCloud(vertices, torch.zeros_like(vertices)), faces, count, seed).points
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """The pictures ``frames/<number>.png`` of a folder in order; their numbers must follow one another.
+
+    Raises:
+        ValueError: If a name is not a number or a number is missing.
+    """
+    files = [path for path in (folder / "frames").glob("*.png") if not path.name.startswith(".")]
+    for path in files:
+        if not path.stem.isdecimal():
+            raise ValueError(f"Expected {path} to be named by the number of its frame: rename it, or take it away.")
+    files.sort(key=lambda path: int(path.stem))
+    for before, after in pairwise(files):
+        if int(after.stem) != int(before.stem) + 1:
+            raise ValueError(f"Between {before} and {after.name} frames are missing or double: make them again.")
+    return files
+
+
+__all__ = ["Cloth", "frame_files", "read_cloth", "surface_points"]

@@ -1,0 +1,157 @@
+"""Gaussians as surface patches: normal, area, and how both and the covariance follow a deformation."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_shape
+from gaussian_swaying.gaussians.area import coverage_area, patch_area
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.patches import deform_all, smallest_axis_normal
+
+
+@dataclass(frozen=True, slots=True)
+class DeformedGaussians:
+    """What a renderer and a shader need of Gaussians after a deformation.
+
+    Attributes:
+        means: Centres [scene units], shape (..., N, 3).
+        covariances: Covariances F A F^T [scene units^2], shape (..., N, 3, 3).
+        normals: Unit normals F^-T N, shape (..., N, 3).
+        rotations: Rotation of each Gaussian from rest, the polar factor of F, shape (..., N, 3, 3).
+    """
+
+    means: Tensor
+    covariances: Tensor
+    normals: Tensor
+    rotations: Tensor
+
+
+class GaussianSurfaceModel(nn.Module):
+    """3D Gaussians as surface patches (Gaussian Swaying, "Surface Formulation").
+
+    Parameters in storage form, with the names of gsplat: ``means`` (N, 3), ``quats`` (N, 4) wxyz, ``scales`` (N, 3) as
+    logarithms, ``opacities`` (N,) as logits, ``sh0`` (N, 1, 3) and ``shN`` (N, K - 1, 3).
+
+    Args:
+        cloud: Gaussians to start from; their tensors are copied.
+        requires_grad: Whether the parameters are to be trained.
+    """
+
+    reference_normals: Tensor | None
+
+    def __init__(self, cloud: GaussianCloud, requires_grad: bool = True) -> None:
+        super().__init__()
+
+        def parameter(tensor: Tensor) -> nn.Parameter:
+            return nn.Parameter(tensor.detach().clone(), requires_grad=requires_grad)
+
+        self.means = parameter(cloud.means)
+        self.quats = parameter(cloud.quats)
+        self.scales = parameter(cloud.scales)
+        self.opacities = parameter(cloud.opacities)
+        self.sh0 = parameter(cloud.sh[:, :1])
+        self.shN = parameter(cloud.sh[:, 1:])
+        self.register_buffer("reference_normals", None if cloud.normals is None else cloud.normals.detach().clone())
+
+    @classmethod
+    def from_cloud(cls, cloud: GaussianCloud, requires_grad: bool = True) -> GaussianSurfaceModel:
+        """The model of given Gaussians."""
+        return cls(cloud, requires_grad)
+
+    @classmethod
+    def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:
+        """The model of a file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads."""
+        return cls(read_gaussians(path), requires_grad)
+
+    def to_cloud(self) -> GaussianCloud:
+        """The Gaussians in storage form, detached; they share memory with the parameters except for ``sh``."""
+        return GaussianCloud(
+            means=self.means.detach(),
+            quats=self.quats.detach(),
+            scales=self.scales.detach(),
+            opacities=self.opacities.detach(),
+            sh=self.sh.detach(),
+            normals=self.reference_normals,
+        )
+
+    def save_ply(self, path: str | os.PathLike[str]) -> None:
+        """Write a 3DGS file, with the errors of :func:`gaussian_swaying.gaussians.ply.write_ply`."""
+        write_ply(path, self.to_cloud())
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh(self) -> Tensor:
+        """All spherical harmonics coefficients, shape (N, K, 3)."""
+        return torch.cat([self.sh0, self.shN], dim=1)
+
+    @property
+    def view_dependent(self) -> bool:
+        """Whether the colours depend on where they are seen from."""
+        return self.shN.shape[1] > 0
+
+    def covariance(self) -> Tensor:
+        """Covariances at rest [scene units^2], shape (N, 3, 3)."""
+        return covariance(self.quats, self.scales)
+
+    def normals(self) -> Tensor:
+        """Unit normals at rest along the smallest axes, on the side of the file's normals if it had any, (N, 3)."""
+        normals = smallest_axis_normal(self.quats, self.scales)
+        if self.reference_normals is None:
+            return normals
+        return torch.where((normals * self.reference_normals).sum(-1, keepdim=True) < 0, -normals, normals)
+
+    def areas(self, mode: str = "coverage", neighbours: int = 24) -> Tensor:
+        """Patch areas at rest [scene units^2], shape (N,).
+
+        Args:
+            mode: "paper" for :func:`patch_area`, which is differentiable, or "coverage" for :func:`coverage_area`.
+            neighbours: Nearest centres that "coverage" considers.
+
+        Returns:
+            Shape (N,).
+
+        Raises:
+            ValueError: If ``mode`` is neither.
+        """
+        check_choice("mode", mode, ("paper", "coverage"))
+        if mode == "paper":
+            return patch_area(self.scales)
+        return coverage_area(self.means, self.normals(), self.scales, self.opacity(), neighbours)
+
+    def opacity(self) -> Tensor:
+        """Opacities from 0 to 1, shape (N,)."""
+        return self.opacities.sigmoid()
+
+    def colors(self, directions: Tensor) -> Tensor:
+        """RGB colours seen along directions from the camera (..., N, 3) of any length above zero; shape (..., N, 3)."""
+        return sh_to_color(self.sh, directions)
+
+    def deformed(self, position: Tensor, deformation_gradient: Tensor) -> DeformedGaussians:
+        """The Gaussians after a deformation.
+
+        Args:
+            position: Deformed centres [scene units], shape (..., N, 3).
+            deformation_gradient: Total deformation gradients, shape (..., N, 3, 3).
+
+        Returns:
+            Centres, covariances, normals and rotations.
+
+        Raises:
+            ValueError: If a tensor does not have the shape above.
+        """
+        check_shape("position", position, len(self), 3)
+        check_shape("deformation_gradient", deformation_gradient, len(self), 3, 3)
+        covariances, normals, rotations = deform_all(deformation_gradient, self.covariance(), self.normals())
+        assert rotations is not None
+        return DeformedGaussians(position, covariances, normals, rotations)

@@ -1,0 +1,281 @@
+"""3x3 matrices as Triton functions, one particle per lane.
+
+The definitions are in :mod:`~gaussian_swaying.geometry.linalg`.
+
+A matrix is a tuple of nine values, row by row; a vector one of three.
+"""
+
+import triton
+import triton.language as tl
+
+TINY = tl.constexpr(1e-30)
+
+
+@triton.jit
+def matmul(a, b):
+    """A B."""
+    return (
+        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
+        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
+        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
+        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
+        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
+        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
+        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
+        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
+        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
+    )
+
+
+@triton.jit
+def transpose(a):
+    """The transpose."""
+    return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
+
+
+@triton.jit
+def cofactor(a):
+    """The cofactor matrix."""
+    return (
+        a[4] * a[8] - a[5] * a[7],
+        a[5] * a[6] - a[3] * a[8],
+        a[3] * a[7] - a[4] * a[6],
+        a[7] * a[2] - a[8] * a[1],
+        a[8] * a[0] - a[6] * a[2],
+        a[6] * a[1] - a[7] * a[0],
+        a[1] * a[5] - a[2] * a[4],
+        a[2] * a[3] - a[0] * a[5],
+        a[0] * a[4] - a[1] * a[3],
+    )
+
+
+@triton.jit
+def dot3(a, b):
+    """Product of two vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def cross3(a, b):
+    """Cross product of two vectors."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@triton.jit
+def square9(a):
+    """Sum of the squares of a matrix."""
+    return (
+        a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3] + a[4] * a[4] + a[5] * a[5] + a[6] * a[6]
+        + a[7] * a[7] + a[8] * a[8]
+    )  # fmt: skip
+
+
+@triton.jit
+def scale9(s, a):
+    """S A."""
+    return (s * a[0], s * a[1], s * a[2], s * a[3], s * a[4], s * a[5], s * a[6], s * a[7], s * a[8])
+
+
+@triton.jit
+def axpy9(s, a, t, b):
+    """S A + t B."""
+    return (
+        s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2],
+        s * a[3] + t * b[3], s * a[4] + t * b[4], s * a[5] + t * b[5],
+        s * a[6] + t * b[6], s * a[7] + t * b[7], s * a[8] + t * b[8],
+    )  # fmt: skip
+
+
+@triton.jit
+def where3(condition, a, b):
+    """Choose between vectors."""
+    return (tl.where(condition, a[0], b[0]), tl.where(condition, a[1], b[1]), tl.where(condition, a[2], b[2]))
+
+
+@triton.jit
+def where9(condition, a, b):
+    """Choose between matrices."""
+    return (
+        tl.where(condition, a[0], b[0]), tl.where(condition, a[1], b[1]), tl.where(condition, a[2], b[2]),
+        tl.where(condition, a[3], b[3]), tl.where(condition, a[4], b[4]), tl.where(condition, a[5], b[5]),
+        tl.where(condition, a[6], b[6]), tl.where(condition, a[7], b[7]), tl.where(condition, a[8], b[8]),
+    )  # fmt: skip
+
+
+@triton.jit
+def scaled_product(u, d, v):
+    """U diag(d) V^T."""
+    return matmul(
+        (u[0] * d[0], u[1] * d[1], u[2] * d[2], u[3] * d[0], u[4] * d[1], u[5] * d[2], u[6] * d[0], u[7] * d[1],
+         u[8] * d[2]),
+        transpose(v),
+    )  # fmt: skip
+
+
+@triton.jit
+def polar_rotation(F):
+    """The nearest rotation, as ``linalg.polar_rotation``."""
+    x = F
+    for _ in range(5):
+        cof = cofactor(x)
+        det = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2]
+        size = tl.maximum(tl.abs(det), 1e-9)
+        inverse = 1.0 / tl.where(det < 0, -size, size)
+        ratio = square9(cof) * inverse * inverse / tl.maximum(square9(x), 1e-9)
+        zeta = tl.sqrt(tl.sqrt(tl.maximum(ratio, 1e-37)))
+        x = axpy9(0.5 * zeta, x, 0.5 * inverse / zeta, cof)
+    cof = cofactor(x)
+    reflected = x[0] * cof[0] + x[1] * cof[1] + x[2] * cof[2] < 0
+    if tl.max(reflected.to(tl.int32)) > 0:
+        u, _a, v = svd3(F)
+        x = where9(reflected, matmul(u, transpose(v)), x)
+    return x
+
+
+@triton.jit
+def _angle(app, aqq, apq):
+    """Tangent, cosine and sine of the rotation that annihilates an entry (``linalg._jacobi_angle``)."""
+    gap = aqq - app
+    twice = 2 * apq
+    root = tl.maximum(tl.sqrt(gap * gap + twice * twice), tl.abs(twice)) + TINY
+    tangent = tl.where(gap < 0, -twice, twice) / (tl.abs(gap) + root)
+    cosine = 1.0 / tl.sqrt(1 + tangent * tangent)
+    return tangent, cosine, cosine * tangent
+
+
+@triton.jit
+def _turn(c, s, a, b):
+    """Two vectors turned into each other."""
+    return (
+        (c * a[0] - s * b[0], c * a[1] - s * b[1], c * a[2] - s * b[2]),
+        (s * a[0] + c * b[0], s * a[1] + c * b[1], s * a[2] + c * b[2]),
+    )
+
+
+@triton.jit
+def _one_sided(bp, bq, vp, vq):
+    """One Jacobi rotation of two columns of F V and of V."""
+    _t, c, s = _angle(dot3(bp, bp), dot3(bq, bq), dot3(bp, bq))
+    bp, bq = _turn(c, s, bp, bq)
+    vp, vq = _turn(c, s, vp, vq)
+    return bp, bq, vp, vq
+
+
+@triton.jit
+def _ordered(bp, bq, vp, vq):
+    """The longer of two columns first; a swap turns one round."""
+    swap = dot3(bp, bp) < dot3(bq, bq)
+    return (
+        where3(swap, bq, bp),
+        where3(swap, (-bp[0], -bp[1], -bp[2]), bq),
+        where3(swap, vq, vp),
+        where3(swap, (-vp[0], -vp[1], -vp[2]), vq),
+    )
+
+
+@triton.jit
+def _unit(vector, fallback):
+    """A vector of length one; where it vanishes, the fallback."""
+    squared = dot3(vector, vector)
+    scale = 1.0 / tl.sqrt(tl.maximum(squared, 1e-31))
+    return where3(squared > 1e-31, (vector[0] * scale, vector[1] * scale, vector[2] * scale), fallback)
+
+
+@triton.jit
+def svd3(F):
+    """U, signed stretches and V of F = U diag(a) V^T, U and V rotations, as ``linalg.spectrum``."""
+    c0 = (F[0], F[3], F[6])
+    c1 = (F[1], F[4], F[7])
+    c2 = (F[2], F[5], F[8])
+    a00 = dot3(c0, c0)
+    a11 = dot3(c1, c1)
+    a22 = dot3(c2, c2)
+    a01 = dot3(c0, c1)
+    a02 = dot3(c0, c2)
+    a12 = dot3(c1, c2)
+    zero = F[0] * 0
+    v0 = (zero + 1, zero, zero)
+    v1 = (zero, zero + 1, zero)
+    v2 = (zero, zero, zero + 1)
+    for _ in range(4):
+        t, c, s = _angle(a00, a11, a01)
+        shift = t * a01
+        a00, a11, a01 = a00 - shift, a11 + shift, zero
+        a02, a12 = c * a02 - s * a12, s * a02 + c * a12
+        v0, v1 = _turn(c, s, v0, v1)
+        t, c, s = _angle(a00, a22, a02)
+        shift = t * a02
+        a00, a22, a02 = a00 - shift, a22 + shift, zero
+        a01, a12 = c * a01 - s * a12, s * a01 + c * a12
+        v0, v2 = _turn(c, s, v0, v2)
+        t, c, s = _angle(a11, a22, a12)
+        shift = t * a12
+        a11, a22, a12 = a11 - shift, a22 + shift, zero
+        a01, a02 = c * a01 - s * a02, s * a01 + c * a02
+        v1, v2 = _turn(c, s, v1, v2)
+    b0 = _combine(v0, c0, c1, c2)
+    b1 = _combine(v1, c0, c1, c2)
+    b2 = _combine(v2, c0, c1, c2)
+    for _ in range(2):
+        b0, b1, v0, v1 = _one_sided(b0, b1, v0, v1)
+        b0, b2, v0, v2 = _one_sided(b0, b2, v0, v2)
+        b1, b2, v1, v2 = _one_sided(b1, b2, v1, v2)
+    b0, b1, v0, v1 = _ordered(b0, b1, v0, v1)
+    b0, b2, v0, v2 = _ordered(b0, b2, v0, v2)
+    b1, b2, v1, v2 = _ordered(b1, b2, v1, v2)
+    first = _unit(b0, v0)
+    component = tl.where(tl.abs(first[0]) < 0.8, 1.0, 0.0)
+    other = _reject((component, 1 - component, zero), first)
+    second = _unit(_reject(b1, first), _unit(other, other))
+    second = _unit(_reject(second, first), second)
+    third = cross3(first, second)
+    stretch = (dot3(first, b0), dot3(second, b1), dot3(third, b2))
+    left = (first[0], second[0], third[0], first[1], second[1], third[1], first[2], second[2], third[2])
+    axes = (v0[0], v1[0], v2[0], v0[1], v1[1], v2[1], v0[2], v1[2], v2[2])
+    return left, stretch, axes
+
+
+@triton.jit
+def _combine(v, c0, c1, c2):
+    """A combination of three vectors."""
+    return (
+        v[0] * c0[0] + v[1] * c1[0] + v[2] * c2[0],
+        v[0] * c0[1] + v[1] * c1[1] + v[2] * c2[1],
+        v[0] * c0[2] + v[1] * c1[2] + v[2] * c2[2],
+    )
+
+
+@triton.jit
+def _reject(a, unit):
+    """What is left of a vector across a unit vector."""
+    along = dot3(a, unit)
+    return (a[0] - along * unit[0], a[1] - along * unit[1], a[2] - along * unit[2])
+
+
+@triton.jit
+def clamp(x, low, high):
+    """X between two limits."""
+    return tl.minimum(tl.maximum(x, low), high)
+
+
+@triton.jit
+def largest(x, y):
+    """The larger of two numbers; NaN if one is."""
+    return tl.maximum(x, y, tl.PropagateNan.ALL)
+
+
+@triton.jit
+def largest_eigenvalue(m):
+    """Largest eigenvalue of a symmetric matrix, as ``linalg.symmetric_eigenvalues``."""
+    mean = (m[0] + m[4] + m[8]) / 3
+    d = (m[0] - mean, m[1], m[2], m[3], m[4] - mean, m[5], m[6], m[7], m[8] - mean)
+    radius = tl.sqrt(square9(d) / 6)
+    cof = cofactor(d)
+    scale = 1.0 / tl.maximum(radius, 1e-19)
+    half = 0.5 * (d[0] * cof[0] + d[1] * cof[1] + d[2] * cof[2]) * scale * scale * scale
+    # 2 cos(acos(h) / 3) = 1 + e with e² (3 + e) = 2 (1 + h): Newton from above, good to round-off at a double root too
+    target = 2 * (1 + clamp(half, -1.0, 1.0))
+    e = tl.sqrt(target / 3)
+    for _ in range(4):
+        e = e - (e * e * (3 + e) - target) / tl.maximum(e * (6 + 3 * e), 1e-30)
+    return mean + radius * (1 + e)

@@ -1,0 +1,239 @@
+"""Which Gaussians move: regions of space, in scene units, and a threshold on opacity."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape, check_vector
+
+
+class Region(ABC):
+    """A part of space. Subclasses can be named in a configuration.
+
+    Attributes:
+        recordable: Whether :meth:`contains` copies nothing from or to the host after a first call (see :meth:`on`), so
+            that a CUDA graph may record it. A class with a ``contains`` of its own has to say so itself.
+        axes: In which axes the region is given, in words; empty for those of the points that it is asked about.
+    """
+
+    recordable: bool = False
+    axes: str = ""
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        if "contains" in vars(cls) and "recordable" not in vars(cls):
+            cls.recordable = False
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without what is kept on devices, which another machine may not have."""
+        return {name: value for name, value in vars(self).items() if name != "_known"}
+
+    def on(self, points: Tensor, values: Sequence[float]) -> Tensor:
+        """Numbers of the region with the type and device of some points.
+
+        They are kept as long as the region, so that a later call copies nothing to a GPU and a recorded CUDA graph
+        never reads what was freed.
+        """
+        known: dict[tuple[object, ...], Tensor] = self.__dict__.setdefault("_known", {})
+        key = (tuple(values), points.dtype, points.device)
+        if key not in known:
+            with torch.inference_mode(False):
+                known[key] = torch.tensor(values, dtype=points.dtype, device=points.device)
+        return known[key]
+
+    @abstractmethod
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+
+    def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
+        """Least and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
+        flat = points.detach().reshape(-1, 3).double()
+        low, high = ([round(v, 4) for v in corner.tolist()] for corner in (flat.amin(0), flat.amax(0)))
+        return low, high
+
+
+class Everything(Region):
+    """All of space."""
+
+    recordable = True
+
+    def __repr__(self) -> str:
+        return "Everything()"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
+
+
+class Box(Region):
+    """A box with sides along the axes, its faces included.
+
+    Args:
+        min: Lower corner [scene units], 3 numbers; null leaves that side open.
+        max: Upper corner [scene units], 3 numbers; null leaves that side open.
+
+    Raises:
+        ValueError: If a corner has not 3 finite numbers, or ``min`` is not below ``max`` along an axis.
+        TypeError: If a corner is not a list.
+    """
+
+    recordable = True
+
+    def __init__(self, min: Sequence[float | None], max: Sequence[float | None]) -> None:
+        self.min = _corner("min", min, -float("inf"))
+        self.max = _corner("max", max, float("inf"))
+        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
+            if not low < high:
+                raise ValueError(f"Expected `min` to be below `max` of the box along {axis}, but got {low} and {high}.")
+
+    def __repr__(self) -> str:
+        return f"Box(min={list(self.min)}, max={list(self.max)})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        return ((points >= self.on(points, self.min)) & (points <= self.on(points, self.max))).all(-1)
+
+
+class Sphere(Region):
+    """A ball, its surface included.
+
+    Args:
+        center: Centre [scene units], 3 numbers.
+        radius: Radius [scene units], above zero.
+
+    Raises:
+        ValueError: If ``center`` has not 3 finite numbers or ``radius`` is not positive.
+        TypeError: If ``center`` is not a list.
+    """
+
+    recordable = True
+
+    def __init__(self, center: Sequence[float], radius: float) -> None:
+        self.center = check_vector("center", center)
+        check_positive("radius", radius)
+        self.radius = float(radius)
+
+    def __repr__(self) -> str:
+        return f"Sphere(center={list(self.center)}, radius={self.radius})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        return (points - self.on(points, self.center)).square().sum(-1) <= self.radius**2
+
+
+class Cylinder(Region):
+    """A straight round cylinder, its surface included.
+
+    Args:
+        center: Middle of its axis [scene units], 3 numbers.
+        axis: Direction of its axis, 3 numbers of any length above zero.
+        radius: Radius [scene units], above zero.
+        height: Length along the axis [scene units], above zero; half of it lies on each side of ``center``.
+
+    Raises:
+        ValueError: If a vector has not 3 finite numbers, ``axis`` is zero, or a size is not positive.
+        TypeError: If a vector is not a list.
+    """
+
+    recordable = True
+
+    def __init__(self, center: Sequence[float], axis: Sequence[float], radius: float, height: float) -> None:
+        self.center = check_vector("center", center)
+        direction = check_vector("axis", axis)
+        length = sum(component**2 for component in direction) ** 0.5
+        if length == 0:
+            raise ValueError(f"Expected `axis` to have a length above zero, but got {list(direction)}.")
+        self.axis = tuple(component / length for component in direction)
+        check_positive("radius", radius)
+        check_positive("height", height)
+        self.radius, self.height = float(radius), float(height)
+
+    def __repr__(self) -> str:
+        return (
+            f"Cylinder(center={list(self.center)}, axis={list(self.axis)}, radius={self.radius}, height={self.height})"
+        )
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        check_shape("points", points, 3)
+        axis = self.on(points, self.axis)
+        offset = points - self.on(points, self.center)
+        along = (offset * axis).sum(-1)
+        across = (offset - along[..., None] * axis).square().sum(-1)
+        return (along.abs() <= 0.5 * self.height) & (across <= self.radius**2)
+
+
+class Union(Region):
+    """What lies in at least one of several regions.
+
+    Args:
+        regions: Regions to join, at least one.
+
+    Raises:
+        ValueError: If the list is empty.
+        TypeError: If an entry is not a region.
+    """
+
+    def __init__(self, regions: list[Region]) -> None:
+        if not isinstance(regions, (list, tuple)):
+            raise TypeError(f"Expected `regions` to be a list of regions, but got {type(regions).__name__}.")
+        if not regions:
+            raise ValueError("Expected `regions` to hold at least one region, but got an empty list.")
+        for region in regions:
+            _check_region("regions", region)
+        self.regions = list(regions)
+        self.recordable = all(region.recordable for region in self.regions)
+
+    def __repr__(self) -> str:
+        return f"Union(regions={self.regions})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        inside = self.regions[0].contains(points)
+        for region in self.regions[1:]:
+            inside = inside | region.contains(points)
+        return inside
+
+
+class Not(Region):
+    """All of space outside a region.
+
+    Args:
+        region: Region to leave out.
+
+    Raises:
+        TypeError: If ``region`` is not a region.
+    """
+
+    def __init__(self, region: Region) -> None:
+        _check_region("region", region)
+        self.region, self.recordable = region, region.recordable
+
+    def __repr__(self) -> str:
+        return f"Not(region={self.region})"
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        return ~self.region.contains(points)
+
+
+def _corner(name: str, values: Sequence[float | None], unbounded: float) -> tuple[float, ...]:
+    """A corner as 3 floats, with ``unbounded`` in place of None."""
+    if isinstance(values, Tensor):
+        values = values.tolist()
+    if isinstance(values, (str, bytes)) or not hasattr(values, "__len__"):
+        raise TypeError(f"Expected `{name}` to be a list of 3 numbers or nulls, but got {values!r}.")
+    finite = check_vector(name, [0.0 if value is None else value for value in values])
+    return tuple(unbounded if value is None else item for value, item in zip(values, finite, strict=True))
+
+
+def _check_region(name: str, region: Region) -> None:
+    if not isinstance(region, Region) or isinstance(region, type):
+        raise TypeError(f"Expected `{name}` to be a Region, but got {region!r}.")

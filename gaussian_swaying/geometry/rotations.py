@@ -1,0 +1,98 @@
+"""Rotations as matrices and quaternions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_shape, check_vector
+
+
+def quat_to_rotation(quats: Tensor) -> Tensor:
+    """Rotation matrices of quaternions.
+
+    Args:
+        quats: Quaternions wxyz of any length above zero, shape (..., 4).
+
+    Returns:
+        Shape (..., 3, 3); columns are the axes of the Gaussian.
+
+    Raises:
+        ValueError: If ``quats`` has another shape.
+    """
+    check_shape("quats", quats, 4)
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
+
+
+def rotation_to_quat(rotation: Tensor) -> Tensor:
+    """Unit quaternions of rotation matrices, by the largest of four equivalent forms (Shepperd 1978).
+
+    Args:
+        rotation: Rotation matrices, shape (..., 3, 3).
+
+    Returns:
+        Quaternions wxyz with w >= 0, shape (..., 4).
+
+    Raises:
+        ValueError: If ``rotation`` has another shape.
+    """
+    check_shape("rotation", rotation, 3, 3)
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotation.unbind(-2))
+    # Row k is 4 q_k q: the outer product of the quaternion with itself.
+    outer = torch.stack(
+        [
+            torch.stack([1 + a + e + i, h - f, c - g, d - b], dim=-1),
+            torch.stack([h - f, 1 + a - e - i, b + d, c + g], dim=-1),
+            torch.stack([c - g, b + d, 1 - a + e - i, f + h], dim=-1),
+            torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
+        ],
+        dim=-2,
+    )
+    best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    quats = torch.nn.functional.normalize(row, dim=-1)
+    return torch.where(quats[..., :1] < 0, -quats, quats)
+
+
+def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
+    """Minimal rotation that takes +z to ``up``; its transpose takes ``up`` to +z.
+
+    For the one direction where the minimal rotation is not unique, (0, 0, -1), it is the half turn about x.
+
+    Args:
+        up: Direction of any length, shape (3,).
+
+    Returns:
+        Rotation matrix in float64 on the CPU, shape (3, 3).
+
+    Raises:
+        ValueError: If ``up`` is zero or not finite.
+    """
+    return torch.tensor(rows_from_z(check_direction("up", up)), dtype=torch.float64)
+
+
+def rows_from_z(up: Sequence[float]) -> list[list[float]]:
+    """Rows of :func:`rotation_from_z`, from a vector of length one."""
+    x, y, z = up
+    if z < -1.0 + 1e-12:
+        return [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
+    f = 1.0 / (1.0 + z)  # Rodrigues' formula with axis (-y, x, 0) and cosine z
+    return [[1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]]
+
+
+def check_direction(name: str, value: Sequence[float] | Tensor) -> tuple[float, ...]:
+    """Return ``value`` as a 3-vector of length one, or raise an error that names the field."""
+    vector = check_vector(name, value)
+    length = math.hypot(*vector)
+    if length < 1e-12:
+        raise ValueError(f"Expected `{name}` to be a direction, but got the zero vector.")
+    return tuple(item / length for item in vector)

@@ -1,0 +1,204 @@
+"""Cameras that travel along a path given by a few keys."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying.rendering.cameras.camera import (
+    Camera,
+    check_elevation,
+    check_fov,
+    check_pixels,
+    look_at_camera,
+    orbit_camera,
+)
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+
+INTERPOLATIONS = ("smooth", "linear")
+
+
+def interpolate_keys(
+    times: Sequence[float], values: Sequence[Sequence[float]], time: float, interpolation: str = "smooth"
+) -> list[float]:
+    """Values between keys; before the first and after the last they hold.
+
+    ``smooth`` is the monotone cubic of Fritsch & Butland 1984 ("A method for constructing local monotone piecewise
+    cubic interpolants") with slope zero at both ends: each number and its rate are continuous for all time, and between
+    two keys no number leaves the range of the two.
+
+    Args:
+        times: Increasing times [s], K of them.
+        values: Numbers at each of them, K rows of D.
+        time: Time [s].
+        interpolation: ``smooth`` or ``linear``.
+
+    Returns:
+        D numbers.
+
+    Example:
+        >>> interpolate_keys([0.0, 2.0], [[0.0], [8.0]], 0.5)
+        [1.25]
+    """
+    if time <= times[0] or len(times) == 1:
+        return list(values[0])
+    if time >= times[-1]:
+        return list(values[-1])
+    k = bisect_right(times, time) - 1
+    span = times[k + 1] - times[k]
+    s = (time - times[k]) / span
+    found = []
+    for d, (start, end) in enumerate(zip(values[k], values[k + 1], strict=True)):
+        if interpolation == "linear":
+            found.append(start + s * (end - start))
+            continue
+        before, after = (_slope(times, [row[d] for row in values], at) for at in (k, k + 1))
+        ease = s * s * (3 - 2 * s)
+        found.append(start + ease * (end - start) + span * s * (1 - s) * ((1 - s) * before - s * after))
+    return found
+
+
+def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
+    """Slope of the smooth interpolant at a key: a weighted harmonic mean of the slopes beside it, zero at a turn."""
+    if not 0 < k < len(times) - 1:
+        return 0.0
+    left, right = times[k] - times[k - 1], times[k + 1] - times[k]
+    before, after = (values[k] - values[k - 1]) / left, (values[k + 1] - values[k]) / right
+    if before * after <= 0:
+        return 0.0
+    first, second = 2 * right + left, right + 2 * left
+    return (first + second) / (first / before + second / after)
+
+
+@dataclass
+class CameraKey:
+    """Where a camera is at one time; what is null stays as in the key before.
+
+    Args:
+        time: Time [s].
+        eye: Position [scene units], 3 numbers; or give ``azimuth``, ``elevation`` and ``radius``.
+        azimuth: Angle about the up direction [degrees], as of OrbitCamera; more than 360 goes round.
+        elevation: Angle above the horizontal plane [degrees], between -90 and 90 (both excluded).
+        radius: Distance from the target, in multiples of the object's longest side.
+        target: Point at the image centre [scene units], 3 numbers; null in the first key for the object's centre.
+        fov_y: Vertical field of view [degrees]; null in the first key for that of the camera.
+    """
+
+    time: float
+    eye: list[float] | None = None
+    azimuth: float | None = None
+    elevation: float | None = None
+    radius: float | None = None
+    target: list[float] | None = None
+    fov_y: float | None = None
+
+
+class KeyframedCamera(CameraPath):
+    """Camera that travels through keys: from eye to eye, or on a sphere about its target.
+
+    Args:
+        keys: Times and places, in order of time.
+        interpolation: ``smooth`` (no jerk at a key, at rest before the first and after the last, never beyond the keys)
+            or ``linear``.
+        up: Direction seen upwards in the image where the keys give an ``eye``, 3 numbers; that of the scene when None.
+        width: Image width [pixels].
+        height: Image height [pixels].
+        fov_y: Vertical field of view [degrees].
+        near: Near plane [scene units].
+
+    Raises:
+        TypeError: If an argument has the wrong type.
+        ValueError: If a number is out of range, the times do not increase, or a key says neither or both of eye and
+            angles.
+
+    Example:
+        >>> path = KeyframedCamera([CameraKey(0.0, azimuth=-90, elevation=10, radius=2), CameraKey(2.0, azimuth=0)])
+        >>> import torch
+        >>> center, up = torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])
+        >>> path(50, 2.0, center, up, 1.0).position.round(decimals=3)
+        tensor([1.9700, 0.0000, 0.3470])
+    """
+
+    def __init__(
+        self,
+        keys: list[CameraKey],
+        interpolation: str = "smooth",
+        up: Sequence[float] | None = None,
+        width: int = 480,
+        height: int = 270,
+        fov_y: float = 40.0,
+        near: float = 0.01,
+    ) -> None:
+        check_choice("interpolation", interpolation, INTERPOLATIONS)
+        if not keys:
+            raise ValueError("Expected `keys` to hold at least one key with a time and a place.")
+        self.times = [check_vector("keys.time", [key.time], 1)[0] for key in keys]
+        if any(a >= b for a, b in pairwise(self.times)):
+            raise ValueError(f"Expected the times of `keys` to increase, but got {self.times}.")
+        on_sphere = [any(getattr(key, name) is not None for name in _ANGLES) for key in keys]
+        with_eye = [key.eye is not None for key in keys]
+        if any(on_sphere) == any(with_eye):
+            raise ValueError(
+                "Expected `keys` to give either `eye`, or `azimuth`, `elevation` and `radius`, "
+                f"but got {'both' if any(with_eye) else 'neither'}."
+            )
+        self.orbits = any(on_sphere)
+        if self.orbits:
+            columns = [_carried_on(name, [getattr(key, name) for key in keys]) for name in _ANGLES]
+            self.places = [list(row) for row in zip(*columns, strict=True)]
+            for _, elevation, radius in self.places:
+                check_elevation("keys.elevation", elevation)
+                check_positive("keys.radius", radius)
+        else:
+            eyes = _carried_on("eye", [key.eye for key in keys])
+            self.places = [list(check_vector("keys.eye", eye)) for eye in eyes]
+        targets = _filled([key.target for key in keys], None)
+        self.targets = [None if target is None else check_vector("keys.target", target) for target in targets]
+        self.fovs = [[check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], fov_y)]
+        self.interpolation = interpolation
+        self.up = None if up is None else check_vector("up", up)
+        self.width, self.height = check_pixels("width", width), check_pixels("height", height)
+        check_positive("near", near)
+        self.near = float(near)
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame, see :meth:`CameraPath.__call__`."""
+        check_positive("size", size)
+        middle = check_vector("center", center)
+        targets = [middle if target is None else target for target in self.targets]
+        place, target, (fov,) = (
+            interpolate_keys(self.times, values, time, self.interpolation)
+            for values in (self.places, targets, self.fovs)
+        )
+        picture = (fov, self.width, self.height, self.near)
+        if self.orbits:
+            azimuth, elevation, radius = place
+            return orbit_camera(
+                target, up, size * radius, azimuth, elevation, *picture, device=center.device, dtype=center.dtype
+            )
+        seen_up = up if self.up is None else self.up
+        return look_at_camera(place, target, seen_up, *picture, device=center.device, dtype=center.dtype)
+
+
+_ANGLES = ("azimuth", "elevation", "radius")
+
+
+def _filled(values: list[Any], first: Any) -> list[Any]:
+    """Each value, or the last one given before it, or ``first``."""
+    found = []
+    for value in values:
+        first = first if value is None else value
+        found.append(first)
+    return found
+
+
+def _carried_on(name: str, values: list[Any]) -> list[Any]:
+    if values[0] is None:
+        raise ValueError(f"The first of the `keys` lacks `{name}`: later keys may leave it out, the first may not.")
+    return _filled(values, None)

@@ -1,0 +1,150 @@
+"""Cameras of a ``transforms.json`` in the NeRF, Blender or instant-ngp style."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._inputs import read_json
+from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, resized_intrinsics
+
+
+def camera_from_transforms(
+    path: str | Path,
+    frame: int,
+    width: int | None = None,
+    height: int | None = None,
+    near: float = 0.01,
+) -> Camera:
+    """Read one camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
+
+    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). The intrinsics come from
+    ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
+    the frame wins over the one at the top of the file. Missing ``cx`` and ``cy`` are the image centre, missing
+    ``fl_y`` makes square pixels (or comes from ``camera_angle_y``). Lens distortion (``k1``, ``p1``, ...) is ignored:
+    undistort the images first.
+
+    Args:
+        path: The file.
+        frame: Index in its list ``frames``, from 0.
+        width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
+            the one that keeps the file's aspect ratio when only ``height`` is given.
+        height: Height of the image to render [pixels], likewise.
+        near: Near plane [scene units].
+
+    Returns:
+        The camera, in the default precision of torch.
+
+    Raises:
+        TypeError: If ``frame``, ``width`` or ``height`` is not an integer.
+        ValueError: If the file is missing, is not JSON, lacks a field or has a bad one. The message names the file,
+            the field and the remedy.
+    """
+    if isinstance(frame, bool) or not isinstance(frame, int):
+        raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
+    return camera_of_transforms(path, load_transforms(path), frame, width, height, near)
+
+
+def camera_of_transforms(
+    path: str | Path,
+    data: dict[str, Any],
+    frame: int,
+    width: int | None = None,
+    height: int | None = None,
+    near: float = 0.01,
+) -> Camera:
+    """One camera of a ``transforms.json`` that :func:`load_transforms` has read; see :func:`camera_from_transforms`."""
+    where = f"`{path}`"
+    frames = data["frames"]
+    if not 0 <= frame < len(frames):
+        raise ValueError(f"The camera file {where} has no frame {frame}: set `frame` between 0 and {len(frames) - 1}.")
+    for name, size in (("width", width), ("height", height)):
+        if size is not None:
+            check_pixels(name, size)
+    pixels = read_intrinsics(where, {**data, **frames[frame]}, width, height)
+    intrinsics, width, height = resized_intrinsics(*pixels, width, height)
+    world_to_camera = torch.linalg.inv(read_pose(where, frame, frames[frame]))
+    return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
+
+
+def load_transforms(path: str | Path) -> dict[str, Any]:
+    """Read a ``transforms.json`` of NeRF, Blender or instant-ngp.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its fields; ``frames`` is a list of at least one dictionary.
+
+    Raises:
+        ValueError: If the file is missing, is not JSON or has no list ``frames``.
+    """
+    where = f"`{path}`"
+    data = read_json(path, "camera file")
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(item, dict) for item in frames):
+        raise ValueError(f"The camera file {where} has no list `frames`: give a transforms.json of NeRF or Blender.")
+    return data
+
+
+def read_number(where: str, fields: dict[str, Any], name: str) -> float | None:
+    """Return a finite number of a transforms.json, or None if the field is missing."""
+    value = fields.get(name)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"The field `{name}` of the camera file {where} is {value!r}: set it to a number.")
+    return float(value)
+
+
+def read_intrinsics(
+    where: str, fields: dict[str, Any], width: int | None, height: int | None
+) -> tuple[float, float, float, float, float, float]:
+    """Return width, height, fx, fy, cx, cy [pixels] at the resolution of a transforms.json."""
+    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+    w, h, fx, fy, cx, cy, angle_x, angle_y = (read_number(where, fields, name) for name in names)
+    if fx is not None and (w is None or h is None):
+        raise ValueError(f"The camera file {where} has `fl_x` but no `w` and `h`: add the size of its images [pixels].")
+    w = float(width) if w is None and width is not None else w
+    h = float(height) if h is None and height is not None else h
+    if w is None or h is None:
+        raise ValueError(f"The camera file {where} has no image size `w` and `h`: set both `width` and `height`.")
+    for name, angle in (("camera_angle_x", angle_x), ("camera_angle_y", angle_y)):
+        if angle is not None and not 0.0 < angle < math.pi:
+            raise ValueError(
+                f"The field `{name}` of the camera file {where} is {angle}: set it in radians, above 0 and below pi."
+            )
+    if fx is None and angle_x is None:
+        raise ValueError(
+            f"The camera file {where} has no focal length: add `fl_x` [pixels] or `camera_angle_x` [radians]."
+        )
+    if fx is None and angle_x is not None:
+        fx = 0.5 * w / math.tan(0.5 * angle_x)
+    assert fx is not None
+    if fy is None:
+        fy = fx if angle_y is None else 0.5 * h / math.tan(0.5 * angle_y)
+    for name, value in (("w", w), ("h", h), ("fl_x", fx), ("fl_y", fy)):
+        if value <= 0:
+            raise ValueError(f"The field `{name}` of the camera file {where} is {value}: set it to a positive number.")
+    return w, h, fx, fy, 0.5 * w if cx is None else cx, 0.5 * h if cy is None else cy
+
+
+def read_pose(where: str, frame: int, fields: dict[str, Any]) -> Tensor:
+    """Return the camera-to-world matrix of a frame with OpenCV axes, in float64, shape (4, 4)."""
+    name = f"frames[{frame}].transform_matrix"
+    if "transform_matrix" not in fields:
+        raise ValueError(f"The camera file {where} has no `{name}`: add the camera-to-world matrix, 4 rows of 4.")
+    try:
+        matrix = torch.tensor(fields["transform_matrix"], dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"The field `{name}` of the camera file {where} must be 4 rows of 4 numbers.") from error
+    if tuple(matrix.shape) != (4, 4) or not bool(torch.isfinite(matrix).all()):
+        raise ValueError(
+            f"The field `{name}` of the camera file {where} must be 4 rows of 4 finite numbers, "
+            f"but has shape {tuple(matrix.shape)}."
+        )
+    if abs(float(torch.linalg.det(matrix))) < 1e-9:
+        raise ValueError(f"The field `{name}` of the camera file {where} is singular: export the camera again.")
+    return matrix * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)  # OpenGL y, z -> OpenCV y, z

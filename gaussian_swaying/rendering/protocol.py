@@ -1,0 +1,167 @@
+"""What every renderer takes and returns."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.rendering.cameras.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderOutput:
+    r"""Picture of a Gaussian scene.
+
+    With the weights :math:`w_k = T_k \alpha_k` of the Gaussians at a pixel, from front to back:
+
+    Attributes:
+        color: :math:`\sum_k w_k c_k`, plus the background times :math:`1 - \sum_k w_k`, shape (H, W, 3).
+        alpha: Opacity :math:`\sum_k w_k`, shape (H, W, 1).
+        depth: Accumulated depth :math:`\sum_k w_k z_k` [scene units], shape (H, W, 1). Divide by ``alpha`` for the
+            expected depth.
+    """
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+
+
+class Renderer(Protocol):
+    """Draws Gaussians with explicit covariances."""
+
+    def __call__(
+        self,
+        means: Tensor,
+        covariances: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one picture.
+
+        Args:
+            means: Centres [scene units], shape (N, 3).
+            covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
+            opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
+            colors: Colours as they are to be seen (no spherical harmonics), shape (N, 3).
+            camera: The camera, on any device and in any precision.
+            background: Colour behind the Gaussians, shape (3,); black when None.
+
+        Returns:
+            The picture, on the device and in the precision of ``means``. A Gaussian that is not finite is not drawn.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScreenGaussians:
+    """Where Gaussians are on the screen: what decides in training which of them to split, copy or remove.
+
+    Attributes:
+        means2d: Centres [pixels], in the graph of the picture, shape (V, 2), or (1, N, 2) without ``index``.
+        radii: Half width and height [pixels] of each, 0 for one that is not drawn, shape of ``means2d``.
+        index: Index of each among the N Gaussians, shape (V,), or None if all are there.
+        width: Image width [pixels].
+        height: Image height [pixels].
+    """
+
+    means2d: Tensor
+    radii: Tensor
+    index: Tensor | None
+    width: int
+    height: int
+
+    def info(self) -> dict[str, Any]:
+        """The same under the names that the strategies of gsplat 1.5 look for."""
+        return {
+            "means2d": self.means2d,
+            "radii": self.radii,
+            "gaussian_ids": self.index,
+            "width": self.width,
+            "height": self.height,
+            "n_cameras": 1,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplatOutput:
+    """Picture of a splat in training.
+
+    Attributes:
+        color: As :attr:`RenderOutput.color`, shape (H, W, 3).
+        alpha: As :attr:`RenderOutput.alpha`, shape (H, W, 1).
+        screen: Where the Gaussians are on the screen.
+    """
+
+    color: Tensor
+    alpha: Tensor
+    screen: ScreenGaussians
+
+
+class SplatRenderer(Renderer, Protocol):
+    """Renderer that also draws Gaussians as they are stored, for training."""
+
+    def render_splat(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor,
+        camera: Camera,
+        background: Tensor | None = None,
+        absgrad: bool = False,
+    ) -> SplatOutput:
+        """Render one picture, differentiable with respect to every tensor of the splat.
+
+        Args:
+            means: Centres [scene units], shape (N, 3).
+            quats: Quaternions wxyz of any length above zero, shape (N, 4).
+            log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
+            opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
+            sh: Spherical harmonics coefficients, shape (N, K, 3) with K = 1, 4, 9 or 16.
+            camera: The camera, on any device and in any precision.
+            background: Colour behind the Gaussians, shape (3,); black when None.
+            absgrad: Whether the backward pass is to leave sums of absolute gradients in ``screen.means2d.absgrad``
+                (Ye et al. 2024, "AbsGS").
+
+        Returns:
+            The picture, on the device and in the precision of ``means``.
+
+        Raises:
+            ValueError: If ``absgrad`` is asked of a renderer that has none.
+        """
+        ...
+
+
+def check_gaussians(
+    means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor, background: Tensor | None
+) -> None:
+    """Raise TypeError or ValueError unless the arguments of a :class:`Renderer` have the documented shapes."""
+    count = means.shape[0] if isinstance(means, Tensor) and means.dim() == 2 else "N"
+    wanted: tuple[tuple[str, Tensor | None, tuple[int | str, ...]], ...] = (
+        ("means", means, (count, 3)),
+        ("covariances", covariances, (count, 3, 3)),
+        ("opacities", opacities, (count,)),
+        ("colors", colors, (count, 3)),
+        ("background", background, (3,)),
+    )
+    for name, tensor, shape in wanted:
+        if name == "background" and tensor is None:
+            continue
+        if not isinstance(tensor, Tensor):
+            raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
+        actual = tuple(tensor.shape)
+        if len(actual) != len(shape) or any(isinstance(s, int) and s != a for s, a in zip(shape, actual, strict=True)):
+            expected = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
+            raise ValueError(f"Expected `{name}` of shape ({expected}), but got {actual}.")
+
+
+def finite_gaussians(means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+    """Return which Gaussians have only finite values, shape (N,), without a wait for the GPU and in few kernels."""
+    with torch.no_grad():
+        values = torch.cat([means, covariances.flatten(-2), opacities[:, None], colors], dim=-1)
+        return torch.linalg.vector_norm(values, math.inf, dim=-1) < math.inf  # NaN is not less either

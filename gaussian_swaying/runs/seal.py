@@ -1,0 +1,50 @@
+"""A checksum at the end of a file, so that a file of which a single bit has changed is not taken for whole."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+from gaussian_swaying._files import check_regular
+
+_TRAILER = re.compile(rb"\ngaussian_swaying sha256 ([0-9a-f]{64})\n")
+_LENGTH = len(b"\ngaussian_swaying sha256 \n") + 64
+_BLOCK = 1 << 20
+
+
+def sha256(path: Path, size: int | None = None) -> str:
+    """SHA-256 of a file, or of its first ``size`` bytes, in hexadecimal."""
+    left = os.path.getsize(path) if size is None else size
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while left > 0 and (block := file.read(min(_BLOCK, left))):
+            digest.update(block)
+            left -= len(block)
+    return digest.hexdigest()
+
+
+def seal(path: Path) -> None:
+    """Add the checksum of a file to its end; ``torch.load`` reads a sealed file as it did before."""
+    digest = sha256(path)
+    with path.open("ab") as file:
+        file.write(b"\ngaussian_swaying sha256 " + digest.encode() + b"\n")
+
+
+def check_seal(path: Path) -> None:
+    """Raise ValueError unless a file ends with the checksum of all that comes before.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is no regular file, has no checksum, or its content is not the one that was sealed.
+    """
+    check_regular(path)
+    size = max(os.path.getsize(path) - _LENGTH, 0)
+    with path.open("rb") as file:
+        file.seek(size)
+        found = _TRAILER.fullmatch(file.read())
+    if found is None:
+        raise ValueError("it has no checksum at its end, so it is not whole or not ours")
+    if sha256(path, size).encode() != found[1]:
+        raise ValueError("its checksum does not fit its content, so it is damaged")

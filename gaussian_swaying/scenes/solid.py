@@ -1,0 +1,154 @@
+"""Solids generated in code: Gaussians on the surface of a body, and if asked for throughout it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.scenes.procedural import ProceduralScene
+
+# balls (x, y, z, radius) of the figure, for a height of 1: body, head, muzzle, ears, arms, legs; it looks along -y
+FIGURE = (
+    (0.00, 0.00, 0.27, 0.27),
+    (0.00, -0.02, 0.68, 0.21),
+    (0.00, -0.20, 0.64, 0.08),
+    (-0.16, 0.00, 0.86, 0.09),
+    (0.16, 0.00, 0.86, 0.09),
+    (-0.25, -0.12, 0.40, 0.10),
+    (0.25, -0.12, 0.40, 0.10),
+    (-0.18, -0.26, 0.10, 0.12),
+    (0.18, -0.26, 0.10, 0.12),
+)
+_BLEND = 0.02  # radius over which the balls of the figure run into each other, for a height of 1
+
+
+def ball_distance(points: Tensor, radius: float) -> Tensor:
+    """Signed distance to a ball about the origin, negative inside; points (..., 3), result (...)."""
+    return torch.linalg.vector_norm(points, dim=-1) - radius
+
+
+def box_distance(points: Tensor, half: tuple[float, float, float]) -> Tensor:
+    """Signed distance to a box about the origin with half sides ``half``, as :func:`ball_distance`."""
+    beyond = points.abs() - torch.tensor(half, dtype=points.dtype)
+    return torch.linalg.vector_norm(beyond.clamp_min(0), dim=-1) + beyond.amax(-1).clamp_max(0)
+
+
+def torus_distance(points: Tensor, ring: float, tube: float) -> Tensor:
+    """Signed distance to a torus about z, its tube of radius ``tube`` on a ring, as :func:`ball_distance`."""
+    across = torch.linalg.vector_norm(points[..., :2], dim=-1) - ring
+    return torch.hypot(across, points[..., 2]) - tube
+
+
+def figure_distance(points: Tensor, height: float) -> Tensor:
+    """About the signed distance to a seated bear on the plane z = 0, as :func:`ball_distance`."""
+    balls = torch.tensor(FIGURE, dtype=points.dtype) * height
+    each = torch.linalg.vector_norm(points[..., None, :] - balls[:, :3], dim=-1) - balls[:, 3]
+    blend = _BLEND * height
+    return torch.maximum(-blend * torch.logsumexp(-each / blend, dim=-1), -points[..., 2])
+
+
+class SolidScene(ProceduralScene):
+    """A solid body with flat Gaussians on its surface, their shortest axes along the true normals, z up.
+
+    The Gaussians of the surface are the points of a jittered lattice next to it, moved onto it. Those inside, if asked
+    for, are the other points of the lattice, as large as the first; their normals are those of the nearest surface.
+
+    Args:
+        shape: ``figure`` (a seated bear), ``ball``, ``box`` (2 : 1.6 : 1.2) or ``torus`` (tube of 0.3 of the ring).
+        size: Height of the figure, diameter of the ball, longest side of the box, outer diameter of the torus [m].
+        spacing: Distance between Gaussians [m], at most a quarter of the size.
+        gaussians: ``throughout``, or ``shell`` for a hollow splat as captures are.
+        overlap: Standard deviation of a Gaussian as a share of the spacing.
+        jitter: How far points of the lattice are moved at random, from 0 to 1 times the spacing.
+        seed: Seed of the jitter.
+    """
+
+    def __init__(
+        self,
+        shape: str = "figure",
+        size: float = 1.0,
+        spacing: float = 0.02,
+        gaussians: str = "throughout",
+        overlap: float = 0.6,
+        jitter: float = 0.3,
+        seed: int = 0,
+    ) -> None:
+        check_choice("generator.shape", shape, ("figure", "ball", "box", "torus"))
+        check_choice("generator.gaussians", gaussians, ("throughout", "shell"))
+        for name, value in (("size", size), ("spacing", spacing), ("overlap", overlap)):
+            check_positive(f"generator.{name}", value)
+        if spacing > 0.25 * size:
+            raise ValueError(f"Expected `generator.spacing` to be at most a quarter of the size, but got {spacing} m.")
+        if not 0 <= jitter <= 1:
+            raise ValueError(f"Expected `generator.jitter` to lie from 0 to 1, but got {jitter}.")
+        self.shape, self.size, self.spacing, self.gaussians = shape, float(size), float(spacing), gaussians
+        self.overlap, self.jitter, self.seed = float(overlap), float(jitter), int(seed)
+
+    @property
+    def distance(self) -> Callable[[Tensor], Tensor]:
+        """Signed distance [m] of points (..., 3) [m] to the surface, negative inside."""
+        half = 0.5 * self.size
+        if self.shape == "ball":
+            return lambda points: ball_distance(points, half)
+        if self.shape == "box":
+            return lambda points: box_distance(points, (half, 0.8 * half, 0.6 * half))
+        if self.shape == "torus":
+            return lambda points: torus_distance(points, half / 1.3, 0.3 * half / 1.3)
+        return lambda points: figure_distance(points, self.size)
+
+    def generate(self) -> GaussianCloud:
+        """Make the solid."""
+        h, draw = self.spacing, torch.Generator().manual_seed(self.seed)
+        reach = 0.5 * self.size + h
+        steps = torch.arange(-reach, reach + h, h, dtype=torch.float64)
+        points = torch.cartesian_prod(steps, steps, steps)
+        if self.shape == "figure":
+            points[:, 2] += 0.5 * self.size
+        points += self.jitter * h * (torch.rand(points.shape, generator=draw, dtype=torch.float64) - 0.5)
+        distance = self.distance(points)
+        skin = points[distance.abs() < 0.5 * h]
+        for _ in range(8):  # onto the surface; once is enough for a true distance away from edges
+            skin = skin - self.distance(skin)[:, None] * self.normal(skin)
+        means, normals = skin, self.normal(skin)
+        if self.gaussians == "throughout":
+            core = points[distance <= -0.5 * h]
+            means, normals = torch.cat([skin, core]), torch.cat([normals, self.normal(core)])
+        sigma = self.overlap * h
+        scales = torch.tensor([sigma, sigma, 0.1 * sigma], dtype=torch.float64).log().expand(len(means), 3)
+        shade = 1 + 0.06 * torch.randn(len(means), 1, generator=draw, dtype=torch.float64)
+        colours = torch.tensor([0.86, 0.70, 0.46], dtype=torch.float64) * shade
+        return GaussianCloud(
+            means=means.float(),
+            quats=_quat_from_z(normals).float(),
+            scales=scales.float().contiguous(),
+            opacities=torch.full((len(means),), math.log(0.99 / 0.01)),
+            sh=((colours - 0.5) / SH_DC).float()[:, None, :],
+            normals=normals.float(),
+        )
+
+    def normal(self, points: Tensor) -> Tensor:
+        """Unit gradient of the distance at points (N, 3), by central differences; +z where it vanishes."""
+        step = 1e-6 * self.size
+        offsets = step * torch.eye(3, dtype=torch.float64)
+        slope = [self.distance(points + offset) - self.distance(points - offset) for offset in offsets]
+        gradient = torch.stack(slope, dim=-1) / (2 * step)
+        length = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        return torch.where(length > 0.1, gradient / length.clamp_min(1e-12), up)
+
+
+def _quat_from_z(normals: Tensor) -> Tensor:
+    """Quaternions wxyz (N, 4) of the shortest turns that take +z to unit vectors (N, 3); about x for -z."""
+    x, y, z = normals.unbind(-1)
+    quats = torch.stack([1 + z, -y, x, torch.zeros_like(x)], dim=-1)
+    flip = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=normals.dtype)
+    return torch.nn.functional.normalize(torch.where(z[:, None] < -1 + 1e-9, flip, quats), dim=-1)
+
+
+__all__ = ["SolidScene", "ball_distance", "box_distance", "figure_distance", "torus_distance"]

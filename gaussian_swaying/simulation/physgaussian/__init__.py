@@ -1,0 +1,1 @@
+"""PhysGaussian's configurations, space and camera."""

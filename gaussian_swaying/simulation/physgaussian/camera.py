@@ -1,0 +1,144 @@
+"""The camera of a PhysGaussian configuration, and reading those that 3DGS keeps beside its model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._inputs import read_json
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+
+
+class PhysGaussianCamera(CameraPath):
+    """Camera of a PhysGaussian configuration: one of its model's, or one that looks at a point from a sphere.
+
+    Azimuth is counted as in PhysGaussian: from the horizontal part of (1, 1, 1) [of (0.72, 0.37, -0.67) if that is
+    nearly across ``up``], clockwise about ``up`` as seen from above.
+
+    Args:
+        cameras: ``cameras.json`` of the model, for the lens and for ``index``; without it ``fov_y`` and the size count.
+        index: Which of its cameras, from 0; -1 for the sphere.
+        azimuth: Angle about ``up`` in the first moving frame [degrees].
+        elevation: Angle above the horizontal plane [degrees].
+        radius: Distance [scene units].
+        delta_azimuth: Change per frame [degrees].
+        delta_elevation: Change per frame [degrees].
+        delta_radius: Change per frame [scene units].
+        viewpoint: Point looked at, in the normalised space of ``normalisation``; in scene units if there is none.
+        up: Direction seen upwards, likewise.
+        width: Image width [pixels].
+        height: Image height [pixels].
+        fov_y: Vertical field of view [degrees].
+        near: Near plane [scene units].
+
+    Raises:
+        ValueError: If a number is out of range; at the first frame, if the file is bad.
+    """
+
+    def __init__(
+        self,
+        cameras: str | os.PathLike[str] | None = None,
+        index: int = -1,
+        azimuth: float = 0.0,
+        elevation: float = 0.0,
+        radius: float = 2.0,
+        delta_azimuth: float = 0.0,
+        delta_elevation: float = 0.0,
+        delta_radius: float = 0.0,
+        viewpoint: Sequence[float] = (1.0, 1.0, 1.0),
+        up: Sequence[float] = (0.0, 0.0, 1.0),
+        width: int = 960,
+        height: int = 540,
+        fov_y: float = 40.0,
+        near: float = 0.01,
+    ) -> None:
+        check_positive("radius", radius)
+        if index >= 0 and cameras is None:
+            raise ValueError(f"The camera {index} is one of the model's: give its `cameras.json` as `cameras`.")
+        self.cameras, self.index, self.radius = cameras, int(index), float(radius)
+        self.azimuth, self.elevation = float(azimuth), float(elevation)
+        self.delta = (float(delta_azimuth), float(delta_elevation), float(delta_radius))
+        self.viewpoint, self.up = check_vector("viewpoint", viewpoint), check_vector("up", up)
+        if not any(self.up):
+            raise ValueError("Expected `up` to be a direction, but got zero.")
+        check_positive("near", near)
+        self.width, self.height, self.fov_y, self.near = width, height, float(fov_y), float(near)
+        self.frame: SimFrame | None = None
+        self._model: Camera | None = None
+
+    def eye(self, frame: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Where the sphere's camera stands in a frame, what it looks at, and up: scene units, shape (3,), float64."""
+        moved = max(frame - 1, 0)  # the first frame here is the rest, which PhysGaussian does not draw
+        azimuth = math.radians(self.azimuth + moved * self.delta[0])
+        elevation = math.radians(self.elevation + moved * self.delta[1])
+        radius = self.radius + moved * self.delta[2]
+        check_positive("radius", radius)
+        target, up = (torch.tensor(v, dtype=torch.float64) for v in (self.viewpoint, self.up))
+        if self.frame is not None:
+            target, up = self.frame.point_to_sim(target), self.frame.direction_to_sim(up)
+        up = up / up.norm()
+        ahead = torch.ones(3, dtype=torch.float64)
+        if abs(float(ahead @ up)) < 0.01:
+            ahead = torch.tensor([0.72, 0.37, -0.67], dtype=torch.float64)
+        ahead = ahead - (ahead @ up) * up
+        ahead = ahead / ahead.norm()
+        aside = torch.linalg.cross(ahead, up)
+        level = math.cos(azimuth) * ahead + math.sin(azimuth) * aside
+        return target + radius * (math.cos(elevation) * level + math.sin(elevation) * up), target, up
+
+    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
+        """Camera of a frame, see :meth:`CameraPath.__call__`."""
+        if self._model is None and self.cameras is not None:
+            self._model = read_model_camera(self.cameras, max(self.index, 0), self.near)
+        if self._model is not None and self.index >= 0:
+            return self._model.to(center.device, center.dtype)
+        width, height = (self.width, self.height) if self._model is None else (self._model.width, self._model.height)
+        camera = look_at_camera(*self.eye(frame), self.fov_y, width, height, self.near, dtype=torch.float64)
+        if self._model is not None:
+            camera = dataclasses.replace(camera, intrinsics=self._model.intrinsics)
+        return camera.to(center.device, center.dtype)
+
+
+def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.01) -> Camera:
+    """Read a camera of the ``cameras.json`` that 3DGS keeps beside its model.
+
+    Args:
+        path: The file: a list of cameras with ``position``, ``rotation`` (camera to world, OpenCV axes), ``fx``, ``fy``
+            [pixels], ``width`` and ``height``.
+        index: Which of them, from 0.
+        near: Near plane [scene units].
+
+    Returns:
+        The camera in float64; the principal point is the image's centre.
+
+    Raises:
+        ValueError: If the file cannot be read, has no such camera, or the camera lacks a field.
+    """
+    entries = read_json(path, "camera file")
+    if not isinstance(entries, list) or not 0 <= index < len(entries):
+        count = len(entries) if isinstance(entries, list) else 0
+        raise ValueError(f"The camera file `{path}` has {count} cameras, and none with the index {index}.")
+    try:
+        entry = entries[index]
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.tensor(entry["rotation"], dtype=torch.float64)
+        pose[:3, 3] = torch.tensor(entry["position"], dtype=torch.float64)
+        width, height = int(entry["width"]), int(entry["height"])
+        rows = [[float(entry["fx"]), 0.0, 0.5 * width], [0.0, float(entry["fy"]), 0.5 * height], [0.0, 0.0, 1.0]]
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"The camera {index} of `{path}` is not one of 3DGS ({error}): it needs position, rotation, fx, fy, width "
+            "and height."
+        ) from error
+    return Camera(torch.linalg.inv(pose), torch.tensor(rows, dtype=torch.float64), width, height, near)
+
+
+__all__ = ["PhysGaussianCamera", "read_model_camera"]

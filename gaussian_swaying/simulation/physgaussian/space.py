@@ -1,0 +1,163 @@
+"""PhysGaussian's normalised space: the scene turned, and its simulated part scaled and centred at (1, 1, 1).
+
+Boxes and planes of a PhysGaussian configuration are in it; :class:`Normalisation` brings them to scene units.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.gaussians.selection import select_simulated
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.rotations import rotation_from_z
+from gaussian_swaying.mpm.boundary import Boundary, RegionInFrame
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
+from gaussian_swaying.simulation.scene import Material, Scene
+
+CENTER = (1.0, 1.0, 1.0)
+"""Where the simulated part is centred in the normalised space."""
+
+
+def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
+    """Rotation by each angle about its axis, one after the other.
+
+    Args:
+        degrees: Angles [degrees].
+        axes: 0, 1 or 2 for x, y or z, as many as angles.
+
+    Returns:
+        Scene axes to turned axes in float64, shape (3, 3).
+
+    Raises:
+        ValueError: If there are not as many axes as angles, or an axis is none of 0, 1 and 2.
+    """
+    if len(degrees) != len(axes):
+        raise ValueError(
+            f"Expected as many entries of `rotation_degree` as of `rotation_axis`, but got {len(degrees)} and "
+            f"{len(axes)}."
+        )
+    total = torch.eye(3, dtype=torch.float64)
+    for angle, axis in zip(check_vector("rotation_degree", degrees, len(degrees)), axes, strict=True):
+        if axis not in (0, 1, 2):
+            raise ValueError(f"Expected `rotation_axis` to hold 0, 1 or 2 for x, y or z, but got {axis!r}.")
+        i, j = ((1, 2), (2, 0), (0, 1))[int(axis)]
+        quarters, rest = divmod(angle, 90.0)
+        cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        if rest == 0:  # without round-off
+            cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+        turn = torch.eye(3, dtype=torch.float64)
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = cosine, -sine, sine, cosine
+        total = turn @ total
+    return total
+
+
+def tidy(vector: Tensor) -> list[float]:
+    """Numbers without the round-off of a rotation, and without -0."""
+    return [round(v, 12) + 0.0 for v in vector.tolist()]
+
+
+def up_direction(rotation: Tensor) -> list[float]:
+    """``scene.up`` whose z-up frame has the z axis of the turned axes; scene axes to turned ones (3, 3)."""
+    return tidy(rotation[2])
+
+
+def heading(rotation: Tensor) -> Tensor:
+    """Turned axes to the axes of the simulation, which may differ by a turn about z; shape (3, 3), float64."""
+    return rotation_from_z(up_direction(rotation)).T @ rotation.T
+
+
+@dataclass
+class Normalisation:
+    """PhysGaussian's normalised space, in which boundaries and regions of the material are then given.
+
+    The scene is turned, and the simulated part scaled and centred at (1, 1, 1). A region of the scene itself is given
+    in turned axes, but in the scene's units. The unit of the normalised space is a metre.
+
+    Args:
+        rotation_degree: Angles by which the scene is turned, one after the other [degrees].
+        rotation_axis: Axis of each: 0, 1 or 2 for x, y or z.
+        scale: Longest side of the simulated part along the turned axes [m].
+    """
+
+    rotation_degree: list[float] = field(default_factory=list)
+    rotation_axis: list[int] = field(default_factory=list)
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive("normalisation.scale", self.scale)
+        rotation_matrix(self.rotation_degree, self.rotation_axis)
+
+    @property
+    def rotation(self) -> Tensor:
+        """Scene axes to turned axes, shape (3, 3), float64."""
+        return rotation_matrix(self.rotation_degree, self.rotation_axis)
+
+    def fit(self, points: Tensor) -> SimFrame:
+        """From the normalised space to a scene.
+
+        Args:
+            points: Points of the simulated part in scene units, shape (N, 3).
+
+        Returns:
+            A frame whose ``point_to_sim`` takes points of the normalised space to scene units, and whose
+            ``point_to_scene`` takes them back.
+
+        Raises:
+            ValueError: If the points have no extent.
+        """
+        rotation = self.rotation
+        turned = points.detach().cpu().double() @ rotation.T
+        low, high = turned.amin(0), turned.amax(0)
+        extent = float((high - low).amax())
+        if extent <= 0:
+            raise ValueError("The simulated part has no extent that `normalisation` could scale.")
+        scale = self.scale / extent
+        origin = torch.tensor(CENTER, dtype=torch.float64) - scale * 0.5 * (low + high)
+        return SimFrame(origin, rotation.T.contiguous(), 1 / scale)
+
+    def place(self, scene: Scene, material: Material, solver: MPMSolver, camera: CameraPath | None = None) -> SimFrame:
+        """Bring regions, boundaries and camera to scene units, and give the scene its scale.
+
+        Args:
+            scene: Its region gets scene axes, and ``metres_per_unit`` is set; the splat is read.
+            material: Its regions get scene units.
+            solver: Its boundaries get scene units.
+            camera: A :class:`PhysGaussianCamera` gets scene units; any other is left alone.
+
+        Returns:
+            The frame of :meth:`fit`.
+
+        Raises:
+            ValueError: If the scene has a scale of its own, or nothing is simulated.
+        """
+        if scene.longest_side is not None or scene.metres_per_unit is not None:
+            raise ValueError(
+                "`normalisation` sets the scale of the scene: leave out `scene.longest_side` and "
+                "`scene.metres_per_unit`, or `normalisation`."
+            )
+        turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
+        scene.region = RegionInFrame(scene.region, turned)
+        cloud = scene.cloud()
+        chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
+        frame = self.fit(cloud.means[chosen])
+        scene.metres_per_unit = 1 / frame.metres_per_unit
+        material.regions = [
+            dataclasses.replace(entry, region=RegionInFrame(entry.region, frame)) for entry in material.regions
+        ]
+        conditions = [b for b in solver.boundaries if isinstance(b, Boundary)]
+        solver.boundaries = nn.ModuleList([b.in_frame(frame) for b in conditions])
+        if isinstance(camera, PhysGaussianCamera):
+            camera.frame = frame
+        return frame
+
+
+__all__ = ["Normalisation", "heading", "rotation_matrix", "tidy", "up_direction"]

@@ -1,0 +1,1 @@
+"""What a splat looks like to a run, and its first configuration."""

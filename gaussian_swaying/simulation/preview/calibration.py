@@ -1,0 +1,259 @@
+"""Stiffness, thickness and wind with which a scene sways as far as wanted, found by short runs of the scene itself.
+
+A small deflection is proportional to wind² / (E thickness). So a run tells by what factor E thickness / wind² has to
+change, and the next run shows how well that went. Nothing here knows what the object is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+
+SWAY = 0.10  # largest displacement that is wanted, as a share of the longest side
+SOFTEST, STIFFEST = 3e4, 1e6  # Pa; ten times the stiffness takes three times the substeps
+THINNEST, THICKEST = 0.003, 0.03  # of the longest side
+STRETCH = (0.75, 1.35)  # aimed at, so that a longer run stays within 0.7 and 1.4
+CLOSE = 1.2  # a share within this factor of the wanted one is good enough
+MOST_RUNS = 6
+SECONDS = 1.6  # of a run: the first peak of the sway, at 0.5 s, and the swing that follows it
+STOP = 4.0  # a run that moved this many times too far has told enough
+MOVED = 0.99  # quantile of the displacements that counts, so that a speck does not
+STRETCHED = 0.001  # share of the particles that may be stretched further, at either end
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far a scene moved in a run.
+
+    Attributes:
+        share: Largest displacement (the quantile :data:`MOVED` of the particles) as a share of the longest side.
+        stretch_min: Smallest stretch of all but :data:`STRETCHED` of the particles.
+        stretch_max: Largest stretch of all but :data:`STRETCHED` of the particles.
+        complete: False if the run was stopped because it moved much too far.
+    """
+
+    share: float
+    stretch_min: float
+    stretch_max: float
+    complete: bool = True
+
+    @property
+    def strain(self) -> float:
+        """Distance of the stretch from 1 as a share of what is allowed; above 1 it is too much."""
+        low, high = STRETCH
+        return max((1 - self.stretch_min) / (1 - low), (self.stretch_max - 1) / (high - 1), 1e-6)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is calibrated.
+
+    Attributes:
+        E: Young's modulus [Pa].
+        thickness: Thickness of the surface [m].
+        wind: Factor on the wind that was asked for, at most 1.
+    """
+
+    E: float
+    thickness: float
+    wind: float = 1.0
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found.
+
+    Attributes:
+        setting: The values, to two digits.
+        motion: How the scene moved with them.
+        runs: How many runs it took.
+        reason: In words.
+    """
+
+    setting: Setting
+    motion: Motion
+    runs: int
+    reason: str
+
+
+def check_sway(sway: float) -> None:
+    """Raise ValueError unless a largest displacement, as a share of the longest side, is one that can be aimed at."""
+    if not 0.01 <= sway <= 0.5:
+        raise ValueError(f"Expected `--sway` to be a share of the longest side from 0.01 to 0.5, but got {sway:g}.")
+
+
+def calibrate(
+    measure: Callable[[Setting], Motion], start: Setting, side: float, sway: float | None = SWAY
+) -> Calibration:
+    """Find the setting with which a scene moves by ``sway`` and nothing is stretched too far.
+
+    E is changed first, then the thickness, which costs nothing, then the wind is weakened.
+
+    Args:
+        measure: Runs the scene with a setting.
+        start: The first setting.
+        side: Longest side of the object [m].
+        sway: Largest displacement wanted, as a share of the longest side. None for a sheet, which may go as far as the
+            wind takes it: E is raised until it is not stretched too far, and nothing else is changed.
+
+    Returns:
+        The best setting of those that were run.
+
+    Raises:
+        ValueError: If ``sway`` is out of range.
+    """
+    if sway is not None:
+        check_sway(sway)
+    setting = start
+    tried: list[tuple[Setting, Motion]] = []
+    while True:
+        motion = measure(setting)
+        tried.append((setting, motion))
+        hold, good = 1.05 * motion.strain, motion.complete and motion.strain <= 1  # brings the stretch to its limit
+        if sway is not None:
+            miss = motion.share / sway
+            good = good and miss <= CLOSE and max(miss, hold) >= 1 / CLOSE
+            hold = max(hold, miss ** (1 / _response(tried)))
+        following = adjusted(setting, hold, start, side, sway is None)
+        if good or following == setting or len(tried) == MOST_RUNS:
+            break
+        setting = following
+    best, motion = min(tried, key=lambda entry: _badness(entry[1], sway))
+    return Calibration(best, motion, len(tried), describe(best, motion, sway))
+
+
+def adjusted(setting: Setting, hold: float, start: Setting, side: float, only_E: bool = False) -> Setting:
+    """A setting that holds ``hold`` times as much against the wind.
+
+    Args:
+        setting: The last one.
+        hold: Factor on E thickness / wind².
+        start: The first setting, whose thickness stays where E can do the work.
+        side: Longest side of the object [m].
+        only_E: Change E alone.
+
+    Returns:
+        The new setting, its values within bounds and of two digits.
+    """
+    hold = min(max(hold, 0.03), 30.0)
+    if only_E:
+        return replace(setting, E=_two_digits(min(setting.E * hold, STIFFEST)))
+    wanted = hold * setting.E * setting.thickness / setting.wind**2
+    stiffness = min(max(wanted / start.thickness, SOFTEST), STIFFEST)
+    thickness = min(max(wanted / stiffness, THINNEST * side), THICKEST * side)
+    wind = min(1.0, math.sqrt(stiffness * thickness / wanted))
+    return Setting(_two_digits(stiffness), _two_digits(thickness), _two_digits(wind))
+
+
+def describe(setting: Setting, motion: Motion, sway: float | None) -> str:
+    """What a calibration came to, in words."""
+    moved = f"{motion.share:.2g} of the longest side" if motion.complete else "much too far"
+    words = [f"in {SECONDS:g} s of this wind 99 % of it moves by at most {moved}"]
+    if setting.wind < 1:
+        words.append(f"the wind was weakened to {setting.wind:g} of what was asked for, as stiffer costs too much")
+    if motion.strain > 1:
+        words.append(
+            f"parts are stretched to between {motion.stretch_min:.2g} and {motion.stretch_max:.2g} of their length: "
+            "hold more of it, or give a smaller --sway or --wind"
+        )
+    elif sway is not None and motion.complete and motion.share < sway / CLOSE**2:
+        words.append("it hardly moves: more --wind moves it more" if motion.strain < 0.8 else "more would stretch it")
+    return "; ".join(words)
+
+
+def _two_digits(value: float) -> float:
+    return float(f"{value:.2g}")
+
+
+def _response(tried: list[tuple[Setting, Motion]]) -> float:
+    """By which power the displacement falls as the hold grows: from the last two runs, 1 if there are none."""
+    done = [(s.E * s.thickness / s.wind**2, m.share) for s, m in tried[-2:] if m.complete and m.share > 0]
+    if len(done) < 2 or abs(math.log(done[1][0] / done[0][0])) < 0.1:
+        return 1.0
+    (hold, share), (other_hold, other_share) = done
+    return min(max(-math.log(other_share / share) / math.log(other_hold / hold), 0.5), 1.5)
+
+
+def _badness(motion: Motion, sway: float | None) -> float:
+    """Zero for a motion as wanted, more the further it is from that."""
+    miss = 0.0 if sway is None else abs(math.log(max(motion.share, 1e-9) / sway))
+    return miss + 3 * max(math.log(motion.strain), 0.0) + (0.0 if motion.complete else 100.0)
+
+
+# ---- the run
+
+
+def apply_setting(pipeline: SimulationPipeline, setting: Setting, base: Setting) -> None:
+    """Give a run whose material and wind are those of ``base`` another setting, before it starts."""
+    points, wind = pipeline.scene.points, pipeline.wind
+    thicker = setting.thickness / base.thickness
+    pipeline.scene.points = replace(
+        points,
+        mass=points.mass * thicker,
+        volume=points.volume * thicker,
+        youngs_modulus=points.youngs_modulus * (setting.E / base.E),
+    )
+    assert isinstance(wind, WindField)  # that of the configuration that the preview writes
+    wind.flows = wind.flows * (setting.wind / base.wind)
+
+
+@torch.inference_mode()
+def measure_motion(
+    pipeline: SimulationPipeline,
+    setting: Setting,
+    base: Setting,
+    sway: float | None = None,
+    seconds: float = SECONDS,
+) -> Motion:
+    """Run a scene from rest, without pictures, with another setting than its own; the scene stays as it is.
+
+    Args:
+        pipeline: The run, whose material and wind are those of ``base``.
+        setting: The setting to try.
+        base: The setting of the pipeline.
+        sway: The run is stopped as soon as it moved :data:`STOP` times this share of the longest side; None for never.
+        seconds: How much time to simulate.
+
+    Returns:
+        How far it moved; not complete if it was stopped or diverged.
+    """
+    scene, wind = pipeline.scene, pipeline.wind
+    points, flows = scene.points, wind.flows
+    apply_setting(pipeline, setting, base)
+    side = scene.size * scene.frame.metres_per_unit
+    limit = math.inf if sway is None else STOP * sway
+    motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
+    torch.set_num_threads(1)  # a few hundred particles: more threads would only wait for each other
+    try:
+        state = pipeline.start()
+        for _ in range(max(1, round(seconds / pipeline.frame_dt))):
+            state, _ = pipeline.advance(state)
+            moved = torch.linalg.vector_norm(state.position - points.position, dim=-1)
+            F = state.F_total.double()
+            stretch = symmetric_eigenvalues(matmul3(F.mT, F)).clamp(min=0).sqrt()
+            motion = Motion(
+                max(motion.share, _quantile(moved, MOVED) / side),
+                min(motion.stretch_min, _quantile(stretch.amin(-1), STRETCHED)),
+                max(motion.stretch_max, _quantile(stretch.amax(-1), 1 - STRETCHED)),
+            )
+            if motion.share > limit:
+                return replace(motion, complete=False)
+    except SimulationDiverged:
+        return Motion(max(motion.share, min(limit, 1.0)), 0.0, 10.0, complete=False)
+    finally:
+        torch.set_num_threads(threads)
+        scene.points, wind.flows = points, flows
+    return motion
+
+
+def _quantile(values: Tensor, share: float) -> float:
+    return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)

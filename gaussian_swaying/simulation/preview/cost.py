@@ -1,0 +1,157 @@
+"""What a run will cost: its substeps, and their time on this machine from a few that are tried."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._provenance import describe_device
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.timestep import wave_speed
+from gaussian_swaying.simulation.pipeline import SimulationPipeline
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a run, from its state at rest.
+
+    A material that stiffens as it deforms, faster wind and a body that moves fast in ``updated`` take more substeps.
+
+    Attributes:
+        device: Where it was measured.
+        particles: Material points.
+        grid: Grid nodes along each axis.
+        frames: Frames of the run.
+        wave_speed: Fastest elastic wave [m/s].
+        stable_substep: Longest stable substep [s].
+        substep: The one that the run takes at rest [s].
+        substeps: Substeps in a frame.
+        substep_seconds: Time that one of them takes [s].
+        simulation_seconds: Time that the frames take without their pictures [s].
+        picture_seconds: Time that the pictures of a frame take, one from each camera, with their files and their part
+            of the video [s]; None if there are none.
+        startup_seconds: Time to read the splat and prepare the scene [s]; 0 if it is not known.
+    """
+
+    device: str
+    particles: int
+    grid: tuple[int, ...]
+    frames: int
+    wave_speed: float
+    stable_substep: float
+    substep: float
+    substeps: int
+    substep_seconds: float
+    simulation_seconds: float
+    picture_seconds: float | None
+    startup_seconds: float = 0.0
+
+    @property
+    def total_seconds(self) -> float:
+        """Time of the whole run [s]."""
+        return self.startup_seconds + self.simulation_seconds + self.frames * (self.picture_seconds or 0.0)
+
+
+@torch.inference_mode()
+def estimate_cost(
+    pipeline: SimulationPipeline, frames: int, tries: int = 9, picture: bool = True, startup_seconds: float = 0.0
+) -> Cost:
+    """Start a run, and measure a few substeps of its first frame and a picture.
+
+    Args:
+        pipeline: The run.
+        frames: How many frames it is to have.
+        tries: Substeps to measure, after one that is not counted; on a GPU it is a frame.
+        picture: Whether the run draws pictures.
+        startup_seconds: How long it takes to prepare the run [s], if it is known.
+
+    Returns:
+        The estimate.
+
+    Raises:
+        ValueError: If the run cannot start: a pin holds nothing, the grid is too large, a fixed substep is too long.
+    """
+    solver = pipeline.solver
+    state = pipeline.start()
+    steps = max(solver.substeps(state, pipeline.frame_dt), _drag_substeps(pipeline, state, frames))
+    forces = pipeline.forces
+    dt = pipeline.frame_dt / steps
+    if pipeline.device.type == "cuda":  # kernels are compiled and graphs recorded in the first frames
+        state, _ = pipeline.advance(state)
+        state, _ = pipeline.advance(state)
+        seconds = _seconds(pipeline, lambda: pipeline.advance(state)) / steps
+    else:
+        solver.rollout(state, dt, 1, forces)
+        seconds = min(_seconds(pipeline, lambda: solver.rollout(state, dt, 1, forces)) for _ in range(tries))
+    drawn = None
+    if picture:  # the further cameras are taken to be as large as the first
+        pipeline.render(state, 0)
+        work = min(_seconds(pipeline, lambda: _encode(pipeline.render(state, 0).color)) for _ in range(2))
+        drawn = work * (1 + len(pipeline.cameras))
+    return Cost(
+        device=describe_device(pipeline.device),
+        particles=solver.points.count,
+        grid=tuple(state.grid.resolution),
+        frames=frames,
+        wave_speed=float(wave_speed(solver.points).amax()),
+        stable_substep=solver.stable_substep(),
+        substep=dt,
+        substeps=steps,
+        substep_seconds=seconds,
+        simulation_seconds=seconds * steps * max(frames - 1, 0),
+        picture_seconds=drawn,
+        startup_seconds=startup_seconds,
+    )
+
+
+def _drag_substeps(pipeline: SimulationPipeline, state: MPMState, frames: int) -> int:
+    """Substeps of a frame that explicit drag asks for at rest, on average over the wind of the run."""
+    if pipeline.idle or pipeline.aero.drag_step == "semi_implicit":
+        return 1
+    winds = pipeline.wind_force.samples(state, pipeline.frame_dt, frames)
+    speed = torch.linalg.vector_norm(winds, dim=-1).reshape(frames, -1).amax(1)
+    area, mass = pipeline.scene.patch_area, pipeline.solver.points.mass
+    rates = [float(pipeline.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values]
+    return math.ceil(statistics.mean(rates) * pipeline.frame_dt)
+
+
+def _encode(image: Tensor) -> None:
+    """What writing a picture and its part of the video takes, about: it is compressed twice."""
+    import imageio.v3 as iio
+
+    pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+    for _ in range(2):
+        iio.imwrite("<bytes>", pixels, extension=".png", compress_level=3)
+
+
+def _seconds(pipeline: SimulationPipeline, work: Callable[[], object]) -> float:
+    """Time that some work takes [s] on a machine that does nothing else, to its end on a GPU too."""
+    begin = Stopwatch()
+    work()
+    if pipeline.device.type == "cuda":
+        torch.cuda.synchronize(pipeline.device)
+        return begin.wall
+    return begin.quiet
+
+
+class Stopwatch:
+    """Time since it was made [s]."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    @property
+    def wall(self) -> float:
+        """By the clock on the wall."""
+        return time.perf_counter() - self._wall
+
+    @property
+    def quiet(self) -> float:
+        """By the clock on the wall, or that of the processor if it is less: other programs had the rest of it."""
+        return min(self.wall, time.process_time() - self._cpu)

@@ -1,0 +1,61 @@
+"""What to check where a guess is weak, and the commands that settle it one way or the other."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from collections.abc import Sequence
+
+from gaussian_swaying import _program as program
+from gaussian_swaying.simulation.preview.suggest import Suggestion
+
+
+def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, **changes: str | list[str]) -> str:
+    """The command line of the preview that gives these options, and some in place of theirs.
+
+    Args:
+        options: What was given.
+        defaults: What is not written.
+        changes: Options to give instead, by their names in ``options``.
+    """
+    words = [*program.words("preview"), str(options.scene)]
+    for name, default in vars(defaults).items():
+        value = changes.get(name, getattr(options, name, default))
+        if name == "scene" or value is None or value == default:
+            continue
+        words.append("--" + name.replace("_", "-"))
+        if value is True:
+            continue
+        listed = isinstance(value, Sequence) and not isinstance(value, str)
+        words += [f"{v:g}" if isinstance(v, float) else str(v) for v in (value if listed else [value])]
+    return shlex.join(words)
+
+
+def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Namespace) -> list[str]:
+    """Warnings about weak guesses, each with the command that takes the guess and the one that takes the next best.
+
+    Args:
+        found: The guesses.
+        options: Options of the preview.
+        defaults: Their defaults.
+
+    Returns:
+        Lines of text; none if there is nothing to doubt.
+    """
+    lines: list[str] = []
+    if found.up.confidence == "low":
+        lines.append("warning: the up axis is a weak guess; look at the picture, and give it:")
+        for name, words in zip(found.up.options, ("as guessed", "the next best"), strict=False):
+            lines.append(f"  {preview_command(options, defaults, up=name.split())}   # {words}")
+    if found.hold.confidence == "low":
+        lines.append(
+            f"warning: that it is held at the {found.hold.end} is a weak guess; look at the picture, and give it:"
+        )
+        for name, words in zip(found.hold.options, ("as guessed", "the next best"), strict=False):
+            lines.append(f"  {preview_command(options, defaults, hold=name)}   # {words}")
+    if found.region.loose:
+        lines.append(
+            f"warning: {found.region.loose:,} specks inside the region hang on nothing and will fall; give a smaller "
+            "--region, or raise scene.opacity_threshold"
+        )
+    return lines

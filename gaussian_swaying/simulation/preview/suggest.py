@@ -1,0 +1,459 @@
+"""What a splat looks like to the simulation: bounds, up axis, sizes, and a guess at each number that a run needs.
+
+Everything here is a guess of a first configuration, made from rules that are stated with the result. None of them knows
+what the object is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.gaussians.area import patch_area
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.subdivision import subdivide
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.geometry.patches import smallest_axis_normal
+from gaussian_swaying.geometry.regions import Box, Not, Region, Union
+from gaussian_swaying.simulation.preview.framing import orbit_frame, whole_box
+from gaussian_swaying.simulation.preview.hold import HoldGuess, end_region, given_hold, guess_hold
+from gaussian_swaying.simulation.preview.photos import CapturedFrom, ShownObject, photo_azimuth, shown_object
+from gaussian_swaying.simulation.preview.shape import (
+    FEWEST,
+    bounds,
+    connected_parts,
+    quantile,
+    rounded,
+    sheet_normal,
+)
+from gaussian_swaying.simulation.preview.up import UpGuess, given_up, guess_up
+
+CELLS = 24  # along the longest side: enough to bend, few enough for a laptop
+DRAFT_CELLS = 16  # the same for a first look
+CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
+SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; anything else: a shell of rubber
+THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
+KEPT_AREA = 0.95  # share of the visible area that the threshold has to leave
+MAX_BOXES = 8  # boxes that cut specks out of the region
+
+
+@dataclass(frozen=True)
+class RegionGuess:
+    """Which Gaussians to simulate.
+
+    Attributes:
+        simulated: Those that would be, shape (N,).
+        box: Lower and upper corner [scene units] of the region, or None for all of space.
+        holes: Boxes within it that are left out, as corners.
+        opacity_threshold: Smallest opacity that is simulated.
+        specks: Gaussians above the threshold that are not part of the object, floor and surroundings apart.
+        loose: Those of them that the region does not leave out.
+        reason: In words.
+        cuts: Further regions within it that are left out: what lies in and behind a wall.
+    """
+
+    simulated: Tensor
+    box: tuple[list[float], list[float]] | None
+    holes: list[tuple[list[float], list[float]]]
+    opacity_threshold: float
+    specks: int
+    loose: int
+    reason: str
+    cuts: tuple[Region, ...] = ()
+
+    def region(self) -> Region | None:
+        """The region as a run takes it; None for all of space."""
+        if self.box is None:
+            return None
+        inside: Region = Box(*self.box)
+        out = [*(Box(*hole) for hole in self.holes), *self.cuts]
+        return Not(Union([Not(inside), *out])) if out else inside
+
+
+def visible_weight(cloud: GaussianCloud) -> Tensor:
+    """Opacity times area pi s1 s2 of each Gaussian [scene units²], shape (N,), the largest 1 % cut to the next."""
+    weight = (cloud.opacities.sigmoid() * patch_area(cloud.scales)).double()
+    return weight.clamp(max=quantile(weight, 0.99))
+
+
+def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
+    """Count, opacities, shapes and sizes of the Gaussians, as plain numbers.
+
+    Returns:
+        Quantiles are lists of the 5, 50 and 95 % values. ``size_share`` is the largest standard deviation over the
+        longest robust side. S1 >= S2 >= S3 are the standard deviations of a Gaussian.
+    """
+    opacity = cloud.opacities.sigmoid()
+    s1, s2, s3 = cloud.scales.double().exp().sort(-1, descending=True).values.unbind(-1)
+    corner = bounds(cloud.means)
+    longest = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
+    return {
+        "count": len(cloud),
+        "sh_degree": cloud.sh_degree,
+        "normals": cloud.normals is not None,
+        "opacity": _three(opacity),
+        "opacity_below": {str(t): float((opacity < t).double().mean()) for t in THRESHOLDS if t > 0},
+        "S1_over_S2": _three(s1 / s2),
+        "S2_over_S3": _three(s2 / s3),
+        "size_share": _three(s1 / max(longest, 1e-30)),
+    }
+
+
+# ---- all of it
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Everything that a first configuration needs.
+
+    Attributes:
+        up: Which way is up.
+        region: What is simulated.
+        hold: At which end it is held.
+        pin: That end as a region, None if it is not held.
+        longest_side: Length given to the longest side of the object [m].
+        metres_per_unit: Length of a scene unit that follows [m].
+        size: Sides of the object along the z-up axes [m].
+        spacing: Particle spacing [m], see :func:`particle_spacing`.
+        dx: Grid spacing [m].
+        fill_spacing: Spacing of further points on large Gaussians [m], see :func:`suggest_fill`; None if not needed.
+        sheet: Whether the object is a thin sheet.
+        azimuth: Azimuth of a camera that sees the broad side, or what photos show [degrees].
+        flow: Wind across the picture, or along a sheet from where it is held [m/s], z up.
+        youngs_modulus: Young's modulus [Pa], a first guess;
+            :mod:`~gaussian_swaying.simulation.preview.calibration` finds a better one.
+        thickness: Thickness of the surface [m], likewise.
+        stiffness_reason: Why, in words.
+        whole: Corners of the box of the object with what does not move of it [scene units].
+        camera_offset: From the centre of what moves to that of the whole, in multiples of its longest side.
+        camera_radius: Distance of a camera that shows the whole, likewise.
+    """
+
+    up: UpGuess
+    region: RegionGuess
+    hold: HoldGuess
+    pin: Region | None
+    longest_side: float
+    metres_per_unit: float
+    size: tuple[float, ...]
+    spacing: float
+    dx: float
+    fill_spacing: float | None
+    sheet: bool
+    azimuth: float
+    flow: tuple[float, ...]
+    youngs_modulus: float
+    thickness: float
+    stiffness_reason: str
+    whole: tuple[list[float], list[float]]
+    camera_offset: tuple[float, ...]
+    camera_radius: float
+
+
+def suggest(
+    cloud: GaussianCloud,
+    up: Sequence[float] | str | None = None,
+    hold: str | None = None,
+    region: tuple[Sequence[float], Sequence[float]] | None = None,
+    longest_side: float = 1.0,
+    speed: float = 6.0,
+    capture: CapturedFrom | None = None,
+) -> Suggestion:
+    """Guess a first configuration.
+
+    Args:
+        cloud: The splat.
+        up: Direction that points up, as 3 numbers or as ``+x`` to ``-z``; guessed if None.
+        hold: ``top``, ``bottom``, ``none`` or ``+x`` to ``-z``; guessed if None.
+        region: Corners of the box to simulate [scene units]; guessed if None.
+        longest_side: Length of the longest side of the object [m].
+        speed: Speed of the wind [m/s].
+        capture: Where the photos of the splat were taken from, which tells up and object.
+
+    Returns:
+        The suggestion.
+
+    Raises:
+        ValueError: If the splat has too few Gaussians, or what was given does not fit it.
+    """
+    check_positive("--longest-side", longest_side)
+    check_positive("--wind", speed, allow_zero=True)
+    if len(cloud) < FEWEST:
+        raise ValueError(
+            f"The splat holds {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed."
+        )
+    means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
+    normals = smallest_axis_normal(cloud.quats, cloud.scales)
+    shown = None if capture is None or region is not None else shown_object(means, opacity, weight, capture)
+    if up is not None:
+        upward = given_up(up, means, normals, weight)
+    elif capture is not None:
+        upward = given_up(capture.up, means, normals, weight)
+        upward = replace(upward, confidence=capture.confidence, reasons=[capture.reason], options=capture.options)
+    else:
+        upward = guess_up(means, normals, weight)
+    if shown is not None:
+        upward = replace(upward, ground=shown.floor(upward.direction))
+    corner = bounds(means if shown is None else means[shown.mask])
+    side = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
+    if side <= 0:
+        raise ValueError("All Gaussians of the splat lie at one point: there is no object to simulate.")
+    if region is None:
+        cell = max(side / CELLS, 2 * particle_spacing(means if shown is None else means[shown.mask]))
+        if shown is not None:  # what is left of a backdrop must not be taken for a part of the object
+            cell = 0.5 * cell
+        chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown)
+    else:
+        chosen = given_region(means, opacity, weight, *region)
+    points, visible = means[chosen.simulated], weight[chosen.simulated]
+    frame = SimFrame.fit(points, upward.direction, longest_side)
+    metres = frame.point_to_sim(points.double())
+    spacing = particle_spacing(points) * frame.metres_per_unit
+    dx = suggest_spacing(longest_side, spacing)
+    if hold is None:
+        rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
+        eyes = None if capture is None else capture.eyes
+        wall = None if shown is None else shown.wall(upward.direction)
+        held = guess_hold(points, visible, upward.direction, dx / frame.metres_per_unit, rest, eyes, wall)
+    else:
+        held = given_hold(hold, upward.direction)
+    pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
+    azimuth, turn = broad_side(metres), 20.0  # the broad side, a little from the side
+    front = None if capture is None else photo_azimuth(capture, points.double().mean(0), frame.rotation)
+    if front is not None:
+        azimuth, turn = front, 0.0
+    flow = _across_picture(azimuth, speed)
+    flat = sheet_normal(points)
+    if held.end == "side" and flat is not None:  # from the pole on, and a little onto the sheet
+        away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
+        onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
+        flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
+    elif flat is not None:  # a curtain is moved by wind onto it
+        flow = _across_picture(azimuth - 90, speed)
+    outside = upward.ground if shown is None else upward.ground | ~shown.mask
+    whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
+    offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
+    return Suggestion(
+        up=upward,
+        region=chosen,
+        hold=held,
+        pin=pin,
+        longest_side=float(longest_side),
+        metres_per_unit=frame.metres_per_unit,
+        size=tuple(float(v) for v in metres.amax(0) - metres.amin(0)),
+        spacing=spacing,
+        dx=dx,
+        fill_spacing=suggest_fill(cloud.select(chosen.simulated), frame.metres_per_unit, dx),
+        sheet=flat is not None,
+        azimuth=round(azimuth + turn, 1),
+        flow=tuple(round(c, 2) + 0.0 for c in flow),
+        youngs_modulus=SHELL_E if flat is None else CLOTH_E,
+        thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
+        stiffness_reason="rubber, not tried" if flat is None else "the cloth of the paper's flags, not tried",
+        whole=whole,
+        camera_offset=offset,
+        camera_radius=radius,
+    )
+
+
+def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
+    """Horizontal flow to the right of a picture from an azimuth [degrees]."""
+    angle = math.radians(azimuth)
+    return (-speed * math.sin(angle), speed * math.cos(angle), 0.0)
+
+
+# ---- what is simulated
+
+
+def suggest_threshold(opacity: Tensor, weight: Tensor) -> float:
+    """The highest of ``THRESHOLDS`` above which at least ``KEPT_AREA`` of the visible area lies."""
+    total = float(weight.sum())
+    for threshold in THRESHOLDS:
+        if float(weight[opacity >= threshold].sum()) >= KEPT_AREA * total:
+            return threshold
+    return 0.0
+
+
+def suggest_region(
+    points: Tensor, opacity: Tensor, weight: Tensor, ground: Tensor, cell: float, shown: ShownObject | None = None
+) -> RegionGuess:
+    """The main object without floor, surroundings and specks.
+
+    The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks within its box are
+    cut out by boxes of their own, the largest first.
+
+    Args:
+        points: Centres [scene units], shape (N, 3).
+        opacity: Opacities, shape (N,).
+        weight: Visible area, shape (N,).
+        ground: The floor, shape (N,).
+        cell: What is farther apart than two such cells is not connected [scene units].
+        shown: What photos show, to which the object is confined; the part nearest to their common point counts most.
+
+    Returns:
+        The guess.
+
+    Raises:
+        ValueError: If hardly any Gaussian is left.
+    """
+    among = torch.ones_like(opacity, dtype=torch.bool) if shown is None else shown.mask
+    threshold = suggest_threshold(opacity[among], weight[among])
+    solid = (opacity >= threshold) & ~ground & among
+    index = solid.nonzero()[:, 0]
+    if len(index) < FEWEST:
+        raise ValueError(
+            f"Only {len(index)} Gaussians are left above the floor and an opacity of {threshold:g}, too few for an "
+            "object: give another `--up`."
+        )
+    part = connected_parts(points[index], cell)
+    counted = weight[index].double() if shown is None else weight[index].double() * shown.nearness(points[index])
+    area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, counted)
+    main = int(area.argmax())
+    chosen = torch.zeros_like(solid)
+    chosen[index[part == main]] = True
+    low, high = _padded(points[chosen], 0.5 * cell)
+    if bool(ground.any()):  # the box must not reach into the floor again
+        low, high = _without(low, high, points[chosen], points[ground])
+    cuts = () if shown is None else tuple(backdrop.behind for backdrop in shown.backdrops)
+    box: Region = Box(low, high)
+    if cuts:
+        box = Not(Union([Not(box), *cuts]))
+    holes: list[tuple[list[float], list[float]]] = []
+    stray = box.contains(points[index]) & (part != main)
+    numbers, counts = part[stray].unique(return_counts=True)
+    for number in numbers[counts.argsort(descending=True)][: 4 * MAX_BOXES].tolist():
+        members = index[stray & (part == number)]
+        hole = _padded(points[members], 0.05 * cell)
+        caught = Box(*hole).contains(points) & chosen
+        if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # worth what it costs the object
+            holes.append(hole)
+    guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), 0, "", cuts)
+    region = guess.region()
+    assert region is not None
+    simulated = region.contains(points) & (opacity >= threshold)
+    loose = int((simulated & ~chosen).sum())
+    if shown is not None and loose:  # the grid is coarser than what tells the object from its surroundings
+        joined = connected_parts(points[simulated], 2 * cell)
+        loose = int((joined != joined.mode().values).sum())
+    everything = bool(region.contains(points).all())
+    words = [f"{int(chosen.sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
+    if bool(ground.any()):
+        words.append(f"a floor of {int(ground.sum()):,} lies below it")
+    if shown is not None:
+        words.append("the cameras look at it")
+        if shown.backdrops:
+            words.append("what lies in or behind a wall or floor is left out")
+    if guess.specks:
+        words.append(f"{guess.specks:,} float apart from it")
+    words.append("the region is all of space" if everything else "the region is the box around it")
+    if holes:
+        words.append(f"without {len(holes)} boxes of specks")
+    return RegionGuess(
+        simulated, None if everything else (low, high), holes, threshold, guess.specks, loose, "; ".join(words), cuts
+    )
+
+
+def given_region(
+    points: Tensor, opacity: Tensor, weight: Tensor, low: Sequence[float], high: Sequence[float]
+) -> RegionGuess:
+    """A region that was given as the corners of a box, with a suggested threshold.
+
+    Raises:
+        ValueError: If it holds hardly any Gaussian.
+    """
+    box = Box(low, high)
+    inside = box.contains(points)
+    if int(inside.sum()) < FEWEST:
+        span = [[round(float(v), 4) for v in corner] for corner in (points.amin(0), points.amax(0))]
+        raise ValueError(
+            f"The box of `--region` holds {int(inside.sum())} Gaussians, too few for an object: the splat reaches from "
+            f"{span[0]} to {span[1]}."
+        )
+    threshold = suggest_threshold(opacity[inside], weight[inside])
+    simulated = inside & (opacity >= threshold)
+    corners = ([float(v) for v in low], [float(v) for v in high])
+    return RegionGuess(simulated, corners, [], threshold, 0, 0, "given")
+
+
+# ---- sizes
+
+
+def particle_spacing(points: Tensor, sample: int = 4000) -> float:
+    """Distance to the nearest other point that 90 % of the points stay below, from an even sample."""
+    check_shape("points", points, None, 3)
+    step = max(1, len(points) // sample)
+    distance, _ = nearest_neighbours(points, 2, points[::step])
+    return quantile(distance[:, 1], 0.9)
+
+
+def suggest_spacing(longest_side: float, spacing: float, cells: int = CELLS) -> float:
+    """Grid spacing: the longest side over ``cells``, no finer than twice the particle spacing, to 2 digits.
+
+    Args:
+        longest_side: Longest side of the object [m].
+        spacing: From :func:`particle_spacing` [m].
+        cells: Cells along the longest side.
+
+    Returns:
+        Grid spacing [m].
+    """
+    check_positive("longest_side", longest_side)
+    return float(f"{max(longest_side / cells, 2 * spacing):.2g}")
+
+
+def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> float | None:
+    """``scene.particle_spacing``, if the splat has holes for the grid: points more than 0.6 cells from any centre.
+
+    Args:
+        cloud: What is simulated.
+        metres_per_unit: Length of a scene unit [m].
+        dx: Grid spacing [m].
+
+    Returns:
+        0.45 ``dx`` to 2 digits [m], or None if such points are fewer than two in a hundred, or far too many.
+    """
+    spacing = float(f"{0.45 * dx:.2g}")
+    opacity = cloud.opacities.sigmoid()
+    try:
+        further = subdivide(cloud.means, cloud.quats, cloud.scales, opacity, spacing / metres_per_unit).means
+    except ValueError:  # haze, on which nothing is to be put
+        return None
+    distance, _ = nearest_neighbours(cloud.means, 1, further)
+    holes = int((distance * metres_per_unit > 0.6 * dx).sum())
+    return spacing if holes > 0.02 * len(cloud) else None
+
+
+def broad_side(points: Tensor) -> float:
+    """Azimuth [degrees], from -90 to 90, of the horizontal direction in which points (N, 3), z up, reach least far."""
+    flat = points.double()[:, :2]
+    _, axes = torch.linalg.eigh(torch.cov((flat - flat.mean(0)).T))
+    x, y = axes[:, 0].tolist()
+    angle = math.degrees(math.atan2(y, x))
+    return (angle + 90) % 180 - 90
+
+
+def _three(values: Tensor) -> list[float]:
+    return [quantile(values, q) for q in (0.05, 0.5, 0.95)]
+
+
+def _padded(points: Tensor, margin: float) -> tuple[list[float], list[float]]:
+    low = [rounded(float(v) - margin, margin) for v in points.amin(0)]
+    return low, [rounded(float(v) + margin, margin) for v in points.amax(0)]
+
+
+def _without(low: list[float], high: list[float], points: Tensor, ground: Tensor) -> tuple[list[float], list[float]]:
+    """The box with the face that looks at the floor moved back onto the object, if it reaches into the floor."""
+    for axis in range(3):
+        first, last = float(points[:, axis].amin()), float(points[:, axis].amax())
+        floor_low, floor_high = float(ground[:, axis].amin()), float(ground[:, axis].amax())
+        if low[axis] < floor_high <= first:
+            low[axis] = round(0.5 * (floor_high + first), 6)
+        if high[axis] > floor_low >= last:
+            high[axis] = round(0.5 * (floor_low + last), 6)
+    return low, high

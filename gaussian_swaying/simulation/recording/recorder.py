@@ -1,0 +1,504 @@
+"""What a run leaves on disk. Every file is written under a temporary name and then renamed, see :mod:`.files`.
+
+Frames are written in the background (:mod:`.writer`), the video is encoded meanwhile (:mod:`.video`), and positions and
+deformation gradients end up in one file (:mod:`.trajectory`).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.export import SUFFIXES, UsdFilm, export_cloud, read_usd_frame, usd_arrays
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.rendering.passes import PASSES
+from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
+from gaussian_swaying.runs.lock import FolderLock
+from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.simulation.recording.resume import check_frames, check_pictures, check_positions, check_shards
+from gaussian_swaying.simulation.recording.trajectory import pack_trajectory
+from gaussian_swaying.simulation.recording.video import VideoEncoder, encode_video
+from gaussian_swaying.simulation.recording.writer import FrameWriter, HostCopy
+
+_FILES = ["run.json", "config.yaml", "checkpoint.pt", "trajectory.npz", "summary.json", "diagnostics.csv"]
+_FILES += ["animation.usdc"]
+# what a run writes, and so must not find in a folder that no run made
+_OURS = [*_FILES, "frames", "ply", "trajectory", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+_OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
+NORMAL_AXES = ("camera", "world")
+
+
+class _Film:
+    """The video of one folder of frames, and the frames that its encoder was given."""
+
+    def __init__(self) -> None:
+        self.encoder: VideoEncoder | None = None
+        self.encoded: list[int] = []
+
+    def give_up(self) -> None:
+        if self.encoder is not None:
+            self.encoder.abort()
+            self.encoder = None
+
+
+def frame_folder(render: str = "color", camera: str = "") -> str:
+    """Folder of a render's frames within that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
+
+    Args:
+        render: One of ``color``, ``depth``, ``normal`` and ``force``.
+        camera: Name of a further camera; empty for the one of the run.
+    """
+    own = "frames" if render == "color" else render
+    return f"cameras/{camera}/{own}" if camera else own
+
+
+def raw_folder(place: str) -> str:
+    """Folder of the numbers whose colours are in the folder ``place``."""
+    return f"{place}_raw"
+
+
+def video_file(place: str) -> str:
+    """The video of the frames in the folder ``place``: ``video.mp4`` of ``frames``, ``depth.mp4`` of ``depth`` ..."""
+    folder = Path(place)
+    return folder.with_name("video.mp4" if folder.name == "frames" else f"{folder.name}.mp4").as_posix()
+
+
+def check_camera_name(name: str) -> None:
+    """Raise ValueError unless a camera's name can be that of a folder on every system."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+        raise ValueError(f"Expected a name of `cameras` to have letters, digits, - and _ only, but got {name!r}.")
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    import imageio.v3 as iio
+
+    with atomic(path) as temporary:
+        iio.imwrite(temporary, pixels, compress_level=3)
+
+
+class Recorder:
+    """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
+
+    Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
+    ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
+
+    Further renders have folders of their own, ``depth``, ``normal`` and ``force``, and videos of these names; further
+    cameras have the same once more in ``cameras/<name>``. All but the colour is black where no Gaussian is.
+
+    - ``depth``: along the optical axis, yellow to violet from one longest side of the object before its centre at rest
+      to one behind it; the numbers are in ``depth_raw`` as PNG of 16 bits: 0 where nothing is, else steps of
+      ``depth_step``.
+    - ``normal``: turned towards the camera, (n + 1) / 2 in red, green and blue, in ``normal_axes``.
+    - ``force``: of the wind per area [Pa], violet at 0 to yellow at ``force_scale``.
+
+    Images, trajectory, .ply and checkpoint are written in the background: the methods take a copy and return. They
+    wait only if the disk or ffmpeg is so far behind that the queue is full. What cannot be written is raised by the
+    next of them, by :meth:`wait` or by :meth:`close`.
+
+    Args:
+        images: Write a PNG per frame.
+        video: Encode the frames; needs ``images``.
+        ply_every: Write the deformed Gaussians in ``export_format`` every so many frames; 0 for never.
+        trajectory: Keep position (float32, metres, z up) and F (float16) of the simulated particles per frame.
+        checkpoint_every: Keep the state for ``--resume`` every so many frames; 0 for never.
+        fps: Frames per second of the video; null for real time, 1 / frame_dt.
+        renders: What is drawn of each frame: ``color``, ``depth``, ``normal``, ``force``.
+        depth_step: Depth of one step of the PNG in ``depth_raw`` [m].
+        normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (metres' axes, z up).
+        force_scale: End of the colour scale of ``force`` [Pa]; null for the force per area that the wind's flow,
+            without gusts, can exert on a patch at rest; it is in summary.json.
+        export_format: How the Gaussians are written: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
+            ``splat``, or ``usd`` (all frames in one animation.usdc, in metres; needs usd-core). See
+            ``gaussian_swaying.gaussians.export``.
+    """
+
+    def __init__(
+        self,
+        images: bool = True,
+        video: bool = True,
+        ply_every: int = 0,
+        trajectory: bool = True,
+        checkpoint_every: int = 1,
+        fps: float | None = None,
+        renders: Sequence[str] = ("color",),
+        depth_step: float = 0.001,
+        normal_axes: str = "camera",
+        force_scale: float | None = None,
+        export_format: str = "ply",
+    ) -> None:
+        for name, value in (("ply_every", ply_every), ("checkpoint_every", checkpoint_every)):
+            check_positive(f"recorder.{name}", value, allow_zero=True)
+        if fps is not None:
+            check_positive("recorder.fps", fps)
+        if isinstance(renders, str) or not renders or len(set(renders)) < len(renders):
+            raise ValueError(
+                f"Expected `recorder.renders` to be a list of different ones of {', '.join(PASSES)}, but got "
+                f"{renders!r}."
+            )
+        for render in renders:
+            check_choice("recorder.renders", render, PASSES)
+        check_positive("recorder.depth_step", depth_step)
+        check_choice("recorder.normal_axes", normal_axes, NORMAL_AXES)
+        if force_scale is not None:
+            check_positive("recorder.force_scale", force_scale)
+        check_choice("recorder.export_format", export_format, tuple(SUFFIXES))
+        if export_format == "usd" and ply_every and find_spec("pxr") is None:
+            raise ValueError(
+                "The USD file needs usd-core: install gaussian-swaying[usd], or set another `recorder.export_format`."
+            )
+        if video and not images:
+            raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
+        self.images, self.video, self.trajectory = images, video, trajectory
+        self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), fps
+        self._folder: Path | None = None
+        self._writer = FrameWriter()
+        self.renders, self.depth_step, self.normal_axes = tuple(renders), float(depth_step), normal_axes
+        self.force_scale, self.export_format = force_scale, export_format
+        self._films: dict[str, _Film] = {}  # by the folder of their frames
+        self._lock: FolderLock | None = None
+        self.checkpoint_frame: int | None = None
+        self._real_time_fps = 25.0
+
+    @property
+    def folder(self) -> Path:
+        """The output folder, once :meth:`open` was called."""
+        if self._folder is None:
+            raise RuntimeError("The recorder has no folder yet: call `open(folder)` first.")
+        return self._folder
+
+    def open(
+        self,
+        folder: str | os.PathLike[str],
+        config: str = "",
+        resume: bool = False,
+        real_time_fps: float = 25.0,
+        cameras: Sequence[str] = (),
+        check: Callable[[dict[str, Any]], None] | None = None,
+    ) -> dict[str, Any] | None:
+        """Prepare the output folder.
+
+        An earlier run found there is moved aside, never overwritten. Any other files in the folder are left alone; if
+        one of them bears a name of the layout, the folder is refused.
+
+        Args:
+            folder: Where to write.
+            config: The whole configuration as YAML, kept beside the results and compared when resuming.
+            resume: Continue the run in the folder.
+            real_time_fps: Frames per second at which the video shows the simulated time.
+            cameras: Names of the further cameras.
+            check: Called with the checkpoint before anything in the folder is changed; raises what is wrong with it.
+
+        Returns:
+            The checkpoint to continue from, or None. The folder is held until :meth:`close` or :meth:`release`.
+
+        Raises:
+            FolderLocked: If another run writes to the folder.
+            ValueError: If the folder cannot be written, or there is nothing to resume or something else, or what was
+                recorded so far is damaged.
+            OSError: If something of an earlier folder, that was not closed, could not be written.
+        """
+        self.wait()
+        self._give_up_video()
+        self.release()
+        self._writer, self._real_time_fps = FrameWriter(), real_time_fps
+        path = Path(folder)
+        places = [frame_folder(render, camera) for camera in ("", *cameras) for render in self.renders]
+        self._films = {place: _Film() for place in places} if self.images else {}
+        self.checkpoint_frame = None
+        try:
+            checkpoint = self._continue(path, config, check) if resume else None
+            if not resume:
+                self._lock = claim_folder(path, _OURS, "choose another with --output")
+            self._folder = path
+            try:
+                self._make_folders()
+                if config and not (path / "config.yaml").exists():
+                    with atomic(path / "config.yaml") as temporary:
+                        temporary.write_text(config)
+            except OSError as error:
+                raise ValueError(
+                    f"The output folder {path} cannot be written ({error.strerror or error}): choose another with "
+                    "--output."
+                ) from error
+        except BaseException:
+            self.release()
+            raise
+        if self.video and not resume:  # that of a resumed run is made of its PNGs
+            for place, film in self._films.items():
+                film.encoder = VideoEncoder(path / video_file(place), self.fps or real_time_fps)
+        return checkpoint
+
+    def _continue(self, path: Path, config: str, check: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
+        """Hold the folder and look through all that the rest of the run builds on, before anything is changed."""
+        if not path.is_dir():
+            raise ValueError(f"There is nothing to resume in {path}: it holds no checkpoint.pt; leave out --resume.")
+        self._lock = hold_folder(path, "see to its permissions")
+        checkpoint = read_checkpoint(path / "checkpoint.pt", config)
+        if check is not None:
+            check(checkpoint)
+        told = self._check_kept(path, checkpoint)
+        for folder in (path, *(path / name for name in self._folders())):
+            remove_temporaries(folder)  # of a run that was killed while it wrote
+        if not (path / MARKER).exists():
+            mark(path)
+        for sentence in told:
+            print(f"warning: {sentence}", file=sys.stderr)
+        self.checkpoint_frame = checkpoint["frame"]
+        return checkpoint
+
+    def _check_kept(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
+        """Sentences about what is missing of the frames so far; ValueError if something is damaged."""
+        frames = checkpoint["frame"] + 1
+        videos = [video_file(place) for place in self._films] if self.video else []
+        check_names(path, [*_FILES, *videos], self._folders())
+        told = []
+        for place in self._picture_folders():
+            film = video_file(place) if self.video and place in self._films else None
+            told += check_pictures(path, place, frames, film)
+        if self.trajectory:
+            position = checkpoint["state"].get("position")
+            told += check_positions(path, frames, len(position) if isinstance(position, Tensor) else None)
+        if self.ply_every and self.export_format == "usd":
+            told += check_shards(path, range(0, frames, self.ply_every))
+        elif self.ply_every:
+            wanted = range(0, frames, self.ply_every)
+            told += check_frames(path, self.export_format, SUFFIXES[self.export_format], wanted)
+        return told
+
+    def release(self) -> None:
+        """Let other runs write to the folder."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    def _folders(self) -> list[str]:
+        wanted = {self.export_format: self.ply_every > 0, "trajectory": self.trajectory}
+        return [*self._picture_folders(), *(name for name, needed in wanted.items() if needed)]
+
+    def _make_folders(self) -> None:
+        for name in self._folders():
+            (self.folder / name).mkdir(parents=True, exist_ok=True)
+
+    def _picture_folders(self) -> list[str]:
+        raw = [raw_folder(place) for place in self._films if Path(place).name == "depth"]
+        return [*self._films, *raw]
+
+    def write_image(self, index: int, image: Tensor, place: str = "frames") -> None:
+        """Write one frame as PNG from colours in [0, 1], shape (H, W, 3), rounded to 8 bits; and add it to the video.
+
+        Args:
+            index: Frame number.
+            image: The colours.
+            place: Folder of the frames, see :func:`frame_folder`.
+
+        Raises:
+            OSError: If something could not be written before, here as in the other methods that write.
+        """
+        path = self.folder / place / f"{index:05d}.png"
+        copy = HostCopy((image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8))
+        self._submit(path, lambda: _write_png(path, copy.get().numpy()))
+        film = self._films.get(place)
+        if film is not None and film.encoder is not None:
+            encoder, encoded = film.encoder, film.encoded
+
+            def encode() -> None:
+                try:
+                    encoder.write(copy.get().numpy())
+                    encoded.append(index)
+                except Exception:
+                    encoder.abort()  # `close` misses the frame, encodes the PNGs and tells what fails then
+
+            self._submit(encoder.path, encode)
+
+    def write_depth(self, index: int, steps: Tensor, place: str = "depth") -> None:
+        """Write one frame's depth as PNG of 16 bits, beside the frames of ``place``.
+
+        Args:
+            index: Frame number.
+            steps: Whole numbers from 0 to 65535, int32, shape (H, W).
+            place: Folder of the coloured frames, see :func:`frame_folder`.
+        """
+        path, copy = self.folder / raw_folder(place) / f"{index:05d}.png", HostCopy(steps)
+        self._submit(path, lambda: _write_png(path, copy.get().numpy().astype(np.uint16)))
+
+    def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
+        """Keep position [m] (P, 3) and F (P, 3, 3) of one frame; packed into one file by :meth:`close`."""
+        path = self.folder / "trajectory" / f"{index:05d}.npz"
+        copy = HostCopy({f"position_{index:05d}": position.float(), f"F_{index:05d}": F.half()})
+
+        def write() -> None:
+            arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in copy.get().items()}
+            with atomic(path) as temporary:
+                np.savez(temporary, **arrays)
+
+        self._submit(path, write)
+
+    def write_ply(self, index: int, write: Callable[[Path], None]) -> None:
+        """Write one frame's Gaussians.
+
+        Args:
+            index: Frame number.
+            write: Called with the path in another thread, later, so what it holds on to must not change. On a GPU it
+                sees what was asked of the current stream before. Must itself write the file whole or not at all.
+        """
+        suffix = ".npz" if self.export_format == "usd" else SUFFIXES[self.export_format]
+        path = self.folder / self.export_format / f"{index:05d}{suffix}"
+        ready = torch.cuda.Event(blocking=True) if torch.cuda.is_initialized() else None
+        if ready is not None:
+            ready.record()
+
+        def work() -> None:
+            if ready is not None:
+                ready.synchronize()
+            write(path)
+
+        self._submit(path, work)
+
+    def write_splat(self, index: int, cloud: GaussianCloud, frame: SimFrame) -> None:
+        """Write one frame's Gaussians in the format of the recorder; those of USD are joined by :meth:`close`.
+
+        Args:
+            index: Frame number.
+            cloud: The Gaussians, in scene units; they must not change.
+            frame: Scene units to metres with z up, for USD.
+        """
+        if self.export_format != "usd":
+            return self.write_ply(index, lambda path: export_cloud(path, cloud, self.export_format))
+
+        def write(path: Path) -> None:
+            arrays: dict[str, Any] = usd_arrays(cloud)
+            rotation = frame.direction_to_sim(torch.eye(3, dtype=torch.float64)).mT.numpy()
+            with atomic(path) as temporary:
+                np.savez(temporary, **arrays, metres_per_unit=frame.metres_per_unit, rotation=rotation)
+
+        self.write_ply(index, write)
+
+    def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep what a resumed run needs.
+
+        Written only once all that was handed over before is on disk, so that it never names a frame that is not
+        complete.
+        """
+        path, copy = self.folder / "checkpoint.pt", HostCopy(checkpoint)
+
+        def write() -> None:
+            write_checkpoint(path, copy.get())
+            self.checkpoint_frame = checkpoint["frame"]
+
+        self._submit(path, write, after_all=True)
+
+    def _submit(self, path: Path, write: Callable[[], None], after_all: bool = False) -> None:
+        self._writer.submit(path.relative_to(self.folder).as_posix(), write, after_all)
+
+    def wait(self) -> None:
+        """Return once everything handed over is on disk, but for the end of the video.
+
+        Raises:
+            OSError: If something could not be written, unless another method has raised it before.
+        """
+        self._writer.wait()
+
+    def frame_files(self, count: int, place: str = "frames") -> list[Path]:
+        """The PNGs of the first ``count`` frames that exist, of the folder ``place``."""
+        files = [self.folder / place / f"{index:05d}.png" for index in range(count)]
+        return [file for file in files if file.exists()]
+
+    def close(
+        self, frames: int, summary: dict[str, Any], real_time_fps: float | None = None, release: bool = True
+    ) -> list[Path]:
+        """Wait for all files, pack the trajectory, finish the video and write the summary of the frames so far.
+
+        Args:
+            frames: Number of frames recorded.
+            summary: What goes to ``summary.json``.
+            real_time_fps: Frames per second at which the video shows the simulated time, if not as in :meth:`open`.
+            release: Let other runs write to the folder then.
+
+        Returns:
+            The files and folders of the run, for telling the user.
+
+        Raises:
+            OSError: If something could not be written, unless another method has raised it before. What does not
+                depend on it is kept all the same.
+        """
+        failure = None
+        try:
+            self.write_summary(summary)
+            made = [self.folder / "summary.json"]
+            try:
+                self.wait()
+            except Exception as error:
+                failure = error
+            if self.ply_every and frames:
+                made.append(self._pack_usd(frames) if self.export_format == "usd" else self.folder / self.export_format)
+            if self.trajectory and frames:
+                pack_trajectory(self.folder / "trajectory", self.folder / "trajectory.npz", frames)
+                made.append(self.folder / "trajectory.npz")
+            if self.images and frames:
+                made += [self.folder / place for place in self._picture_folders()]
+                for place in self._films:
+                    files = self.frame_files(frames, place)
+                    if self.video and files:  # last: it needs another program
+                        self._finish_video(place, files, self.fps or real_time_fps or self._real_time_fps)
+                        made.append(self.folder / video_file(place))
+        finally:
+            self._give_up_video()
+            if release:
+                self.release()
+        if failure is not None:
+            raise failure
+        return made
+
+    def _finish_video(self, place: str, files: list[Path], fps: float) -> None:
+        """End the video if it shows these frames at this rate, or else make one of the files."""
+        film = self._films[place]
+        encoder = film.encoder
+        if encoder is not None and encoder.fps == fps and film.encoded == [int(file.stem) for file in files]:
+            with suppress(OSError):
+                return encoder.finish()
+        film.give_up()  # before another is made under the same name
+        encode_video(files, self.folder / video_file(place), fps)
+
+    def _give_up_video(self) -> None:
+        for film in self._films.values():
+            film.give_up()
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write ``summary.json``, and its entry ``per_frame`` as ``diagnostics.csv`` too."""
+        write_json(self.folder / "summary.json", summary)
+        if summary.get("per_frame"):
+            write_table(self.folder / "diagnostics.csv", summary["per_frame"])
+
+    def _pack_usd(self, frames: int) -> Path:
+        """Join the frames into one film, those of an earlier part of a resumed run from the film of that part."""
+        target, shards = self.folder / "animation.usdc", self.folder / "usd"
+        files = {int(file.stem): file for file in shards.glob("[0-9]*.npz")}
+        wanted = range(0, frames, self.ply_every)
+        if not any(index in files for index in wanted):
+            return target
+        with np.load(files[min(files)]) as shard:
+            scale, rotation = float(shard["metres_per_unit"]), torch.from_numpy(shard["rotation"])
+        film = UsdFilm(self.fps or self._real_time_fps, scale, rotation)
+        for index in wanted:
+            if index in files:
+                with np.load(files[index]) as shard:
+                    film.add(index, {k: shard[k] for k in shard.files if k not in ("metres_per_unit", "rotation")})
+            elif target.exists():
+                film.add(index, read_usd_frame(target, index))
+        film.save(target)
+        shutil.rmtree(shards)
+        return target

@@ -1,0 +1,113 @@
+"""The trajectory of a run, ``trajectory.npz``: arrays ``position_00000`` and ``F_00000`` per frame."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._files import atomic, check_regular
+from gaussian_swaying._inputs import check_archive
+
+_MEMBER = re.compile(r"(position|F)_(\d{5})\.npy")
+
+
+def pack_trajectory(shards: Path, target: Path, frames: int) -> None:
+    """Join the frames into one .npz, copying their arrays without unpacking all of them at once.
+
+    Args:
+        shards: Folder with an .npz per frame, ``00000.npz`` ...; removed at the end.
+        target: The file; frames that only an earlier one of this name holds are kept.
+        frames: Number of frames to keep.
+    """
+    wanted = {f"{index:05d}" for index in range(frames)}
+    with atomic(target) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as out:
+        done: set[str] = set()
+        for source in _sources(shards, target):
+            with zipfile.ZipFile(source) as archive:
+                for name in archive.namelist():
+                    if name.rsplit("_", 1)[1][:5] in wanted and name not in done:
+                        done.add(name)
+                        out.writestr(name, archive.read(name))
+    if shards.exists():  # if not closed before
+        shutil.rmtree(shards)
+
+
+def _sources(shards: Path, target: Path) -> Iterator[Path]:
+    """The files that hold frames; those of a resumed run replace those of the run before it."""
+    yield from sorted(shards.glob("[0-9]*.npz"), reverse=True)
+    if target.exists():
+        yield target
+
+
+def check_trajectory(shards: Path, target: Path, frames: int, particles: int | None = None) -> set[int]:
+    """Look through what :func:`pack_trajectory` would join, with the checksum of every array.
+
+    Args:
+        shards: Folder with an .npz per frame.
+        target: The file that was joined before, if any.
+        frames: Number of frames that were recorded.
+        particles: Number of particles that each must have; None for any.
+
+    Returns:
+        The frames of which position and F are there.
+
+    Raises:
+        ValueError: If a file is damaged, or is no regular one.
+    """
+    found: dict[str, set[int]] = {"position": set(), "F": set()}
+    for source in _sources(shards, target):
+        check_regular(source)
+        try:
+            with zipfile.ZipFile(source) as archive:
+                for member in archive.infolist():
+                    name = _MEMBER.fullmatch(member.filename)
+                    if name is None:
+                        raise ValueError(f"it holds {member.filename}, which no run writes")
+                    with archive.open(member) as stream:
+                        _check_array(stream, name[1], particles)
+                        while stream.read(1 << 20):  # to the end, where its checksum is compared
+                            pass
+                    if int(name[2]) < frames:
+                        found[name[1]].add(int(name[2]))
+        except Exception as error:
+            why = re.sub(r"\s+", " ", str(error)).rstrip(".") or type(error).__name__
+            raise ValueError(
+                f"{source} is damaged ({why}): remove it to go on without its frames, or start again without --resume."
+            ) from error
+    return found["position"] & found["F"]
+
+
+def _check_array(stream: IO[bytes], name: str, particles: int | None) -> None:
+    """Read the header of an array, which must be of the kind that a run writes."""
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError("an array is of another format")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    sizes, kind = ((3,), np.float32) if name == "position" else ((3, 3), np.float16)
+    if shape[1:] != sizes or dtype != kind or (particles is not None and shape[0] != particles):
+        raise ValueError(f"an array of {dtype} {shape} is none of this run")
+
+
+def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, Tensor]:
+    """Position [m, z up] (P, 3) and F (P, 3, 3) of the simulated particles at one recorded frame.
+
+    Args:
+        path: ``trajectory.npz`` of a run.
+        frame: Frame number from 0.
+
+    Raises:
+        ValueError: If the file does not hold the frame.
+    """
+    with np.load(check_archive(path, "the run")) as arrays:
+        name = f"{frame:05d}"
+        if f"position_{name}" not in arrays:
+            raise ValueError(f"{path} holds no frame {frame}: it has {len(arrays.files) // 2} frames.")
+        return torch.from_numpy(arrays[f"position_{name}"]), torch.from_numpy(arrays[f"F_{name}"]).float()

@@ -1,0 +1,270 @@
+"""The views of a capture as training images, one per batch, for Lightning."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from lightning.pytorch import LightningDataModule
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying.captures.capture import Capture, View, read_capture
+from gaussian_swaying.captures.images import straight_colors
+from gaussian_swaying.captures.initial_points import initial_points
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.training.data.order import EndlessShuffle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingImage:
+    """One batch: an image and the camera that took it.
+
+    It holds bytes and computes colours where they are used, so that little goes to a GPU. Fields and properties are
+    there as items too: ``batch["image"]``.
+
+    Attributes:
+        pixels: Dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha.
+        camera: Camera of the image.
+        name: Path of the image as the capture's files give it.
+        index: Place of the view in ``Capture.split(...)``.
+    """
+
+    pixels: Tensor
+    camera: Camera
+    name: str
+    index: int
+    _cameras: dict[torch.device, Camera] = field(default_factory=dict, repr=False)  # on devices, kept by the dataset
+
+    @property
+    def image(self) -> Tensor:
+        """Colours in 0 to 1, not multiplied with alpha, float32, shape (H, W, 3)."""
+        return straight_colors(self.pixels)[0]
+
+    @property
+    def alpha(self) -> Tensor | None:
+        """Alpha in 0 to 1, float32, shape (H, W, 1), or None if the image is opaque."""
+        return straight_colors(self.pixels)[1]
+
+    def __getitem__(self, name: str) -> Any:
+        """Field or property of this name."""
+        if name not in ("image", "alpha", "pixels", "camera", "name", "index"):
+            raise KeyError(name)
+        return getattr(self, name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Field or property of this name, or ``default`` if there is none."""
+        try:
+            return self[name]
+        except KeyError:
+            return default
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> TrainingImage:
+        """Copy on another device."""
+        device = torch.device(device)
+        if device not in self._cameras:
+            self._cameras[device] = self.camera.to(device)
+        pixels = self.pixels.to(device, non_blocking=non_blocking or self.pixels.is_pinned())
+        return replace(self, pixels=pixels, camera=self._cameras[device])
+
+    def pin_memory(self) -> TrainingImage:
+        """Copy in page-locked memory, for DataLoader."""
+        return replace(self, pixels=self.pixels.pin_memory())
+
+
+class CaptureDataset(Dataset[TrainingImage]):
+    """Views of one split.
+
+    Args:
+        views: The views.
+        cache: Keep the pixels in memory, as bytes of the size that the views have; page-locked if there is a GPU.
+        threads: Threads that read images into the cache.
+
+    Raises:
+        ValueError: If an image cannot be read into the cache.
+    """
+
+    def __init__(self, views: tuple[View, ...], cache: bool = True, threads: int = 4) -> None:
+        self.views = views
+        self._cameras: list[dict[torch.device, Camera]] = [{} for _ in views]
+        self._pixels: list[Tensor] | None = None
+        if cache:
+            with ThreadPoolExecutor(max(threads, 1)) as pool:
+                self._pixels = list(pool.map(View.load, views))
+            if torch.cuda.is_available():
+                self._pixels = [pixels.pin_memory() for pixels in self._pixels]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> TrainingImage:
+        """The view of an index."""
+        view = self.views[index]
+        pixels = view.load() if self._pixels is None else self._pixels[index]
+        return TrainingImage(pixels, view.camera, view.name, index, self._cameras[index])
+
+
+class CaptureDataModule(LightningDataModule):
+    """Training, validation and test images of a capture.
+
+    A batch is one :class:`TrainingImage`. Training images come without end, in rounds that are shuffled by ``seed``
+    alone; a run resumed from a checkpoint goes on with the image that comes next, one image being one step of the
+    trainer. Validation and test images come in the order of their names. Validation uses the split ``val`` of the
+    capture, or ``test`` if it has none. Alpha is handed on: who draws the picture knows what is behind it.
+
+    Args:
+        path: Folder or transforms.json, see :func:`~gaussian_swaying.captures.capture.read_capture`.
+        format: ``auto``, ``colmap`` or ``transforms``.
+        downscale: How many pixels on a side become one.
+        test_every: Every how many-th image is for testing, 0 for none, where the files do not say.
+        images: Folder of the images of a COLMAP model.
+        workers: With ``cache`` the number of threads that read the images when the run starts, without it the number
+            of processes that read them as they are needed.
+        cache: Keep the images in memory, as bytes of the size that is trained on.
+        points: What the Gaussians start from, see :func:`~gaussian_swaying.captures.initial_points.initial_points`.
+        point_count: Number of points, where they are drawn at random.
+        seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
+        initial_opacity: Opacity of the Gaussians at these points, between 0 and 1; 0.5 suits MCMC.
+        initial_scale: Their standard deviation as a multiple of the distance to their neighbours; 0.1 suits MCMC.
+
+    Raises:
+        ValueError: If an argument is out of range; in ``setup``, if the capture is bad.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        format: Literal["auto", "colmap", "transforms"] = "auto",
+        downscale: int = 1,
+        test_every: int = 8,
+        images: str = "images",
+        workers: int = 4,
+        cache: bool = True,
+        points: str = "auto",
+        point_count: int = 100_000,
+        seed: int | None = None,
+        initial_opacity: float = 0.1,
+        initial_scale: float = 1.0,
+    ) -> None:
+        super().__init__()
+        if not 0.0 < initial_opacity < 1.0:
+            raise ValueError(f"Expected `initial_opacity` between 0 and 1 (both excluded), but got {initial_opacity}.")
+        check_positive("initial_scale", initial_scale)
+        self.initial_opacity, self.initial_scale = initial_opacity, initial_scale
+        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
+            raise ValueError(f"Expected `workers` to be a whole number of at least 0, but got {workers!r}.")
+        self.path, self.format, self.downscale, self.test_every = path, format, downscale, test_every
+        self.images, self.workers, self.cache = images, workers, cache
+        self.points, self.point_count = points, point_count
+        self.seed = int(os.environ.get("PL_GLOBAL_SEED", "0")) if seed is None else seed
+        self._capture: Capture | None = None
+        self._datasets: dict[str, CaptureDataset] = {}
+        self._seen = 0  # training images of the run before this one
+
+    @property
+    def capture(self) -> Capture:
+        """The capture, read at the first access."""
+        if self._capture is None:
+            self._capture = read_capture(self.path, self.format, self.downscale, self.test_every, self.images)
+        return self._capture
+
+    @property
+    def scene_scale(self) -> float:
+        """``extent`` of the capture [scene units]."""
+        return self.capture.extent
+
+    def initial_cloud(self, sh_degree: int = 3) -> GaussianCloud:
+        """Gaussians to start the training from.
+
+        Args:
+            sh_degree: Degree of their spherical harmonics.
+
+        Raises:
+            ValueError: If ``points`` cannot be had from this capture.
+        """
+        from gaussian_swaying.training.initial import gaussians_from_points
+
+        cloud = initial_points(self.capture, self.points, self.point_count, self.seed)
+        return gaussians_from_points(cloud.points, cloud.colors, sh_degree, self.initial_opacity, self.initial_scale)
+
+    @property
+    def validation_split(self) -> str:
+        """``val`` if the capture has such a split, else ``test``."""
+        return "val" if self.capture.split("val") else "test"
+
+    def setup(self, stage: str | None = None) -> None:
+        """Read the capture, and the images of the stage into the cache.
+
+        Args:
+            stage: ``fit``, ``validate``, ``test``, or None for all.
+
+        Raises:
+            ValueError: If the capture or one of these images is bad.
+        """
+        wanted = {"fit": ("train", self.validation_split), "validate": (self.validation_split,), "test": ("test",)}
+        for split in wanted.get(stage or "", ("train", self.validation_split, "test")):
+            if stage in ("validate", "test") and not self.capture.split(split):
+                raise ValueError(
+                    f"The split `{split}` of {self.path} is empty, so there is nothing to {stage}: set `test_every`, "
+                    "or name the images in the capture's files."
+                )
+            self._dataset(split)
+
+    def _dataset(self, split: str) -> CaptureDataset:
+        if split not in self._datasets:
+            self._datasets[split] = CaptureDataset(self.capture.split(split), self.cache, self.workers)
+        return self._datasets[split]
+
+    def _options(self) -> dict[str, Any]:
+        workers = 0 if self.cache else self.workers
+        return {
+            "batch_size": None,  # an item is a batch
+            "num_workers": workers,
+            "persistent_workers": workers > 0,
+            "pin_memory": torch.cuda.is_available() and not self.cache,
+        }
+
+    def transfer_batch_to_device(
+        self, batch: TrainingImage, device: torch.device, dataloader_idx: int
+    ) -> TrainingImage:
+        """The image on the device; Lightning would look through its fields at every step."""
+        return batch.to(device, non_blocking=True)
+
+    def train_dataloader(self) -> DataLoader[TrainingImage]:
+        """Training images, shuffled, without end."""
+        dataset = self._dataset("train")
+        return DataLoader(dataset, sampler=EndlessShuffle(len(dataset), self.seed, self._seen), **self._options())
+
+    def state_dict(self) -> dict[str, int]:
+        """Number of training images seen, and what their order depends on; Lightning keeps it in checkpoints."""
+        seen = self._seen if self.trainer is None else self.trainer.global_step
+        return {"seed": self.seed, "count": len(self.capture.split("train")), "seen": seen}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Go on with the training image that comes next.
+
+        Raises:
+            ValueError: If the seed or the training images are others.
+        """
+        now = {"seed": self.seed, "count": len(self.capture.split("train"))}
+        fitting = self.trainer is None or self.trainer.state.fn == "fit"
+        for name, what in (("seed", "seed"), ("count", "number of training images")):
+            if fitting and state_dict[name] != now[name]:
+                raise ValueError(
+                    f"The {what} of {self.path} was {state_dict[name]} in the checkpoint and is {now[name]} now: set "
+                    "what it was, or start a new run."
+                )
+        self._seen = int(state_dict["seen"])
+
+    def val_dataloader(self) -> DataLoader[TrainingImage]:
+        """Validation images in order."""
+        return DataLoader(self._dataset(self.validation_split), shuffle=False, **self._options())
+
+    def test_dataloader(self) -> DataLoader[TrainingImage]:
+        """Test images in order."""
+        return DataLoader(self._dataset("test"), shuffle=False, **self._options())

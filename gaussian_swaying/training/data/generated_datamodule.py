@@ -1,0 +1,93 @@
+"""A capture made in code as training data, so that a training runs with nothing downloaded."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+
+from gaussian_swaying.captures.generated_capture import GeneratedCapture
+from gaussian_swaying.training.data.datamodule import CaptureDataModule
+
+
+class GeneratedDataModule(CaptureDataModule):
+    """Images of a :class:`~gaussian_swaying.captures.generated_capture.GeneratedCapture`, drawn at the first run.
+
+    They are kept in a folder, which later runs with the same settings use again, and which
+    :class:`~gaussian_swaying.training.data.datamodule.CaptureDataModule` reads as any other capture.
+
+    Args:
+        path: Folder of the images; made if it is missing.
+        capture: What is drawn.
+        test_every: Every how many-th image is for testing.
+        workers: Threads that draw and read the images.
+        points: What the Gaussians start from: ``random`` in the space that the cameras see, or a file.
+        point_count: Number of points, where they are drawn at random.
+        seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
+        initial_opacity: Opacity of the Gaussians at these points, between 0 and 1.
+        initial_scale: Their standard deviation as a multiple of the distance to their neighbours.
+
+    Raises:
+        ValueError: In ``setup``, if the folder holds something else, or images of another flag.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        capture: GeneratedCapture,
+        test_every: int = 8,
+        workers: int = 4,
+        points: str = "random",
+        point_count: int = 100_000,
+        seed: int | None = None,
+        initial_opacity: float = 0.1,
+        initial_scale: float = 1.0,
+    ) -> None:
+        super().__init__(
+            path,
+            "transforms",
+            test_every=test_every,
+            workers=workers,
+            points=points,
+            point_count=point_count,
+            seed=seed,
+            initial_opacity=initial_opacity,
+            initial_scale=initial_scale,
+        )
+        self.generated = capture
+
+    def setup(self, stage: str | None = None) -> None:
+        """Draw the images if they are not there, then read them.
+
+        Args:
+            stage: ``fit``, ``validate``, ``test``, or None for all.
+
+        Raises:
+            ValueError: If the folder holds something else.
+        """
+        self._make()
+        super().setup(stage)
+
+    def _make(self) -> None:
+        folder = Path(self.path)
+        settings = {name: value for name, value in vars(self.generated).items() if not name.startswith("_")}
+        marker = folder / "generated.json"
+        if marker.is_file():
+            held = json.loads(marker.read_text())
+            if held == settings:
+                return
+            other = ", ".join(name for name in settings if held.get(name) != settings[name])
+            raise ValueError(f"{folder} holds images that were made with another {other}: remove it or set `path`.")
+        if folder.exists():
+            raise ValueError(f"{folder} exists and holds no generated capture: set another `path`.")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
+            made = Path(temporary) / "capture"
+            self.generated.write(made, max(self.workers, 1))
+            (made / marker.name).write_text(json.dumps(settings))
+            try:
+                made.rename(folder)
+            except OSError:  # another run was faster
+                if not marker.is_file() or json.loads(marker.read_text()) != settings:
+                    raise

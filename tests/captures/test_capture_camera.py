@@ -1,0 +1,117 @@
+"""Cameras of a capture as camera paths: both kinds of files give the same."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.captures.capture_camera import CaptureCamera, read_views
+from gaussian_swaying.geometry.rotations import rotation_to_quat
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+
+CENTER, UP = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+WIDTH, HEIGHT = 64, 48
+NAMES = ["c.png", "a.png", "b.png"]  # as the files have them, which is not their order
+
+
+def _cameras():
+    """Camera of each name: a quarter of a circle."""
+    eyes = {"a.png": 0.0, "b.png": 45.0, "c.png": 90.0}
+    return {
+        name: look_at_camera(
+            [3 * math.cos(math.radians(a)), 3 * math.sin(math.radians(a)), 1.0],
+            [0, 0, 0],
+            [0, 0, 1],
+            40.0,
+            WIDTH,
+            HEIGHT,
+            dtype=torch.float64,
+        )
+        for name, a in eyes.items()
+    }
+
+
+@pytest.fixture(params=["transforms", "colmap"])
+def capture(request, tmp_path):
+    """A capture without its images."""
+    cameras = _cameras()
+    focal = float(cameras["a.png"].intrinsics[0, 0])
+    if request.param == "transforms":
+        flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+        frames = [
+            {
+                "file_path": f"images/{name}",
+                "transform_matrix": (torch.linalg.inv(cameras[name].world_to_camera) @ flip).tolist(),
+            }
+            for name in NAMES
+        ]
+        (tmp_path / "transforms.json").write_text(
+            json.dumps({"fl_x": focal, "w": WIDTH, "h": HEIGHT, "frames": frames})
+        )
+        return tmp_path
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {focal} {focal} {WIDTH / 2} {HEIGHT / 2}\n")
+    lines = []
+    for k, name in enumerate(NAMES):
+        view = cameras[name].world_to_camera
+        pose = [*rotation_to_quat(view[:3, :3]).tolist(), *view[:3, 3].tolist()]
+        lines += [" ".join(map(str, [k + 1, *pose, 1, f"images/{name}"])), ""]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def _same(camera, expected):
+    torch.testing.assert_close(camera.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-5)
+    torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=1e-6, atol=1e-4)
+    assert (camera.width, camera.height) == (expected.width, expected.height)
+
+
+@pytest.mark.parametrize("view", [1, "images/b.png", "b.png", "b"])
+def test_one_view_by_number_or_name(view, capture):
+    path = CaptureCamera(capture, view=view)
+    for time in (0.0, 5.0):
+        _same(path(0, time, CENTER, UP, 1.0), _cameras()["b.png"])
+    assert [name for name, _ in read_views(capture)] == ["images/a.png", "images/b.png", "images/c.png"]
+
+
+def test_a_journey_meets_every_view_in_the_order_of_names(capture):
+    path = CaptureCamera(capture, seconds_per_view=2.0)
+    for k, name in enumerate(("a.png", "b.png", "c.png")):
+        _same(path(0, 2.0 * k, CENTER, UP, 1.0), _cameras()[name])
+    _same(path(0, 99.0, CENTER, UP, 1.0), _cameras()["c.png"])
+    between = path(0, 1.0, CENTER, UP, 1.0)
+    rotation = between.world_to_camera[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-5)
+    seen = between.world_to_camera[:3] @ torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    assert abs(float(seen[0] / seen[2])) < 0.05  # it still looks about where both neighbours look
+    assert 2.5 < float(between.position[:2].norm()) < 3.0
+
+
+def test_the_picture_can_have_another_size(capture):
+    camera = CaptureCamera(capture, view=0, width=32)(0, 0.0, CENTER, UP, 1.0)
+    assert (camera.width, camera.height) == (32, 24)
+    torch.testing.assert_close(camera.intrinsics[:2], 0.5 * _cameras()["a.png"].intrinsics[:2], rtol=1e-6, atol=1e-5)
+
+
+def test_bad_views(capture, tmp_path):
+    with pytest.raises(ValueError, match="no view 3: set `view` between 0 and 2"):
+        CaptureCamera(capture, view=3)(0, 0.0, CENTER, UP, 1.0)
+    with pytest.raises(ValueError, match=r"no view `d`, or several: .* such as images/a\.png"):
+        CaptureCamera(capture, view="d")(0, 0.0, CENTER, UP, 1.0)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(ValueError, match=r"holds no cameras: give a transforms\.json"):
+        CaptureCamera(empty)(0, 0.0, CENTER, UP, 1.0)
+
+
+def test_views_of_different_sizes_need_one(tmp_path):
+    frames = [
+        {"file_path": name, "transform_matrix": torch.eye(4).tolist(), "w": w, "h": 48, "fl_x": 50.0}
+        for name, w in (("a", 64), ("b", 32))
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(ValueError, match="2 different sizes"):
+        CaptureCamera(tmp_path)(0, 0.0, CENTER, UP, 1.0)
+    assert CaptureCamera(tmp_path, width=16, height=16)(0, 0.0, CENTER, UP, 1.0).width == 16

@@ -1,0 +1,188 @@
+"""What a training gets: every image once a round, the same after a restart, nothing but bytes in memory."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+lightning = pytest.importorskip("lightning")
+
+from gaussian_swaying.training.data.datamodule import CaptureDataModule  # noqa: E402
+
+
+@pytest.fixture
+def folder(tmp_path, capture_tools):
+    """Nine images with alpha, of which two are for testing."""
+    names = [f"images/{index:03d}.png" for index in range(9)]
+    return capture_tools.transforms(tmp_path / "capture", capture_tools.cameras(9), names, channels=4)
+
+
+def _indices(data, count):
+    return [batch["index"] for batch in itertools.islice(data.train_dataloader(), count)]
+
+
+def test_a_batch_is_an_image_with_its_camera(folder):
+    data = CaptureDataModule(folder, seed=1)
+    data.setup("fit")
+    batch = next(iter(data.train_dataloader()))
+    view = data.capture.split("train")[batch.index]
+    pixels = view.load()
+    assert (batch["name"], batch["camera"]) == (view.name, view.camera)
+    assert torch.equal(batch["pixels"], pixels)
+    assert batch["image"].shape == (16, 20, 3)
+    assert batch["alpha"].shape == (16, 20, 1)
+    torch.testing.assert_close(batch.image * batch.alpha, pixels[..., :3] / 255, rtol=0, atol=1e-6)
+    assert batch.get("mask") is None
+    with pytest.raises(KeyError):
+        batch["mask"]
+    moved = batch.to("cpu")
+    assert torch.equal(moved.pixels, pixels)
+
+
+def test_opaque_images_have_no_alpha(tmp_path, capture_tools):
+    names = [f"{index}.png" for index in range(3)]
+    data = CaptureDataModule(capture_tools.transforms(tmp_path, capture_tools.cameras(3), names), test_every=0)
+    batch = next(iter(data.train_dataloader()))
+    assert batch.alpha is None
+    assert torch.equal((batch.image * 255).round().byte(), batch.pixels)
+
+
+@pytest.mark.parametrize("options", [{}, {"cache": False, "workers": 0}, {"cache": False, "workers": 2}])
+def test_every_image_once_a_round_and_the_seed_decides(folder, options):
+    first, again, other = (CaptureDataModule(folder, seed=seed, **options) for seed in (1, 1, 2))
+    order = _indices(first, 14)
+    assert sorted(order[:7]) == sorted(order[7:]) == list(range(7))
+    assert order[:7] != order[7:]
+    assert _indices(again, 14) == order
+    assert _indices(other, 14) != order
+    assert [batch.name for batch in first.val_dataloader()] == ["images/000.png", "images/008.png"]
+    assert [batch.name for batch in first.test_dataloader()] == ["images/000.png", "images/008.png"]
+
+
+def test_cache_and_workers_give_the_same_pixels(folder):
+    pictures = []
+    for options in ({"cache": True}, {"cache": False, "workers": 2}):
+        data = CaptureDataModule(folder, downscale=2, seed=5, **options)
+        pictures.append([batch.pixels for batch in itertools.islice(data.train_dataloader(), 7)])
+    assert all(torch.equal(one, two) for one, two in zip(*pictures, strict=True))
+    assert pictures[0][0].dtype == torch.uint8
+    assert pictures[0][0].shape == (8, 10, 4)
+
+
+def test_only_the_images_of_the_stage_are_read(folder):
+    (folder / "images/003.png").write_bytes((folder / "images/003.png").read_bytes()[:60])  # its header is whole
+    data = CaptureDataModule(folder)
+    data.setup("test")
+    with pytest.raises(ValueError, match=r"images/003\.png cannot be read"):
+        data.setup("fit")
+
+
+def test_validation_prefers_its_own_split(tmp_path, capture_tools):
+    names = [f"{index}.png" for index in range(4)]
+    lists = {"train_filenames": names[:2], "val_filenames": names[2:3], "test_filenames": names[3:]}
+    data = CaptureDataModule(capture_tools.transforms(tmp_path, capture_tools.cameras(4), names, **lists))
+    data.setup()
+    assert [batch.name for batch in data.val_dataloader()] == ["2.png"]
+    assert [batch.name for batch in data.test_dataloader()] == ["3.png"]
+
+
+def test_the_seed_of_the_run_is_the_default(folder, monkeypatch):
+    monkeypatch.setenv("PL_GLOBAL_SEED", "11")
+    assert CaptureDataModule(folder).seed == 11
+    monkeypatch.delenv("PL_GLOBAL_SEED")
+    assert CaptureDataModule(folder).seed == 0
+
+
+class _Watcher(lightning.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen = []
+
+    def training_step(self, batch, batch_idx):
+        self.seen.append(batch["name"])
+        return self.weight + batch["image"].mean()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD([self.weight], lr=0.1)
+
+
+def _fit(folder, steps, root, checkpoint=None, **options):
+    model, data = _Watcher(), CaptureDataModule(folder, seed=3, **options)
+    trainer = lightning.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        max_epochs=-1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=root,
+    )
+    trainer.fit(model, data, ckpt_path=checkpoint)
+    return trainer, model.seen
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Lightning's advice on workers
+@pytest.mark.parametrize("stop", [4, 7, 10])
+def test_a_resumed_run_sees_the_images_that_come_next(folder, tmp_path, stop):
+    _, whole = _fit(folder, 16, tmp_path)
+    trainer, first = _fit(folder, stop, tmp_path)
+    trainer.save_checkpoint(tmp_path / "a.ckpt")
+    _, second = _fit(folder, 16, tmp_path, tmp_path / "a.ckpt")
+    assert first + second == whole
+    assert len(set(whole[:7])) == 7
+
+
+def test_a_checkpoint_of_other_images_or_another_seed_is_refused(folder):
+    state = {"seed": 0, "count": 7, "seen": 5}
+    data = CaptureDataModule(folder)
+    data.load_state_dict(state)
+    order = _indices(CaptureDataModule(folder), 9)
+    assert _indices(data, 4) == order[5:]
+    assert data.state_dict() == state
+    with pytest.raises(ValueError, match=r"seed.*was 0.*is 4 now"):
+        CaptureDataModule(folder, seed=4).load_state_dict(state)
+    with pytest.raises(ValueError, match=r"number of training images.*was 7.*is 9 now"):
+        CaptureDataModule(folder, test_every=0).load_state_dict(state)
+
+
+def test_what_a_trainer_starts_from(folder):
+    data = CaptureDataModule(folder, point_count=64)
+    assert data.scene_scale == data.capture.extent
+    cloud = data.initial_cloud(1)
+    assert len(cloud) == 64
+    assert cloud.sh.shape == (64, 4, 3)
+    other = CaptureDataModule(folder, point_count=64, initial_opacity=0.5, initial_scale=0.1).initial_cloud(1)
+    torch.testing.assert_close(other.opacities, torch.zeros(64))
+    torch.testing.assert_close(other.scales, cloud.scales + math.log(0.1))
+
+
+def test_the_camera_of_a_view_is_moved_once(folder):
+    data = CaptureDataModule(folder)
+    data.setup("fit")
+    first, again = (data._dataset("train")[1].to("cpu").camera for _ in range(2))
+    assert first is again
+    assert data._dataset("train")[0].to("cpu").camera is not first
+    moved = data.transfer_batch_to_device(data._dataset("train")[1], torch.device("cpu"), 0)
+    assert moved.camera is first  # by the way that keeps it, not by Lightning's search
+
+
+def test_nothing_to_measure_is_an_error(folder):
+    data = CaptureDataModule(folder, test_every=0)
+    data.setup("fit")
+    for stage in ("test", "validate"):
+        with pytest.raises(ValueError, match=rf"`test` of .* is empty.*{stage}.*`test_every`"):
+            data.setup(stage)
+
+
+def test_bad_arguments(folder):
+    with pytest.raises(ValueError, match="`workers`"):
+        CaptureDataModule(folder, workers=-1)
+    with pytest.raises(ValueError, match="`initial_opacity`"):
+        CaptureDataModule(folder, initial_opacity=1.0)
+    with pytest.raises(ValueError, match="`initial_scale`"):
+        CaptureDataModule(folder, initial_scale=0.0)
+    with pytest.raises(ValueError, match="`format`"):
+        CaptureDataModule(folder, format="nerf").setup()

@@ -1,0 +1,141 @@
+"""Where training starts: points of the capture, of files, of meshes, and at random."""
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from gaussian_swaying.captures.capture import read_capture
+from gaussian_swaying.captures.generated_capture import GeneratedCapture
+from gaussian_swaying.captures.initial_points import consistent_points, initial_points, random_points
+from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, sample_mesh
+
+SQUARE = "# a square and its colours\nv 0 0 0 1 0 0\nv 2 0 0 1 0 0\nv 2 1 0 0 0 1\nv 0 1 0 0 0 1\nvn 0 0 1\n"
+
+
+@pytest.fixture
+def capture(tmp_path, capture_tools):
+    names = [f"images/{index}.png" for index in range(4)]
+    return read_capture(capture_tools.transforms(tmp_path / "capture", capture_tools.cameras(4), names), test_every=0)
+
+
+def test_points_of_the_capture_come_first(tmp_path, capture_tools):
+    capture = read_capture(capture_tools.colmap(tmp_path, capture_tools.cameras(2), ["a.png", "b.png"]), test_every=0)
+    for source in ("auto", "capture"):
+        assert torch.equal(initial_points(capture, source).points, capture.points)
+    assert len(initial_points(capture, "random", count=50)) == 50
+
+
+def test_random_points_fill_what_the_cameras_see(capture):
+    """The cameras stand 2 to 2.02 from (0, 0, 0.2); their wider half field of view has tan 10/8 tan(25 degrees)."""
+    cloud = initial_points(capture, "auto", count=20_000, seed=3)
+    reach = 2.0 * 10 / 8 * np.tan(np.radians(25))
+    middle = 0.5 * (cloud.points.amax(0) + cloud.points.amin(0))
+    torch.testing.assert_close(middle, torch.tensor([0.0, 0.0, 0.2]), rtol=0, atol=0.01)
+    torch.testing.assert_close(cloud.points.amax(0) - middle, torch.full((3,), reach).float(), rtol=0.02, atol=0)
+    assert 0 <= float(cloud.colors.min()) < 0.01 < 0.99 < float(cloud.colors.max()) <= 1
+    assert torch.equal(initial_points(capture, count=20_000, seed=3).points, cloud.points)
+    assert not torch.equal(initial_points(capture, count=20_000, seed=4).points, cloud.points)
+    small = initial_points(capture, half_side=0.1, count=100)
+    assert float((small.points - torch.tensor([0.0, 0.0, 0.2])).abs().max()) <= 0.1 + 1e-6
+
+
+def test_random_points_keep_away_from_the_cameras(capture):
+    """Half a camera's distance, also where the cube holds the cameras; all of the rest is filled."""
+    middle = torch.tensor([0.0, 0.0, 0.2])
+    cloud = initial_points(capture, "random", count=20_000, half_side=4.0)
+    assert len(cloud) == 20_000
+    eyes = torch.stack([view.camera.position for view in capture.views])
+    ratio = torch.cdist(cloud.points, eyes) / (eyes - middle).norm(dim=-1)
+    assert 0.5 <= float(ratio.min()) < 0.53
+    reach = (cloud.points - middle).abs().amax(0)
+    torch.testing.assert_close(reach, torch.full((3,), 4.0), rtol=0.01, atol=0)
+
+
+def test_random_points_without_room(capture, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.captures.initial_points._ATTEMPTS", 1)
+    with pytest.raises(ValueError, match="leave no room"):
+        initial_points(capture, "random", count=1000, half_side=4.0)
+
+
+def test_consistent_points_lie_where_the_photos_agree(tmp_path):
+    """Of points around a flag seen from all sides, those near it; the mean of their colours is the flag's there."""
+    flag = GeneratedCapture(views=24, size=48)
+    capture = read_capture(flag.write(tmp_path / "flag"))
+    chosen = consistent_points(capture, 400, seed=1, half_side=0.9)
+    assert len(chosen) == 400
+    around = random_points(torch.tensor([0.6, 0.0, 0.4]), 0.9, 400)
+    off_black = chosen.colors.sum(-1) > 0.2  # the background is black in all photos: consistent too
+    assert torch.equal(consistent_points(capture, 400, seed=1, half_side=0.9).points, chosen.points)
+
+    def typical(points):
+        places, _ = flag.nearest(points)
+        return float((points - places).norm(dim=-1).median())
+
+    assert off_black.any()
+    assert typical(chosen.points[off_black]) < 0.5 * typical(around.points)
+    with pytest.raises(ValueError, match="`point_count`"):
+        consistent_points(capture, 400, half_side=1e3)
+
+
+def test_a_mesh_is_sampled_by_area(tmp_path, capture):
+    """A 2 x 1 quadrilateral and a 0.5 x 1 upright triangle: 2 to 0.25 of the points."""
+    (tmp_path / "m.obj").write_text(SQUARE + "f 1//1 2//1 3//1 4//1\nv 0 0 5\nv 0.5 0 5\nv 0 0 6\nf -3 -2 -1\n")
+    cloud = initial_points(capture, tmp_path / "m.obj", count=40_000)
+    upright = cloud.points[:, 2] > 4
+    assert float(upright.float().mean()) == pytest.approx(0.25 / 2.25, abs=0.01)
+    flat = cloud.points[~upright]
+    assert float(flat[:, 2].abs().max()) == 0
+    counts = torch.histogramdd(flat[:, :2], [4, 2], range=[0.0, 2.0, 0.0, 1.0]).hist
+    torch.testing.assert_close(counts / len(flat), torch.full((4, 2), 1 / 8), rtol=0.06, atol=0)
+    torch.testing.assert_close(cloud.colors[~upright][:, 2], flat[:, 1], rtol=0, atol=1e-5)  # red below, blue above
+    assert cloud.normals[~upright][0].tolist() == [0, 0, 1]
+    assert cloud.normals[upright][0].tolist() == [0, -1, 0]
+
+
+def test_ply_with_and_without_faces(tmp_path, capture):
+    rows = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], dtype=[(n, "<f4") for n in "xyz"])
+    points = PlyElement.describe(rows, "vertex")
+    PlyData([points]).write(str(tmp_path / "points.ply"))
+    cloud = initial_points(capture, str(tmp_path / "points.ply"), count=7)
+    assert cloud.points.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert cloud.colors.unique().tolist() == [0.5]
+    faces = np.empty(1, dtype=[("vertex_indices", "O")])
+    faces["vertex_indices"][0] = np.array([0, 1, 2], dtype=np.int32)
+    PlyData([points, PlyElement.describe(faces, "face")], text=True).write(str(tmp_path / "mesh.ply"))
+    assert len(initial_points(capture, tmp_path / "mesh.ply", count=7)) == 7
+
+
+def test_bad_sources_are_named(tmp_path, capture, capture_tools):
+    with pytest.raises(ValueError, match="came with no points"):
+        initial_points(capture, "capture")
+    with pytest.raises(ValueError, match=r"points\.xyz.*\.ply or \.obj"):
+        initial_points(capture, "points.xyz")
+    for name in ("none.ply", "none.obj"):
+        with pytest.raises(ValueError, match=rf"{name}.*check the path"):
+            initial_points(capture, tmp_path / name)
+    (tmp_path / "text.ply").write_text("hello")
+    with pytest.raises(ValueError, match=r"text\.ply is not a \.ply"):
+        initial_points(capture, tmp_path / "text.ply")
+    (tmp_path / "bad.obj").write_text(SQUARE + "f 1 2 9\n")
+    with pytest.raises(ValueError, match=r"bad\.obj has no faces, or faces of vertices that do not exist"):
+        read_obj_mesh(tmp_path / "bad.obj")
+    (tmp_path / "nan.obj").write_text("v nan 0 0\nf 1 1 1\n")
+    with pytest.raises(ValueError, match=r"nan\.obj.*NaN"):
+        read_obj_mesh(tmp_path / "nan.obj")
+    with pytest.raises(ValueError, match="degenerate"):
+        sample_mesh(PointCloud(torch.zeros(3, 3), torch.zeros(3, 3)), torch.tensor([[0, 1, 2]]), 5)
+    with pytest.raises(ValueError, match="`count`"):
+        initial_points(capture, count=0)
+    with pytest.raises(ValueError, match="`half_side`"):
+        random_points(torch.zeros(3), 0.0, 5)
+
+
+def test_cameras_that_look_apart_need_points(tmp_path, capture_tools):
+    from gaussian_swaying.rendering.cameras.camera import look_at_camera
+
+    eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
+    outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
+    capture = read_capture(capture_tools.transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
+    with pytest.raises(ValueError, match="look at no common point"):
+        initial_points(capture)

@@ -1,0 +1,62 @@
+"""Reading the surface of a reference, and points on it."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.evaluation.reference import read_cloth, surface_points
+
+
+def test_points_are_even_by_area():
+    """Two triangles of areas 1 to 3: a quarter of the points lies in the smaller one; the same ones every time."""
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -3, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1]])
+    points = surface_points(vertices, faces, 4000)
+    share = float((points[:, 1] > 0).float().mean())
+    assert share == pytest.approx(0.25, abs=5 * math.sqrt(0.25 * 0.75 / 4000))
+    assert torch.equal(points, surface_points(vertices, faces, 4000))
+    assert not torch.equal(points, surface_points(vertices, faces, 4000, seed=1))
+
+
+def test_a_cloth_is_read(make_reference):
+    cloth = read_cloth(make_reference(side=2.0) / "cloth.npz")
+    assert cloth.positions.shape == (4, 17 * 9, 3)
+    assert cloth.positions.dtype == torch.float32
+    assert cloth.side == 2.0
+
+
+def test_squares_are_halved_and_the_side_may_be_in_the_settings(make_reference):
+    squares = np.array([[0, 9, 10, 1]])
+    cloth = read_cloth(make_reference(faces=squares, settings=json.dumps({"width": 1.0, "height": 2.5})) / "cloth.npz")
+    assert cloth.side == 2.5
+    assert cloth.faces.tolist() == [[0, 9, 10], [0, 10, 1]]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"positions": np.zeros((4, 5, 2))}, r"Expected `positions` of .*cloth\.npz of shape \(T, V, 3\)"),
+        ({"faces": np.zeros((4, 5), int)}, r"Expected `faces` of .*cloth\.npz of shape \(F, 3\)"),
+        ({"faces": np.array([[0, 1, 999]])}, r"indices from 0 to 152"),
+        ({"positions": np.full((4, 9, 3), np.nan), "faces": np.array([[0, 1, 2]])}, "to be finite"),
+        ({"side": -1.0}, "to be positive"),
+    ],
+)
+def test_a_bad_cloth(make_reference, arrays, message):
+    with pytest.raises(ValueError, match=message):
+        read_cloth(make_reference(**arrays) / "cloth.npz")
+
+
+def test_a_damaged_or_incomplete_cloth(tmp_path):
+    path = tmp_path / "cloth.npz"
+    with pytest.raises(ValueError, match=r"cloth\.npz cannot be read"):
+        read_cloth(path)
+    path.write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"cloth\.npz cannot be read"):
+        read_cloth(path)
+    np.savez(path, positions=np.zeros((2, 3, 3)))
+    with pytest.raises(ValueError, match="has no array `faces`"):
+        read_cloth(path)

@@ -1,0 +1,153 @@
+"""Spherical harmonics against associated Legendre polynomials, and their rotation against turned directions."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians import harmonics
+from gaussian_swaying.gaussians.harmonics import evaluate_sh, rotate_sh, sh_basis, sh_to_color
+
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
+
+
+def _directions(device, dtype, count=50):
+    return torch.nn.functional.normalize(torch.randn(count, 3, device=device, dtype=dtype), dim=-1)
+
+
+def _rotations(device, dtype, count=50):
+    q, r = torch.linalg.qr(torch.randn(count, 3, 3, dtype=torch.float64))
+    q = q * r.diagonal(dim1=-2, dim2=-1).sign()[:, None]
+    return (q * torch.linalg.det(q)[:, None, None]).to(device, dtype)
+
+
+def _legendre(degree, order, z):
+    """Associated Legendre polynomial with the Condon-Shortley phase, by its recurrence in the degree."""
+    value = torch.ones_like(z)
+    for k in range(1, order + 1):
+        value = -value * (2 * k - 1) * (1 - z * z).sqrt()
+    before = torch.zeros_like(z)
+    for k in range(order + 1, degree + 1):
+        before, value = value, ((2 * k - 1) * z * value - (k + order - 1) * before) / (k - order)
+    return value
+
+
+def _reference_basis(directions, degree):
+    """Textbook real harmonics from spherical angles; the phase is kept, as 3DGS does."""
+    x, y, z = directions.unbind(-1)
+    azimuth = torch.atan2(y, x)
+    columns = []
+    for band in range(degree + 1):
+        for order in range(-band, band + 1):
+            m = abs(order)
+            norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
+            trig = torch.sin(m * azimuth) if order < 0 else torch.cos(m * azimuth)
+            columns.append(norm * (math.sqrt(2) if m else 1) * _legendre(band, m, z) * trig)
+    return torch.stack(columns, dim=-1)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_basis_matches_legendre_polynomials(device, dtype, degree):
+    directions = _directions(device, dtype)
+    expected = _reference_basis(directions, degree)
+    torch.testing.assert_close(sh_basis(directions, degree), expected, rtol=0, atol=TOLERANCE[dtype])
+
+
+def test_signs_of_the_first_band():
+    """The convention of 3DGS files: -y, z, -x."""
+    basis = sh_basis(torch.eye(3), 1)[:, 1:]
+    torch.testing.assert_close(basis / 0.4886025, torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_evaluation(device, dtype, degree):
+    directions = _directions(device, dtype)
+    sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
+    expected = torch.einsum("nk,nkc->nc", _reference_basis(directions, degree), sh)
+    tolerance = 10 * TOLERANCE[dtype]
+    torch.testing.assert_close(evaluate_sh(sh, directions), expected, rtol=0, atol=tolerance)
+    torch.testing.assert_close(evaluate_sh(sh, 7 * directions), expected, rtol=0, atol=tolerance)
+    torch.testing.assert_close(sh_to_color(sh, directions), (expected + 0.5).clamp(min=0), rtol=0, atol=tolerance)
+    assert (sh_to_color(sh, directions) == 0).any()
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_the_basis_as_one_product(device, dtype, degree):
+    """What a GPU does is what the basis is, with its gradient."""
+    directions = _directions(device, dtype).requires_grad_()
+    found, known = harmonics._basis_by_product(directions, degree), sh_basis(directions, degree)
+    torch.testing.assert_close(found, known, rtol=0, atol=TOLERANCE[dtype])
+    weights = torch.randn_like(known)
+    gradients = [torch.autograd.grad((basis * weights).sum(), directions)[0] for basis in (found, known)]
+    # along a direction they may differ: the basis is asked about unit vectors only
+    across = [g - (g * directions).sum(-1, keepdim=True) * directions for g in gradients]
+    torch.testing.assert_close(across[0], across[1], rtol=0, atol=20 * TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_what_an_inference_kept_serves_gradients(degree, device, monkeypatch):
+    monkeypatch.setattr(harmonics, "_kept", {})
+    harmonics._sampling.cache_clear()
+    harmonics._coefficients.cache_clear()
+    sh = torch.randn(5, (degree + 1) ** 2, 3, device=device)
+    directions, turn = _directions(device, torch.float32, 5), torch.eye(3, device=device).repeat(5, 1, 1)
+    with torch.inference_mode():
+        harmonics._basis_by_product(directions, degree)
+        known = evaluate_sh(sh, directions), rotate_sh(sh, turn)
+    for given in (sh, directions, turn):
+        given.requires_grad_()
+    basis = harmonics._basis_by_product(directions, degree)
+    found = evaluate_sh(sh, directions), rotate_sh(sh, turn)
+    for a, b in zip(found, known, strict=True):
+        torch.testing.assert_close(a, b)
+    (found[0].sum() + found[1].sum() + basis.sum()).backward()
+    for given in (sh, directions, turn):
+        assert torch.isfinite(given.grad).all()
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_many_directions_of_one_gaussian(degree):
+    """The coefficients of one Gaussian seen from everywhere, and those of many seen from one side."""
+    sh, directions = torch.randn(4, (degree + 1) ** 2, 3), _directions("cpu", torch.float32, 6)
+    grid = evaluate_sh(sh[:, None], directions)
+    assert grid.shape == (4, 6, 3)
+    for i in range(4):
+        torch.testing.assert_close(evaluate_sh(sh[i], directions), grid[i])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rotated_coefficients_equal_turned_directions(device, dtype, degree):
+    directions, rotation = _directions(device, dtype), _rotations(device, dtype)
+    sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
+    turned = (rotation.mT @ directions[..., None]).squeeze(-1)
+    actual = evaluate_sh(rotate_sh(sh, rotation), directions)
+    torch.testing.assert_close(actual, evaluate_sh(sh, turned), rtol=0, atol=TOLERANCE[dtype])
+
+
+def test_rotation_keeps_length_and_broadcasts(device):
+    sh = torch.randn(4, 16, 3, device=device, dtype=torch.float64)
+    rotation = _rotations(device, torch.float64, 6)[:, None]
+    rotated = rotate_sh(sh, rotation)
+    assert rotated.shape == (6, 4, 16, 3)
+    torch.testing.assert_close(rotated.norm(dim=-2), sh.norm(dim=-2).expand(6, 4, 3))
+    torch.testing.assert_close(rotate_sh(rotated, rotation.mT), sh.expand(6, 4, 16, 3))
+
+
+def test_gradients(device):
+    sh = torch.randn(2, 16, 3, device=device, dtype=torch.float64, requires_grad=True)
+    rotation = _rotations(device, torch.float64, 2).requires_grad_()
+    assert torch.autograd.gradcheck(rotate_sh, (sh, rotation), fast_mode=True)
+    assert torch.autograd.gradcheck(evaluate_sh, (sh, _directions(device, torch.float64, 2)), fast_mode=True)
+
+
+def test_wrong_arguments():
+    with pytest.raises(ValueError, match="Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
+        evaluate_sh(torch.zeros(2, 5, 3), torch.ones(2, 3))
+    with pytest.raises(ValueError, match="Expected `sh` of shape"):
+        sh_to_color(torch.zeros(2, 4), torch.ones(2, 3))
+    with pytest.raises(ValueError, match="Expected `directions` of shape"):
+        evaluate_sh(torch.zeros(2, 4, 3), torch.ones(2, 2))
+    with pytest.raises(ValueError, match="Expected `degree` to be 0, 1, 2 or 3, but got 4"):
+        sh_basis(torch.ones(2, 3), 4)
+    with pytest.raises(ValueError, match="Expected `rotation` of shape"):
+        rotate_sh(torch.zeros(2, 4, 3), torch.ones(2, 3))

@@ -1,0 +1,255 @@
+"""3x3 helpers against torch.linalg and the identities that define them."""
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.linalg import (
+    cofactor,
+    determinant,
+    from_principal,
+    polar_rotation,
+    singular_values,
+    spectrum,
+    svd3,
+    symmetric_eigen,
+    symmetric_eigenvalues,
+)
+
+
+def _matrices(device, dtype, spread=0.3, count=200):
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
+    return (torch.eye(3, dtype=torch.float64) + spread * noise).to(device, dtype)
+
+
+def test_cofactor_and_determinant(device, dtype):
+    F = _matrices(device, dtype)
+    F = F[torch.linalg.det(F).abs() > 0.05]
+    tol = 1e3 * torch.finfo(dtype).eps
+    expected = torch.linalg.det(F)[:, None, None] * torch.linalg.inv(F).mT
+    torch.testing.assert_close(cofactor(F), expected, rtol=tol, atol=tol)
+    torch.testing.assert_close(determinant(F), torch.linalg.det(F), rtol=tol, atol=tol)
+
+
+def test_polar_rotation_matches_svd(device, dtype):
+    """Condition numbers up to 50; inverted matrices give the nearest rotation, not a reflection."""
+    F = _matrices(device, dtype, spread=0.4)
+    F = F[torch.linalg.cond(F.double()) < 50]
+    u, s, vh = torch.linalg.svd(F.double())
+    R = polar_rotation(F)
+    # forward error of a polar factor: eps times the condition number
+    tol = 100 * torch.finfo(dtype).eps
+    proper = torch.linalg.det(F) > 0
+    torch.testing.assert_close(R[proper], (u @ vh).to(dtype)[proper], rtol=0, atol=tol)
+    eye = torch.eye(3, dtype=dtype, device=device).expand_as(R)
+    torch.testing.assert_close(R.mT @ R, eye, rtol=0, atol=tol)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(len(R), dtype=dtype, device=device), rtol=0, atol=tol)
+    # the nearest rotation has tr(R^T F) = s1 + s2 - s3
+    inverted = ~proper
+    assert int(inverted.sum()) > 5, "the test should meet inverted matrices"
+    best = s[inverted] @ torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64, device=device)
+    found = (R * F).double()[inverted].sum((-1, -2))
+    torch.testing.assert_close(found, best, rtol=0, atol=5e-3)
+    clear = s[inverted][:, 1] > 1.5 * s[inverted][:, 2]
+    torch.testing.assert_close(found[clear], best[clear], rtol=0, atol=1e-4 if dtype == torch.float32 else 1e-5)
+
+
+def test_polar_rotation_is_objective(device):
+    """R(Q F) = Q R(F), and R(Q) = Q."""
+    F = _matrices(device, torch.float64, spread=0.2)
+    Q = torch.linalg.qr(_matrices(device, torch.float64, spread=1.0))[0]
+    torch.testing.assert_close(polar_rotation(Q @ F, 8), Q @ polar_rotation(F, 8), rtol=0, atol=1e-12)
+    torch.testing.assert_close(polar_rotation(Q, 8), Q, rtol=0, atol=1e-12)
+
+
+def test_polar_gradient_at_identity():
+    """An SVD gives NaN here; the derivative of R at I is the skew part of the perturbation."""
+    F = torch.eye(3, dtype=torch.float64).requires_grad_()
+    (gradient,) = torch.autograd.grad(polar_rotation(F)[0, 1], F)
+    expected = torch.zeros(3, 3, dtype=torch.float64)
+    expected[0, 1], expected[1, 0] = 0.5, -0.5
+    torch.testing.assert_close(gradient, expected)
+    G = _matrices("cpu", torch.float64, spread=0.2, count=3)
+    G = torch.cat([G, G @ torch.diag(torch.tensor([1.0, 1.1, -0.5], dtype=torch.float64))]).requires_grad_()
+    assert torch.autograd.gradcheck(polar_rotation, G)
+
+
+@pytest.mark.parametrize("matrix", [torch.zeros(3, 3), torch.diag(torch.tensor([1.0, 1.0, 0.0])), -torch.eye(3)])
+def test_polar_rotation_of_degenerate_matrices_is_finite(matrix, dtype):
+    F = matrix.to(dtype).requires_grad_()
+    R = polar_rotation(F)
+    assert bool(torch.isfinite(R).all())
+    (gradient,) = torch.autograd.grad(R.sum(), F)
+    assert bool(torch.isfinite(gradient).all())
+
+
+def test_eigenvalues_and_singular_values():
+    F = _matrices("cpu", torch.float64, spread=0.5)
+    expected = torch.linalg.svdvals(F)
+    torch.testing.assert_close(singular_values(F), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(symmetric_eigenvalues(F.mT @ F), expected.square(), rtol=0, atol=1e-7)
+    torch.testing.assert_close(singular_values(torch.eye(3)), torch.ones(3, dtype=torch.float64))
+
+
+def _graded(device, dtype, decades, count=2000):
+    """Random matrices with stretches between 1 and 10^-decades, many of them repeated or nearly so, half inverted."""
+    generator = torch.Generator().manual_seed(2)
+    u, v = (torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))[0] for _ in range(2))
+    a = 10 ** (-decades * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    a[::3, 1] = a[::3, 0]
+    a[::4, 2] = a[::4, 1] * (1 + 1e-5 * torch.rand(len(a[::4]), generator=generator, dtype=torch.float64))
+    F = u @ a.diag_embed() @ v.mT
+    F[1::2] *= -1
+    return F.to(device, dtype)
+
+
+def _eye(dtype, device):
+    return torch.eye(3, dtype=dtype, device=device)
+
+
+# a Jacobi method is backward stable; some 40 rotations leave a few tens of eps
+JACOBI = 30
+
+
+@pytest.mark.parametrize("decades", [0, 1, 3, 6])
+def test_svd3(device, dtype, decades):
+    """Two rotations, sorted stretches, a sign for inverted matrices: against torch in float64."""
+    F = _graded(device, dtype, decades)
+    u, a, v = svd3(F)
+    tol = JACOBI * torch.finfo(dtype).eps
+    expected = torch.linalg.svdvals(F.double())
+    largest = expected[:, :1, None]
+    for rotation in (u, v):
+        torch.testing.assert_close(rotation.mT @ rotation, _eye(dtype, device).expand_as(u), rtol=0, atol=tol)
+        assert float((torch.linalg.det(rotation) - 1).abs().max()) < tol
+    assert float(((u @ a.diag_embed() @ v.mT - F).double() / largest).abs().max()) < tol
+    error = (a.double().abs() - expected) / expected[:, :1]
+    assert float(error.abs().max()) < 3 * tol
+    inverted = torch.linalg.det(F.double()) < 0
+    assert 100 < int(inverted.sum()) < 1900
+    sure = expected[:, 2] > 10 * tol * expected[:, 0]
+    assert bool(((a[:, 2] < 0) == inverted)[sure].all())
+    assert bool((a[:, :2] > -tol).all())
+    torch.testing.assert_close(spectrum(F).rotation, u @ v.mT, rtol=0, atol=tol)
+
+
+def test_spectrum_gives_the_polar_rotation(device):
+    F = _matrices(device, torch.float64)
+    F = F[(torch.linalg.cond(F) < 50) & (torch.linalg.det(F) > 0)]
+    # both are limited by eps times the condition number
+    torch.testing.assert_close(spectrum(F).rotation, polar_rotation(F), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["zero", "rank one", "rank two", "identity", "reflection", "tiny"])
+def test_spectrum_of_degenerate_matrices(device, dtype, name):
+    eye = _eye(dtype, device)
+    matrices = {"zero": 0 * eye, "rank one": eye[0].outer(eye[2] + eye[1]), "rank two": eye - eye[0].outer(eye[0])}
+    F = (matrices | {"identity": eye, "reflection": -eye, "tiny": 1e-6 * (eye + 0.1)})[name]
+    u, a, v = svd3(F)
+    tol = JACOBI * torch.finfo(dtype).eps
+    for rotation in (u, v, spectrum(F).rotation):
+        torch.testing.assert_close(rotation.mT @ rotation, eye, rtol=0, atol=tol)
+        assert abs(float(torch.linalg.det(rotation)) - 1) < tol
+    torch.testing.assert_close(u @ a.diag() @ v.mT, F, rtol=tol, atol=tol * float(F.abs().max()))
+    if name in ("identity", "tiny"):
+        torch.testing.assert_close(spectrum(F).rotation, eye, rtol=0, atol=tol)
+
+
+@pytest.mark.parametrize("decades", [0, 2, 6])
+def test_symmetric_eigen(device, dtype, decades):
+    """Indefinite matrices, with repeated and with zero eigenvalues too."""
+    q = torch.linalg.qr(_graded(device, torch.float64, 0))[0]
+    values = torch.linalg.svdvals(_graded(device, torch.float64, decades)) * torch.tensor([1.0, -1, 1], device=device)
+    values[::5, 2] = 0
+    S = (q @ values.diag_embed() @ q.mT).to(dtype)
+    found, axes = symmetric_eigen(S)
+    size = S.double().abs().amax((-1, -2), keepdim=True)
+    tol = JACOBI * torch.finfo(dtype).eps
+    torch.testing.assert_close(axes.mT @ axes, _eye(dtype, device).expand_as(axes), rtol=0, atol=tol)
+    assert float((torch.linalg.det(axes) - 1).abs().max()) < tol
+    assert float(((axes @ found.diag_embed() @ axes.mT - S).double() / size).abs().max()) < tol
+    expected = torch.linalg.eigvalsh(S.double()).flip(-1)
+    assert float(((found.double() - expected) / size[..., 0]).abs().max()) < tol
+    assert bool((found[:, :-1] >= found[:, 1:]).all())
+    F = _graded(device, dtype, decades, count=20000)
+    S = F.mT @ F
+    found, axes = symmetric_eigen(S)  # in float32 the squares of what the rotations leave underflow
+    size = S.abs().amax((-1, -2), keepdim=True)
+    assert float(((axes @ found.diag_embed() @ axes.mT - S) / size).abs().max()) < tol
+
+
+def test_symmetric_eigen_of_zero_and_its_gradient(dtype):
+    values, axes = symmetric_eigen(torch.zeros(3, 3, dtype=dtype))
+    assert bool((values == 0).all())
+    torch.testing.assert_close(axes, torch.eye(3, dtype=dtype))
+    G = torch.tensor([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]], dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: symmetric_eigen(0.5 * (x + x.mT))[0], G)
+
+
+def test_shapes():
+    for shape in [(), (0,), (4,), (2, 0), (2, 3)]:
+        F = (torch.eye(3) + 0.1 * torch.rand(*shape, 3, 3)).requires_grad_()
+        parts = spectrum(F)
+        assert parts.stretch.shape == (*shape, 3)
+        result = from_principal(parts, lambda a: a.square())
+        assert result.shape == parts.rotation.shape == F.shape
+        result.sum().backward()
+        assert symmetric_eigen(F.detach().mT @ F.detach())[1].shape == F.shape
+
+
+def _log_sum(a):
+    """A function that couples the stretches."""
+    return a.log() + 0.3 * a.log().sum(-1, keepdim=True) + 0.1 * a.square()
+
+
+REPEATED = {
+    "identity": [1.0, 1, 1],
+    "uniform": [0.7, 0.7, 0.7],
+    "pair": [1.2, 1.2, 0.8],
+    "low pair": [1.2, 0.8, 0.8],
+    "near": [1.0, 1 + 1e-7, 0.9],
+    "distinct": [1.3, 1.0, 0.6],
+}
+
+
+@pytest.mark.parametrize("name", list(REPEATED))
+@pytest.mark.parametrize("rotated", [False, True])
+def test_isotropic_functions_have_exact_gradients(name, rotated):
+    """Where an eigenvector decomposition divides by the gap. Round-off of the differences is 1e-16 / 1e-6."""
+    q = torch.linalg.qr(_matrices("cpu", torch.float64, spread=1.0, count=2))[0]
+    q = q * torch.linalg.det(q)[:, None, None]
+    F = (q[0] @ torch.tensor(REPEATED[name], dtype=torch.float64).diag() @ q[1].mT).requires_grad_()
+    p = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x, p: from_principal(spectrum(x), lambda a: p * _log_sum(a), rotated=rotated), (F, p), atol=1e-7
+    )
+    assert torch.autograd.gradcheck(lambda x: (spectrum(x).stretch.log().square().sum(), spectrum(x).rotation), F)
+
+
+def test_isotropic_functions_of_inverted_matrices():
+    """Exact there too, away from the state in which the least stretch is minus the middle one."""
+    F = torch.diag(torch.tensor([1.2, 0.9, -0.5], dtype=torch.float64))
+    F = (F + 0.02 * _matrices("cpu", torch.float64, count=3)).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x: (from_principal(spectrum(x), lambda a: a.pow(3), rotated=True), spectrum(x).rotation), F
+    )
+    jump = torch.diag(torch.tensor([1.0, 0.5, -0.5])).requires_grad_()
+    (gradient,) = torch.autograd.grad(from_principal(spectrum(jump), lambda a: a - 1, rotated=True).sum(), jump)
+    assert bool(torch.isfinite(gradient).all())
+
+
+def test_isotropic_functions_that_are_known(device, dtype):
+    """The square is S S, the identity S; and the value does not depend on whether a gradient is wanted."""
+    F = _matrices(device, dtype)
+    tol = JACOBI * torch.finfo(dtype).eps * float(F.abs().max()) ** 2
+    parts = spectrum(F)
+    torch.testing.assert_close(from_principal(parts, lambda a: a, rotated=True), F, rtol=0, atol=tol)
+    torch.testing.assert_close(from_principal(parts, lambda a: a.square()), F.mT @ F, rtol=0, atol=tol)
+    assert parts.spin is None
+    with_gradient = spectrum(F.clone().requires_grad_())
+    assert with_gradient.spin is not None
+    for rotated in (False, True):
+        values = [from_principal(p, lambda a: a.exp(), rotated=rotated) for p in (parts, with_gradient)]
+        torch.testing.assert_close(*values, rtol=0, atol=tol)
+    with torch.no_grad():
+        assert spectrum(F.clone().requires_grad_()).spin is None

@@ -1,0 +1,50 @@
+"""The neighbour search against all distances."""
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
+
+
+def _uneven(count):
+    """Density that varies by orders of magnitude, and a point far away."""
+    points = torch.randn(count, 3, dtype=torch.float64) * torch.logspace(-4, 1, count, dtype=torch.float64)[:, None]
+    points[0] = 1e5
+    return points
+
+
+def _distances(a, b):
+    return torch.linalg.vector_norm(a[:, None] - b[None], dim=-1)
+
+
+def test_among_themselves():
+    points = _uneven(2000)
+    distance, index = nearest_neighbours(points, 12)
+    everything = _distances(points, points).fill_diagonal_(torch.inf)
+    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :12])
+    torch.testing.assert_close(everything.gather(-1, index), distance)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_from_other_places(count):
+    """Inside, on, and far outside the points."""
+    points = _uneven(1500)
+    queries = torch.cat(
+        [torch.randn(300, 3, dtype=torch.float64), points[10:20], torch.tensor([[-3e6, 0, 1.0]]).double()]
+    )
+    distance, index = nearest_neighbours(points, count, queries)
+    everything = _distances(queries, points)
+    torch.testing.assert_close(distance, everything.sort(dim=-1).values[:, :count])
+    torch.testing.assert_close(everything.gather(-1, index), distance)
+
+
+def test_far_from_the_origin_and_degenerate():
+    """Distances by matrix products would be off by metres at float32 coordinates of 1e4."""
+    points = (torch.rand(200, 3) + 1e4).float()
+    queries = points[::3] + torch.tensor([0.001, 0.0, 0.0])
+    _, index = nearest_neighbours(points.double(), 1, queries)
+    assert torch.equal(index[:, 0], _distances(queries.double(), points.double()).argmin(1))
+    assert nearest_neighbours(points, 1, queries[:0])[1].shape == (0, 1)
+    same = torch.zeros(4, 3)
+    assert nearest_neighbours(same, 1, same)[0].abs().max() == 0
+    assert nearest_neighbours(same[:1], 1, torch.ones(2, 3))[1].tolist() == [[0], [0]]

@@ -1,0 +1,109 @@
+"""The rooms of the package: imports run one way, and there is no circle."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2] / "gaussian_swaying"
+FLOORS = (
+    "geometry",
+    "gaussians metrics mpm runs",
+    "aero rendering scenes",
+    "captures",
+    "simulation training",
+    "evaluation validation",
+    "cli",
+)
+"""From the ground up; rooms of one floor do not know each other."""
+
+FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms.split()}
+PRIVATE = -1  # _checks and the like lie below all rooms
+FILES = {
+    ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(ROOT.rglob("*.py"))
+}
+
+
+def _imports(module):
+    """Modules of the package that a module imports anywhere in its file, those for type checking alone included."""
+    found = set()
+    for node in ast.walk(ast.parse(FILES[module].read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == ROOT.name:
+            found |= {name if (name := f"{node.module}.{a.name}") in FILES else node.module for a in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names if a.name.split(".")[0] == ROOT.name}
+        assert not (isinstance(node, ast.ImportFrom) and node.level), f"{module}: relative import"
+    return found - {module, ROOT.name}
+
+
+def _at_import(module):
+    """Those that are imported as soon as the module is."""
+    return {
+        name if (name := f"{node.module}.{a.name}") in FILES else node.module
+        for node in ast.parse(FILES[module].read_text()).body
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{ROOT.name}.")
+        for a in node.names
+    }
+
+
+def _floor(module):
+    parts = module.split(".")
+    return PRIVATE if len(parts) == 2 and parts[1].startswith("_") else FLOOR[parts[1]]
+
+
+def test_every_room_has_a_floor():
+    assert {path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()} == set(FLOOR)
+
+
+@pytest.mark.parametrize("room", FLOOR)
+def test_imports_run_downwards(room):
+    upwards = [
+        f"{module} imports {other}"
+        for module in FILES
+        if module.split(".")[1:2] == [room]
+        for other in _imports(module)
+        if other.split(".")[1:2] != [room] and _floor(other) >= FLOOR[room]
+    ]
+    assert upwards == []
+
+
+def test_what_lies_below_the_rooms_knows_none():
+    private = [module for module in FILES if module != ROOT.name and _floor(module) == PRIVATE]
+    assert private
+    assert [(m, other) for m in private for other in _imports(m) if _floor(other) != PRIVATE] == []
+
+
+def test_there_is_no_circle():
+    """Files that import each other, also within a room, cannot be read one after the other."""
+    graph = {module: _at_import(module) for module in FILES}
+    done: set[str] = set()
+
+    def visit(module, path):
+        assert module not in path, " -> ".join([*path[path.index(module) :], module])
+        if module not in done:
+            for other in sorted(graph[module]):
+                visit(other, [*path, module])
+            done.add(module)
+
+    for module in FILES:
+        visit(module, [])
+
+
+def test_metrics_stand_alone():
+    """Another project can copy the folder."""
+    assert {other for module in FILES if ".metrics" in module for other in _imports(module)} <= {f"{ROOT.name}._checks"}
+
+
+def test_no_file_is_long():
+    """Some 500 lines, unless it is one concept."""
+    one_concept = {
+        "mpm.solver",
+        "mpm.fused",
+        "mpm.transfer_triton",
+        "mpm.boundary",
+        "simulation.pipeline",
+    }  # being split
+    one_concept |= {"simulation.physgaussian.convert", "training.module", "validation.granular"}
+    long = {m.removeprefix(f"{ROOT.name}.") for m, path in FILES.items() if len(path.read_text().splitlines()) > 520}
+    assert long <= one_concept

@@ -1,0 +1,80 @@
+"""The generated flag against the sheet it stands for."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.scenes.procedural import FlagScene
+
+
+def test_normals_are_perpendicular_to_the_rippled_sheet():
+    """The sheet is y = a sin(k x): its normal is (-a k cos(k x), 1, 0), and each centre lies on it."""
+    cloud = FlagScene(spacing=0.05, ripple=0.05).generate()
+    k = 2 * math.pi * 1.5 / 1.2
+    x, y, _ = cloud.means.double().unbind(-1)
+    torch.testing.assert_close(y, 0.05 * torch.sin(k * x), rtol=0, atol=1e-7)
+    expected = torch.stack([-0.05 * k * torch.cos(k * x), torch.ones_like(x), torch.zeros_like(x)], -1)
+    expected = expected / expected.norm(dim=-1, keepdim=True)
+    normals = GaussianSurfaceModel.from_cloud(cloud).normals().double()
+    assert float(expected[:, 0].abs().max()) > 0.3  # the ripple is steep enough to tell
+    torch.testing.assert_close((normals * expected).sum(-1).abs(), torch.ones_like(x), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("spacing", [0.1, 0.05])
+def test_areas_add_up_to_the_flag(spacing):
+    cloud = FlagScene(width=1.2, height=0.8, spacing=spacing, ripple=0.0).generate()
+    assert len(cloud) == round(1.2 / spacing) * round(0.8 / spacing)
+    areas = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).areas("coverage")
+    assert float(areas.sum()) == pytest.approx(1.2 * 0.8, rel=0.02)
+
+
+def test_size_and_place():
+    cloud = FlagScene(width=0.6, height=0.4, spacing=0.1).generate()
+    low, high = cloud.means.amin(0), cloud.means.amax(0)
+    torch.testing.assert_close(low[[0, 2]], torch.tensor([0.05, 0.05]))
+    torch.testing.assert_close(high[[0, 2]], torch.tensor([0.55, 0.35]))
+    assert float(cloud.means[:, 1].abs().max()) <= 0.003
+
+
+def test_the_same_arguments_give_the_same_splat():
+    one, two = (FlagScene(spacing=0.1).generate() for _ in range(2))
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(one, name), getattr(two, name)), name
+
+
+def test_yaw_turns_the_flag_about_its_pole():
+    """Centres and normals turn by the same angle, counter-clockwise from above; the pole side stays."""
+    plain, turned = (FlagScene(spacing=0.1, ripple=0.03, yaw=yaw).generate() for yaw in (0.0, -35.0))
+    c, s = math.cos(math.radians(35)), math.sin(math.radians(35))
+    turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(turned.means, plain.means @ turn.T)
+    before, after = (GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).normals() for cloud in (plain, turned))
+    torch.testing.assert_close(after, before @ turn.T, atol=1e-6, rtol=0)
+
+
+def test_patterns():
+    stripes, white = (FlagScene(spacing=0.1, pattern=name).generate() for name in ("stripes", "white"))
+    assert len(stripes.sh.unique(dim=0)) == 4  # three bands and the disc
+    assert len(white.sh.unique(dim=0)) == 1
+    assert white.sh.shape == (96, 1, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("width", 0.0),
+        ("height", -1.0),
+        ("spacing", 0.0),
+        ("spacing", float("nan")),
+        ("overlap", 0.0),
+        ("ripple", -0.1),
+        ("pattern", "dots"),
+        ("yaw", float("inf")),
+        ("spacing", 0.9),
+    ],
+)
+def test_bad_arguments(name, value):
+    with pytest.raises(ValueError, match=f"generator.{name}"):
+        FlagScene(**{name: value})

@@ -1,0 +1,210 @@
+"""The generated scenes: what they hold, that they repeat, and what they refuse."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.scenes import (
+    AlocasiaScene,
+    FicusScene,
+    FlagOnStandScene,
+    LeavesScene,
+    SandScene,
+    TelephoneScene,
+    VaseScene,
+)
+from gaussian_swaying.scenes.patches import baked
+from gaussian_swaying.scenes.plant_parts import leaf_area
+from gaussian_swaying.scenes.stage import SKY, cast, floor
+
+SCENES = [AlocasiaScene, FicusScene, LeavesScene, SandScene, TelephoneScene, VaseScene]
+FIELDS = ("means", "quats", "scales", "opacities", "sh", "normals")
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_scene_is_a_usable_splat(scene):
+    """Of the promised number of Gaussians, finite, opaque, in colours, with unit normals along the smallest axes."""
+    cloud = scene().generate()
+    assert 20_000 <= len(cloud) <= 200_000
+    assert all(bool(torch.isfinite(getattr(cloud, name)).all()) for name in FIELDS)
+    torch.testing.assert_close(cloud.normals.norm(dim=-1), torch.ones(len(cloud)), atol=1e-5, rtol=0)
+    own = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).normals()
+    assert float((own * cloud.normals).sum(-1).min()) > 0.999
+    assert float(cloud.opacities.sigmoid().min()) > 0.9
+    colours = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).colors(torch.tensor([0.0, 1.0, 0.0]))
+    assert float(colours.min()) >= -1e-6
+    assert float(colours.max()) <= 1 + 1e-6
+    assert float(colours.std(0).min()) > 0.02
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_same_arguments_give_the_same_splat(scene):
+    one, two = (scene(spacing=0.05).generate() for _ in range(2))
+    for name in FIELDS:
+        assert torch.equal(getattr(one, name), getattr(two, name)), name
+
+
+@pytest.mark.parametrize("scene", [AlocasiaScene, FicusScene, LeavesScene, SandScene, VaseScene])
+def test_the_seed_changes_the_splat(scene):
+    one, two = (scene(spacing=0.05, seed=seed).generate() for seed in (0, 1))
+    assert len(one) != len(two) or not torch.equal(one.means, two.means)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_half_the_spacing_gives_up_to_eight_times_the_gaussians(scene):
+    """Four times on surfaces, eight inside; less where a leaf, a tube or a wall keeps its least number."""
+    coarse, fine = (len(scene(spacing=spacing).generate()) for spacing in (0.02, 0.01))
+    assert 1.3 < fine / coarse < 8.5
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_even_a_coarse_scene_keeps_its_size(scene):
+    """With the coarsest spacing that is allowed there are still Gaussians in every part."""
+    low, high = (getattr(scene().generate().means, side)(0) for side in ("amin", "amax"))
+    coarse = scene(spacing=0.2).generate().means
+    assert float((coarse.amin(0) - low).abs().max()) < 0.25
+    assert float((coarse.amax(0) - high).abs().max()) < 0.25
+
+
+def test_the_leaves_cover_the_area_of_their_outlines():
+    """Sizes are drawn from 0.75 to 1.15 and blades are bent by some percent, so within a tenth of the mean."""
+    many, few = (LeavesScene(leaves=n, spacing=0.02).generate() for n in (300, 100))
+    areas = [
+        float(GaussianSurfaceModel.from_cloud(cloud, requires_grad=False).areas("paper").sum()) for cloud in (many, few)
+    ]
+    # pi s1 s2 of a Gaussian with standard deviations of 0.45 times the edges
+    mean_square = (1.15**3 - 0.75**3) / (3 * 0.4)
+    expected = 200 * leaf_area(0.17, 0.075, (0.6, 0.9)) * mean_square * math.pi * 0.45**2
+    assert areas[0] - areas[1] == pytest.approx(expected, rel=0.1)
+
+
+def test_the_sand_is_as_steep_as_allowed_and_filled():
+    """No slope above `slope`, and one Gaussian inside per cube of the spacing."""
+    scene = SandScene(spacing=0.02)
+    cloud = scene.generate()
+    skin = (cloud.means[:, 2] > 0) & (cloud.scales.amax(-1).exp() > 0.005)
+    slope = cloud.normals[skin, 2].acos().rad2deg()
+    assert float(slope.max()) <= 28.01
+    assert float(slope.max()) > 24
+    x = torch.arange(-1.2, 1.2, 0.01, dtype=torch.float64)
+    y = torch.arange(-1.2, 1.5, 0.01, dtype=torch.float64)
+    height = scene.height(*torch.meshgrid(x, y, indexing="ij"))
+    hollow = SandScene(spacing=0.02, interior=False).generate()
+    inside = len(cloud) - len(hollow)
+    # the skin stands for the last layer: what is left below it is the height less 0.9 spacings, on average
+    below = (height - 0.9 * 0.02).clamp_min(0).sum() * 1e-4
+    assert inside * 0.02**3 == pytest.approx(float(below), rel=0.05)
+
+
+def test_the_wind_reaches_three_layers_of_sand_that_share_its_surface():
+    """So that there are grains to take where some were taken; what lies deeper owns almost none of the area."""
+    scene = SandScene(spacing=0.02)
+    cloud = scene.generate()
+    bear = cloud.select(cloud.means[:, 2] > 0)
+    speck = bear.scales.amax(-1).exp() < 0.003
+    areas = GaussianSurfaceModel.from_cloud(bear, requires_grad=False).areas("paper").double()
+    assert float(areas[speck].sum()) < 0.01 * float(areas.sum())
+    skin = SandScene(spacing=0.02, interior=False).generate()
+    skin = skin.select(skin.means[:, 2] > 0)
+    # each of the skin stands for a third of a square of the spacing seen from above; pi 0.55^2 = 0.95 of its area
+    own = GaussianSurfaceModel.from_cloud(skin, requires_grad=False).areas("paper").double()
+    surface = 0.02**2 / skin.normals[:, 2].double() * math.pi * 0.55**2
+    torch.testing.assert_close(own, surface / 3, rtol=1e-4, atol=0)
+    # the layers below are level, and missing where the bear is thin
+    assert 0.65 < float(areas.sum() / surface.sum()) < 1.0
+    depth = scene.height(*bear.means[~speck, :2].double().T) - bear.means[~speck, 2].double()
+    assert float(depth.max()) < 3.6 * 0.02  # a grain's place in its layer is half a spacing off
+
+
+def test_the_handset_hangs_on_a_coil():
+    scene = TelephoneScene()
+    cord = scene.cord()
+    assert float(cord.center[0, 2]) > -0.02
+    low = float(cord.center[:, 2].min())
+    assert -0.40 < low < -0.34
+    # wound 16 times with a radius of 22 mm, but for its ends, the wire is far longer than it hangs low
+    length = float(cord.area.sum()) / (2 * math.pi * 0.006)
+    assert length > 0.75 * 16 * 2 * math.pi * 0.022
+    handset = torch.cat([part.center for part in scene.handset(0.008)])
+    assert float(handset[:, 2].max()) > low  # the cord ends in its upper cup
+    assert -0.85 < float(handset[:, 2].min()) < -0.75
+    assert float(handset[:, 1].max()) < 0.09  # before the wall
+
+
+@pytest.mark.parametrize("stand", ["pole", "posts", "rod"])
+def test_a_stand_lies_outside_the_box_of_its_flag(stand):
+    """So a region can pick the flag; each corner or edge that is held has something next to it that holds it."""
+    sizes = {"width": 1.0, "height": 0.6, "spacing": 0.02}
+    cloud = FlagOnStandScene(**sizes, stand=stand).generate()
+    flag = FlagOnStandScene(**sizes, stand="none").generate()
+    assert torch.equal(cloud.means[: len(flag)], flag.means)
+    rest = cloud.means[len(flag) :]
+    box = (rest >= torch.tensor([0.0, -0.005, 0.0])) & (rest <= torch.tensor([1.0, 0.005, 0.6]))
+    assert not bool(box.all(-1).any())
+    held = {
+        "pole": [(0.0, 0.0), (0.0, 0.3), (0.0, 0.6)],
+        "posts": [(0.0, 0.6), (1.0, 0.6), (1.0, 0.0)],
+        "rod": [(0.0, 0.6), (0.5, 0.6), (1.0, 0.6)],
+    }[stand]
+    for x, z in held:
+        assert float((rest - torch.tensor([x, 0.0, z])).norm(dim=-1).min()) < 0.04
+    free = torch.tensor([1.0, 0.0, 0.3] if stand == "pole" else [0.0, 0.0, 0.0])
+    assert float((rest - free).norm(dim=-1).min()) > 0.05
+    turned = FlagOnStandScene(**sizes, stand=stand, yaw=90.0).generate().means
+    torch.testing.assert_close(turned[:, 1], cloud.means[:, 0], atol=1e-5, rtol=0)
+    with pytest.raises(ValueError, match=r"generator\.stand"):
+        FlagOnStandScene(stand="hand")
+
+
+def test_a_floor_runs_into_the_sky_and_bears_a_shadow():
+    """In the colours as they are drawn, light included, so no rim of the floor is seen."""
+    ground = floor(0.05, (0.5, 0.4, 0.3), [(0.5, 0.0, 0.1, 0.6)], fade=(1.0, 3.0))
+    r = ground.center.norm(dim=-1)
+    shown = baked(ground, 0.45, two_sided=True)
+    assert float((shown[r > 3.0] - torch.tensor(SKY, dtype=torch.float64)).abs().max()) < 1e-9
+    assert float(r.max()) > 12
+    spot = (ground.center - torch.tensor([0.5, 0.0, 0.0]).double()).norm(dim=-1)
+    dark, light = shown[spot < 0.04].mean(), shown[(spot > 0.3) & (r < 0.9)].mean()
+    assert float(dark / light) == pytest.approx(0.4, abs=0.08)
+    assert ground.normal[:, 2].min() > 0.999
+    # a light from the left, in front and above throws the shadow to the right and back
+    x, y, _, _ = cast((0.0, 0.0, 1.0), 0.3, 0.5)
+    assert x == pytest.approx(0.4 / 0.6)
+    assert y == pytest.approx(0.7 / 0.6)
+
+
+def test_ups_are_up():
+    """Pots stand on z = 0 and the plants grow above them; the table lies at z = 0 and the beach a little lower."""
+    for scene in (FicusScene(spacing=0.05), AlocasiaScene(spacing=0.05)):
+        z = scene.generate().means[:, 2]
+        assert float(z.min()) > -1e-6
+        assert float(z.max()) > 0.9
+    vase = VaseScene(spacing=0.02).generate()
+    assert float(vase.means[:, 2].max()) > 0.55
+    assert float(SandScene(spacing=0.05).generate().means[:, 2].min()) == pytest.approx(-0.08, abs=1e-6)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), 0.3])
+def test_a_bad_spacing_is_refused(scene, value):
+    with pytest.raises(ValueError, match=r"generator\.spacing"):
+        scene(spacing=value)
+
+
+@pytest.mark.parametrize(
+    ("scene", "name", "value"),
+    [
+        (FicusScene, "leaves", 0),
+        (LeavesScene, "leaves", 2),
+        (AlocasiaScene, "leaves", -1),
+        (VaseScene, "flowers", 0),
+        (TelephoneScene, "turns", 0),
+        (SandScene, "slope", 0.0),
+        (SandScene, "slope", 80.0),
+    ],
+)
+def test_bad_arguments_are_refused(scene, name, value):
+    with pytest.raises(ValueError, match=rf"generator\.{name}"):
+        scene(**{name: value})

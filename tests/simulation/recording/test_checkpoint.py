@@ -1,0 +1,292 @@
+"""A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it."""
+
+import pickle
+import random
+import shutil
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.runs.seal import check_seal, seal
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
+from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.simulation.recording.recorder import Recorder
+
+CONFIG = "material:\n  E: 3000.0\nwind:\n  flow:\n  - 6.0\n  - 1.5\n  - 0.0\n"
+
+
+class Fuse:
+    """Executes code when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.fixture(params=["total", "updated"])
+def formulation(request):
+    return request.param
+
+
+@pytest.fixture
+def run(make_pipeline, tmp_path, formulation):
+    """A pipeline, the folder of its run of two frames, and how to go on from it to a third."""
+    pipeline, folder = make_pipeline(formulation=formulation), tmp_path / "run"
+    recorder = Recorder(video=False)
+    pipeline.run(recorder, folder, 2, CONFIG, progress=False)
+
+    def resume(frames=3):
+        return pipeline.run(recorder, folder, frames, CONFIG, resume=True, progress=False)
+
+    return folder, resume
+
+
+def _contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _refused(resume, folder, case):
+    """The sentence of a refusal; the folder is as it was before."""
+    before = _contents(folder)
+    try:
+        resume()
+    except ValueError as error:
+        assert _contents(folder) == before, case
+        message = str(error)
+        assert "\n" not in message, case
+        assert message.endswith("start again without --resume."), (case, message)
+        return message
+    except BaseException as error:
+        raise AssertionError(f"{case} ended in {error!r}") from error
+    raise AssertionError(f"{case} went on silently")
+
+
+def _flips(content, count):
+    """Copies with a single bit changed at random places."""
+    generator = random.Random(0)
+    for _ in range(count):
+        place, bit = generator.randrange(len(content)), generator.randrange(8)
+        yield f"bit {bit} of byte {place}", content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
+
+
+def _broken_bytes(content):
+    """Cut short, lengthened, overwritten, exchanged."""
+    for share in (0.0, 0.1, 0.5, 0.9, 0.999):
+        yield f"the first {share} of it", content[: int(share * len(content))]
+    yield "the last byte missing", content[:-1]
+    yield "a byte more", content + b"\n"
+    yield "twice", content + content
+    yield "without its checksum", content[:-90]
+    yield "text", b"hello"
+    yield "zeros", bytes(len(content))
+    yield "a block of zeros", content[: len(content) // 2] + bytes(512) + content[len(content) // 2 + 512 :]
+    altered = content.replace(b"3000.0", b"3001.0")
+    assert altered != content
+    yield "altered text", altered
+    yield "a pickle", pickle.dumps({"frame": 1})
+
+
+JUNK = [None, True, -1, 2.5, "text", b"bytes", [], {}, torch.zeros(3), torch.zeros(()), float("nan")]
+
+
+def _variants(value):
+    """The value with another type, shape, precision, or something that is not finite."""
+    yield from (junk for junk in JUNK if type(junk) is not type(value))
+    if isinstance(value, torch.Tensor):
+        yield value[..., None]
+        yield value.to(torch.float16 if value.dtype != torch.float16 else torch.float32)
+        yield value.to(torch.complex64)
+        if value.ndim:
+            yield value[:-1]
+            yield value[..., :-1]
+        if value.is_floating_point():
+            for wrong in (float("nan"), float("inf")):
+                changed = value.clone()
+                changed[(-1,) * changed.ndim] = wrong
+                yield changed
+    if isinstance(value, tuple):
+        yield from (value[:-1], (*value, 1), (0.5,) * 3, (2**40,) * 3, ("a",) * 3)
+    if type(value) is float:
+        yield from (-value - 1.0, float("nan"), float("inf"))
+
+
+def _fields(checkpoint):
+    """Every dictionary in a checkpoint and how to find it in a copy."""
+    yield "", checkpoint, lambda copy: copy
+    yield "state.", checkpoint["state"], lambda copy: copy["state"]
+    yield "grid.", checkpoint["state"]["grid"], lambda copy: copy["state"]["grid"]
+    yield "log[1].", checkpoint["log"][1], lambda copy: copy["log"][1]
+    yield "wall_s.", checkpoint["wall_s"], lambda copy: copy["wall_s"]
+
+
+# none of these changes what the run computes
+HARMLESS = {("state.F_total", None), ("state.internal", None), ("splat", None)}
+
+
+def _broken_fields(file):
+    """A checkpoint with a right checksum for each field that is missing, renamed or of another kind."""
+
+    def fresh():
+        return torch.load(file, weights_only=True)
+
+    for prefix, fields, find in _fields(fresh()):
+        for name, value in fields.items():
+            if prefix + name != "splat" and not prefix.startswith("wall"):
+                copy = fresh()
+                del find(copy)[name]
+                yield f"{prefix}{name} missing", copy
+                copy = fresh()
+                find(copy)[f"{name}s"] = find(copy).pop(name)
+                yield f"{prefix}{name} renamed", copy
+            for variant in _variants(value):
+                if variant is None and (prefix + name, None) in HARMLESS:
+                    continue
+                number = type(variant) in (int, float)
+                if number and (prefix == "log[1]." or (prefix == "wall_s." and 0 <= variant < float("inf"))):
+                    continue  # a number is a number
+                copy = fresh()
+                find(copy)[name] = variant
+                yield f"{prefix}{name} = {variant!r}"[:80], copy
+    copy = fresh()
+    copy["log"].pop()
+    yield "a log of too few frames", copy
+    copy = fresh()
+    copy["frame"] = 0
+    yield "the frame before", copy
+    copy = fresh()
+    copy["state"]["time"] = copy["state"]["time"] + 0.04
+    yield "the time of another frame", copy
+    yield "a list", [1, 2]
+    yield "nothing", {}
+
+
+def test_forty_bits_and_more_than_a_hundred_other_damages(run):
+    """None goes on silently, none ends in anything but the one sentence; then the right one goes on."""
+    folder, resume = run
+    file = folder / "checkpoint.pt"
+    content = file.read_bytes()
+    cases = 0
+    for case, damaged in [*_flips(content, 40), *_broken_bytes(content)]:
+        file.write_bytes(damaged)
+        assert "checkpoint.pt cannot be read as a checkpoint" in _refused(resume, folder, case)
+        cases += 1
+    assert cases == 54
+    file.write_bytes(content)
+    broken = list(_broken_fields(file))
+    for case, checkpoint in broken:
+        write_checkpoint(file, checkpoint)
+        _refused(resume, folder, case)
+    assert len(broken) > 300
+    file.write_bytes(content)
+    assert resume()["status"] == "complete"
+
+
+def test_a_checkpoint_executes_no_code(tmp_path, run):
+    folder, resume = run
+    held = read_checkpoint(folder / "checkpoint.pt")
+    held["wall_s"]["fuse"] = Fuse(tmp_path / "burnt")
+    write_checkpoint(folder / "checkpoint.pt", held)
+    assert "cannot be read as a checkpoint" in _refused(resume, folder, "a fuse")
+    assert not (tmp_path / "burnt").exists()
+
+
+def test_a_configuration_that_is_no_yaml(run):
+    folder, resume = run
+    held = read_checkpoint(folder / "checkpoint.pt")
+    for text in ("{", "a: [" * 5000, "x: !!python/object/apply:os.getcwd []"):
+        write_checkpoint(folder / "checkpoint.pt", held | {"config": text})
+        assert "`config` is not valid YAML" in _refused(resume, folder, text[:20])
+
+
+def test_a_splat_that_was_exchanged(make_cloud, make_pipeline, tmp_path):
+    """As many Gaussians under the same name, one of them elsewhere."""
+    from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+    from gaussian_swaying.simulation.pipeline import SimulationPipeline
+    from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+
+    like, file, folder = make_pipeline(pinned=False), tmp_path / "splat.ply", tmp_path / "run"
+
+    def go(frames, resume):
+        scene = SimulatedScene(Scene(ply=str(file)), Material(), 0.25)
+        camera = OrbitCamera(width=8, height=8)
+        pipeline = SimulationPipeline(scene, MPMSolver(dx=0.25), like.wind, like.aero, None, camera)
+        pipeline.run(Recorder(images=False, video=False), folder, frames, resume=resume, progress=False)
+
+    cloud = make_cloud()
+    write_ply(file, cloud)
+    go(2, False)
+    other = shutil.copy(file, tmp_path / "other.ply")
+    cloud.means[0] += 0.01
+    write_ply(file, cloud)
+    with pytest.raises(ValueError, match=r"splat .*splat.ply is not the one .* put that file back, or start again"):
+        go(3, True)
+    shutil.copy(other, file)
+    go(3, True)
+
+
+@pytest.mark.parametrize("formulation", ["total"], indirect=True)
+def test_edits_that_bring_an_internal_variable(make_pipeline, tmp_path, formulation):
+    """A law that flows from the second frame on: the state has then what it had not at the start."""
+    from gaussian_swaying.mpm.laws.snow import Snow
+    from gaussian_swaying.simulation.edits import Edit
+    from gaussian_swaying.simulation.pipeline import SimulationPipeline
+
+    def make():
+        like = make_pipeline(formulation="updated")
+        edit = Edit(time=0.04, law=Snow())
+        solver = MPMSolver(dx=0.2, formulation="updated", boundaries=[PinnedRegion(like.solver.boundaries[0].region)])
+        return SimulationPipeline(like.scene, solver, like.wind, like.aero, None, like.camera, edits=[edit])
+
+    recorder = Recorder(images=False, video=False)
+    make().run(recorder, tmp_path / "run", 3, progress=False)
+    held = read_checkpoint(tmp_path / "run" / "checkpoint.pt")
+    assert held["state"]["internal"] is not None
+    make().run(recorder, tmp_path / "run", 4, resume=True, progress=False)
+    held["state"]["internal"] = torch.full_like(held["state"]["internal"], torch.nan)
+    write_checkpoint(tmp_path / "run" / "checkpoint.pt", held | {"frame": 2})
+    with pytest.raises(ValueError, match="its `internal` is NaN"):
+        make().run(recorder, tmp_path / "run", 4, resume=True, progress=False)
+
+
+def test_the_diagnostics_of_a_frame_are_what_a_log_holds(run):
+    held = read_checkpoint(run[0] / "checkpoint.pt")
+    assert set(held["log"][0]) == set(FrameDiagnostics.__dataclass_fields__)
+
+
+def test_a_seal(tmp_path):
+    file = tmp_path / "file"
+    file.write_bytes(b"content")
+    with pytest.raises(ValueError, match="no checksum"):
+        check_seal(file)
+    seal(file)
+    check_seal(file)
+    assert file.read_bytes().startswith(b"content\ngaussian_swaying sha256 ")
+    file.write_bytes(file.read_bytes().replace(b"content", b"context"))
+    with pytest.raises(ValueError, match="damaged"):
+        check_seal(file)
+    with pytest.raises(ValueError, match="is a folder"):
+        check_seal(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        check_seal(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+@pytest.mark.parametrize("law", [None, "Snow"])
+def test_states_that_the_kernels_made_are_whole(formulation, law, make_pipeline, tmp_path):
+    """On a GPU, or here in Triton's interpreter: nothing in them is refused."""
+    pytest.importorskip("triton")
+    import gaussian_swaying
+    from gaussian_swaying.simulation.scene import Material
+
+    if law and formulation == "total":
+        pytest.skip("what flows needs `updated`")
+    material = Material(E=300.0, density=30.0, law=getattr(gaussian_swaying, law)() if law else None)
+    pipeline = make_pipeline(formulation=formulation, transfer="triton", material=material, frame_dt=0.01)
+    recorder = Recorder(images=False, video=False)
+    pipeline.run(recorder, tmp_path / "run", 2, progress=False)
+    assert pipeline.run(recorder, tmp_path / "run", 3, resume=True, progress=False)["frames"] == 3

@@ -1,0 +1,32 @@
+"""Files that appear whole or not at all."""
+
+import csv
+import json
+
+import pytest
+
+from gaussian_swaying._files import atomic, write_json, write_table
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "value.json"
+    write_json(path, {"a": 1})
+    with pytest.raises(TypeError):
+        write_json(path, {"a": object()})
+
+    def fail_half_way():
+        with atomic(path) as temporary:
+            temporary.write_text("{")
+            assert temporary.parent == path.parent  # a rename across file systems is not atomic
+            raise RuntimeError("half way")
+
+    with pytest.raises(RuntimeError, match="half way"):
+        fail_half_way()
+    assert json.loads(path.read_text()) == {"a": 1}
+    assert [file.name for file in tmp_path.iterdir()] == ["value.json"]
+
+
+def test_rows_of_an_older_run_leave_their_gaps(tmp_path):
+    write_table(tmp_path / "table.csv", [{"a": 1}, {"a": 2, "b": 3}])
+    with (tmp_path / "table.csv").open(newline="") as file:
+        assert list(csv.DictReader(file)) == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]

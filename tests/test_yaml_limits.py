@@ -1,0 +1,80 @@
+"""Configurations that are too much are refused before they are built, in a sentence."""
+
+import os
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gaussian_swaying._yaml_limits import check_config_files, check_yaml
+from gaussian_swaying.cli.simulate import main
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
+
+
+def laughs(levels):
+    """Nine times nine times nine ..."""
+    lines = ["a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, levels)]
+    return "\n".join(lines)
+
+
+BAD = {
+    "laughs": (laughs(10), "values, aliases included"),
+    "cyclic": ("wind: &w {flow: [1, 2, 3], again: *w}", r"hold itself: remove the alias \*w"),
+    "short": ("edits: &w [*w]", "hold itself"),
+    "deep": ("[" * 100_000, "nested too deeply"),
+    "long": ("background: [" + "0, " * 19_000 + "0]", "A list of 19,001 entries"),
+    "many": ("edits:\n" + "- {time: 1.0, E: 2.0}\n" * 20_000, "too large"),
+    "large": ("output: " + "x" * (1 << 20), "too long"),
+    "digits": ("material: {E: " + "9" * 400 + "}", "400 digits"),
+}
+
+
+@pytest.mark.parametrize(("text", "words"), BAD.values(), ids=BAD)
+def test_what_is_too_much_is_refused(text, words, tmp_path, capsys):
+    with pytest.raises(ValueError, match=words):
+        check_yaml(text)
+    (tmp_path / "bad.yaml").write_text(text)
+    assert main(["--config", str(tmp_path / "bad.yaml")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+
+
+def test_aliases_that_do_no_harm_are_kept():
+    text = "a: &a {E: 1.0}\nb: [*a, *a]\nc: &c 5\nd: *c\n" + "# as long as it takes"
+    assert check_yaml(text) == text
+    assert yaml.safe_load(laughs(4))["a3"][0][0][0][0] == "lol"
+    assert check_yaml(laughs(4))
+    assert check_yaml("'" + "9" * 400 + "'")  # text, no number
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
+def test_shipped_configurations_are_far_from_the_limits(config):
+    assert check_yaml(config.read_text(encoding="utf-8")) == config.read_text(encoding="utf-8")
+
+
+def test_files_that_are_no_configurations(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "latin.yaml").write_bytes("output: Blüte\n".encode("latin-1"))
+    (tmp_path / "wide.yaml").write_bytes("output: Blüte\n".encode("utf-16"))
+    (tmp_path / "huge.yaml").write_bytes(b"#" * (1 << 20) + b"\n")
+    for arguments, words in (
+        (["--config", str(tmp_path / "pipe.yaml")], "no regular file"),
+        ([f"--config={tmp_path / 'latin.yaml'}"], "latin.yaml is not UTF-8 text"),
+        (["--config", str(tmp_path / "wide.yaml")], "wide.yaml is not UTF-8 text"),
+        (["--wind", str(tmp_path / "huge.yaml")], "1,048,577 bytes"),
+        (["--config", "/dev/zero"], "no regular file"),
+        (["--config", str(tmp_path)], "is a directory"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            check_config_files(arguments)
+    check_config_files(
+        ["--config", "wind: {flow: [1, 2, 3]}", "--config", "/nowhere.yaml", "--frames", "3", "x" * 5000]
+    )
+
+
+def test_a_group_without_fields(capsys):
+    assert main(["--config", "wind: [1, 2]", "--frames", "2"]) == 2
+    assert "Expected `wind` to hold fields" in capsys.readouterr().err
