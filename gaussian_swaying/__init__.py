@@ -64,10 +64,10 @@ if TYPE_CHECKING:
     from gaussian_swaying.simulation.edits import Edit
     from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
     from gaussian_swaying.simulation.physgaussian.space import Normalisation
-    from gaussian_swaying.simulation.pipeline import SimulationPipeline
     from gaussian_swaying.simulation.recording.recorder import Recorder
     from gaussian_swaying.simulation.recording.trajectory import load_trajectory
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+    from gaussian_swaying.simulation.simulation import Frame, Simulation
     from gaussian_swaying.training.data.datamodule import CaptureDataModule
     from gaussian_swaying.training.densification import DefaultDensification, MCMCDensification
     from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
@@ -168,13 +168,14 @@ _HOMES = {
     ),
     "rendering.torch_renderer": ("TorchRenderer",),
     "simulation.diagnostics": (
+        "Simulation",
         "SimulationDiverged",
         "TearingGauge",
     ),
     "simulation.edits": ("Edit",),
     "simulation.physgaussian.camera": ("PhysGaussianCamera",),
     "simulation.physgaussian.space": ("Normalisation",),
-    "simulation.pipeline": ("SimulationPipeline",),
+    "simulation.simulation": ("Frame", "Simulation"),
     "simulation.recording.recorder": ("Recorder",),
     "simulation.recording.trajectory": ("load_trajectory",),
     "simulation.scene": (
@@ -217,6 +218,7 @@ __all__ = [
     "Fluid",
     "Foam",
     "Force",
+    "Frame",
     "FrechetVideoDistance",
     "GaussianCloud",
     "GaussianGust",
@@ -252,8 +254,8 @@ __all__ = [
     "SequentialRelease",
     "SimFrame",
     "SimulatedScene",
+    "Simulation",
     "SimulationDiverged",
-    "SimulationPipeline",
     "SineSway",
     "Snow",
     "SpatialWind",

@@ -22,8 +22,6 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview.calibration import (
     SWAY,
     Setting,
@@ -40,6 +38,7 @@ from gaussian_swaying.simulation.preview.shape import DIRECTIONS, bounds
 from gaussian_swaying.simulation.preview.starter import draft_yaml, region_dict, starter_yaml
 from gaussian_swaying.simulation.preview.suggest import Suggestion, gaussian_statistics, suggest
 from gaussian_swaying.simulation.progress import duration
+from gaussian_swaying.simulation.simulation import Simulation
 
 LOADED = time.process_time()  # s; the interpreter and the imports so far, which a run takes too
 
@@ -126,17 +125,17 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "draft": draft_yaml(found, options.scene),
         "starter": starter_yaml(found, options.scene, options.frames),
     }
-    pipeline, starter = _pipeline(["--device", options.device], texts["starter"])
+    simulation, starter = _pipeline(["--device", options.device], texts["starter"])
     costs = {
         "draft": estimate_cost(draft, settings.frames, startup_seconds=startup),
-        "starter": estimate_cost(pipeline, starter.frames, startup_seconds=startup),
+        "starter": estimate_cost(simulation, starter.frames, startup_seconds=startup),
     }
     data: dict[str, Any] = {
         "splat": str(options.scene),
         "bounds": bounds(cloud.means),
         "gaussians": gaussian_statistics(cloud),
         "suggestion": suggestion_dict(found),
-        "run": run_dict(pipeline),
+        "run": run_dict(simulation),
         "cost": _cost_dict(costs["starter"]),
         "draft_cost": _cost_dict(costs["draft"]),
     }
@@ -152,10 +151,10 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         pictures = f"{_seconds_of(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height, whole=found.whole), texts)
+    return Preview("\n".join(report), data, preview_picture(simulation, options.height, whole=found.whole), texts)
 
 
-def _calibrated(found: Suggestion, draft: SimulationPipeline, sway: float) -> Suggestion:
+def _calibrated(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:
     """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
     if found.pin is None or not any(found.flow):
         return found
@@ -187,16 +186,16 @@ def preview_config(options: argparse.Namespace) -> Preview:
     if options.scene is not None:
         arguments += ["--scene.ply", options.scene]
     begin = Stopwatch()
-    pipeline, settings = _pipeline(arguments)
+    simulation, settings = _pipeline(arguments)
     startup = LOADED + begin.quiet
-    cost = estimate_cost(pipeline, settings.frames, picture=settings.recorder.images, startup_seconds=startup)
-    cloud = pipeline.scene.model.to_cloud().to("cpu")
+    cost = estimate_cost(simulation, settings.frames, picture=settings.recorder.images, startup_seconds=startup)
+    cloud = simulation.scene.model.to_cloud().to("cpu")
     data: dict[str, Any] = {
         "config": options.config,
         "splat": None if options.scene is None else str(options.scene),
         "bounds": bounds(cloud.means),
         "gaussians": gaussian_statistics(cloud),
-        "run": run_dict(pipeline),
+        "run": run_dict(simulation),
         "cost": _cost_dict(cost),
     }
     report = [
@@ -204,19 +203,19 @@ def preview_config(options: argparse.Namespace) -> Preview:
         *_run_lines(data["run"]),
         *_cost_lines(cost),
     ]
-    return Preview("\n".join(report), data, preview_picture(pipeline, options.height), {})
+    return Preview("\n".join(report), data, preview_picture(simulation, options.height), {})
 
 
-def _pipeline(arguments: list[str], text: str | None = None) -> tuple[SimulationPipeline, Any]:
+def _pipeline(arguments: list[str], text: str | None = None) -> tuple[Simulation, Any]:
     """The run of a configuration, given by options or as text, and its settings."""
-    parser = build_parser()
+    parser = Simulation.parser()
     check_config_files(arguments)
     try:
         with guessing(parser):
             settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
     except ArgumentError as error:
         raise ValueError(parser_sentence(str(error), arguments)) from error
-    return build_pipeline(parser, settings)[0], settings
+    return Simulation.from_settings(parser, settings), settings
 
 
 def _parse_text(parser: Any, arguments: list[str], text: str) -> Any:
@@ -300,16 +299,16 @@ def suggestion_dict(found: Suggestion) -> dict[str, Any]:
     }
 
 
-def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
+def run_dict(simulation: Simulation) -> dict[str, Any]:
     """What a run simulates, holds and blows at."""
-    parts, scene = classify(pipeline), pipeline.scene
+    parts, scene = classify(simulation), simulation.scene
     return {
         "gaussians": len(scene.model.means),
         "simulated": int(parts.simulated.sum()),
         "carried": int(parts.carried.sum()),
         "held": int(parts.pinned.sum()),
         "conditions": parts.names,
-        "regions": [repr(b.region) for b in conditions(pipeline) if hasattr(b, "region")],
+        "regions": [repr(b.region) for b in conditions(simulation) if hasattr(b, "region")],
         "frame": scene.frame.describe(),
         "box_min": [float(v) for v in scene.bounds[0]],
         "box_max": [float(v) for v in scene.bounds[1]],
@@ -318,9 +317,9 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "filled": scene.filled,
         "points": scene.points.count,
         "further": scene.on_surface - len(scene.simulated),
-        "dx_m": pipeline.solver.dx,
-        "formulation": pipeline.solver.formulation,
-        "flow": mean_flow(pipeline).tolist(),
+        "dx_m": simulation.solver.dx,
+        "formulation": simulation.solver.formulation,
+        "flow": mean_flow(simulation).tolist(),
     }
 
 

@@ -13,9 +13,8 @@ from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.runs.signals import stop_signals
-from gaussian_swaying.simulation.config import RUN_ONLY, build_parser, build_pipeline
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -32,8 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         129 by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    parser = build_parser()
-    started: list[SimulationPipeline] = []
+    parser = Simulation.parser()
+    started: list[Simulation] = []
 
     def advice(error: BaseException) -> str | None:
         """How to go on from the checkpoint that the run has left, if it has left one."""
@@ -51,25 +50,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
 
 
-def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[SimulationPipeline]) -> None:
+def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Simulation]) -> None:
     """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
     arguments = with_shipped(arguments, "sim")
     check_config_files(arguments)
     with guessing(parser):
         settings = parser.parse_args(arguments)
-    pipeline, recorder = build_pipeline(parser, settings)
+    simulation = Simulation.from_settings(parser, settings)
     folder = output_folder(settings)
-    scene = pipeline.scene
+    scene = simulation.scene
     by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
-    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {pipeline.device}")
+    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {simulation.device}")
     if scene.filled:
         print(f"{scene.filled:,} points fill the inside")
     print(scene.frame.describe())
     extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
-    text = config_text(parser, settings)
-    started.append(pipeline)
+    started.append(simulation)
     with stop_signals():
-        summary = pipeline.run(recorder, folder, settings.frames, text, settings.resume, extra)
+        summary = simulation.run(folder, settings.frames, settings.resume, extra)
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
     if summary["torn_particles"]:
@@ -79,7 +77,7 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
             file=sys.stderr,
         )
     beside = [folder / name for name in ("diagnostics.csv", "checkpoint.pt", "config.yaml")]
-    for file in [*pipeline.files, *(file for file in beside if file.exists())]:
+    for file in [*simulation.files, *(file for file in beside if file.exists())]:
         print(f"wrote {file}")
 
 
@@ -89,11 +87,3 @@ def output_folder(settings: Namespace) -> Path:
         return Path(settings.output)
     files = [str(file) for file in settings.config or []]
     return Path("outputs") / (Path(files[-1]).stem if files else "run")
-
-
-def config_text(parser: ArgumentParser, settings: Namespace) -> str:
-    """The settings that decide the result, as YAML."""
-    kept = settings.clone()
-    for name in RUN_ONLY:
-        kept.pop(name, None)
-    return str(parser.dump(kept, skip_validation=True))

@@ -27,12 +27,14 @@ class DeformedGaussians:
         covariances: Covariances F A F^T [scene units^2], shape (..., N, 3, 3).
         normals: Unit normals F^-T N, shape (..., N, 3).
         rotations: Rotation of each Gaussian from rest, the polar factor of F, shape (..., N, 3, 3).
+        colors: Colours as a camera sees them, shape (..., N, 3); None before they are shaded.
     """
 
     means: Tensor
     covariances: Tensor
     normals: Tensor
     rotations: Tensor
+    colors: Tensor | None = None
 
 
 class GaussianSurfaceModel(nn.Module):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import Recordable
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.state import MPMState
 
 MOST_STEPS = 256
@@ -88,6 +89,14 @@ class Force(Recordable, nn.Module, ABC):
             the substep [kg/s], shape (..., P). A force with a resistance acts with the velocity that it leads to, so it
             is stable however light the particle.
         """
+
+    def in_frame(self, frame: SimFrame) -> Force:
+        """The same force with its places brought from scene units to metres, z up; itself if it names no place.
+
+        Args:
+            frame: How a scene is brought to metres. A force that a configuration names gets it before the run.
+        """
+        return self
 
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
         """The force in each of several substeps; what depends on time alone can be computed here, for all at once.

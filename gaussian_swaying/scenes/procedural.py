@@ -22,6 +22,21 @@ class ProceduralScene(ABC):
         """Make the splat; the same arguments give the same splat."""
 
 
+class GivenScene(ProceduralScene):
+    """Gaussians that are there already, for Python: a YAML names a file.
+
+    Args:
+        cloud: The Gaussians.
+    """
+
+    def __init__(self, cloud: GaussianCloud) -> None:
+        self.cloud = cloud
+
+    def generate(self) -> GaussianCloud:
+        """The Gaussians, as they are."""
+        return self.cloud
+
+
 class FlagScene(ProceduralScene):
     """A rectangular flag in the x-z plane, its pole side at x = 0, its lower edge at z = 0, in metres.
 

@@ -1,32 +1,20 @@
-"""From a YAML file and the command line to a run. The constructors of the components are the schema."""
+"""From a YAML file and the command line to settings. The constructors of the components are the schema."""
 
 from __future__ import annotations
 
+import inspect
+import os
 import sys
-from argparse import SUPPRESS, Action
+from argparse import SUPPRESS, Action, ArgumentError
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
-
-import torch
+from types import UnionType
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from gaussian_swaying import _program as program
-from gaussian_swaying._checks import check_vector
-from gaussian_swaying._yaml_limits import limit_yaml
-from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.captures.capture_camera import CaptureCamera
-from gaussian_swaying.mpm.boundary import RegionInFrame
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
-from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.simulation.physgaussian.convert import convert, read_config, to_yaml
-from gaussian_swaying.simulation.physgaussian.space import Normalisation
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.recording.recorder import Recorder
-from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -36,6 +24,9 @@ CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
 # what a configuration cannot hold; what may change between a run and the one that resumes it
 COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
+# arguments of the constructor that a YAML gives within a component; those that may be null as a whole
+PYTHON_ONLY = ("up", "hold", "renderer")
+NULLABLE = ("normalisation",)
 
 
 class PhysGaussianAction(Action):
@@ -76,8 +67,12 @@ class PresetAction(Action):
         ActionConfigFile.apply_config(parser, namespace, "config", str(preset))
 
 
-def build_parser() -> ArgumentParser:
-    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors."""
+def build_parser(schema: type) -> ArgumentParser:
+    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors.
+
+    Args:
+        schema: The class whose constructor says what a configuration holds.
+    """
     from jsonargparse import ActionYesNo, ArgumentParser
 
     limit_yaml()
@@ -102,109 +97,79 @@ def build_parser() -> ArgumentParser:
         "override it.",
     )
     parser.add_argument("--output", type=str | None, help="Folder of the results. Default: outputs/<config name>.")
-    parser.add_argument(
-        "--device", type=Literal["auto", "cpu", "cuda"], default="auto", help="auto takes a CUDA GPU if there is one."
-    )
     parser.add_argument("--frames", type=int, default=250, help="Number of frames, the first at rest.")
-    parser.add_argument("--frame_dt", type=float, default=0.04, help="Time between frames [s].")
-    parser.add_argument(
-        "--dtype", type=Literal["float32", "float64"], default="float32", help="Precision of the solver."
-    )
-    parser.add_argument("--background", type=list[float], default=[0.0, 0.0, 0.0], help="Background colour in [0, 1].")
     parser.add_argument(
         "--resume",
         action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
         default=False,
         help="Continue the run found in the output folder.",
     )
-    parser.add_argument(
-        "--normalisation",
-        type=Normalisation | None,
-        default=None,
-        help="Take boundaries and regions of the material in PhysGaussian's normalised space; null for scene units.",
-    )
-    parser.add_class_arguments(Scene, "scene")
-    parser.add_class_arguments(Material, "material")
-    parser.add_class_arguments(MPMSolver, "solver")
-    parser.add_class_arguments(WindField, "wind")
-    parser.add_class_arguments(AeroForce, "aero")
-    parser.add_subclass_arguments(Shader, "shader", required=False, help="Shading; null keeps the splat's colours.")
-    parser.add_subclass_arguments(CameraPath, "camera", required=False, help="Where each frame is seen from.")
-    parser.add_argument(
-        "--edits",
-        type=list[Edit],
-        default=[],
-        help="Changes of a part of the object: its `region` (at rest, scene units; null for all that moves), the "
-        "`time` from which they hold [s], any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a `color` (red, "
-        "green, blue in [0, 1]) with the part `detail` of the old differences in brightness.",
-    )
-    parser.add_argument(
-        "--cameras",
-        type=dict[str, CameraPath] | None,
-        default=None,
-        help="Further cameras by name; their pictures and videos are in the folders cameras/NAME.",
-    )
-    parser.add_class_arguments(Recorder, "recorder")
+    groups = _groups(schema)
+    for name, component in groups.items():
+        parser.add_class_arguments(component, name)
+    parser.add_class_arguments(schema, skip={*groups, *PYTHON_ONLY})
     return parser
 
 
-def resolve_device(name: str) -> torch.device:
-    """``auto``, ``cpu`` or ``cuda`` as a device; ValueError if CUDA is asked for and missing."""
-    available = torch.cuda.is_available()
-    if name == "cuda" and not available:
-        raise ValueError(
-            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, and there is none: use --device auto or cpu."
-        )
-    return torch.device("cuda" if name != "cpu" and available else "cpu")
+def arguments_of(schema: type) -> list[str]:
+    """The arguments of a constructor that a configuration holds."""
+    return [name for name in inspect.signature(schema).parameters if name not in PYTHON_ONLY]
 
 
-def build_pipeline(parser: ArgumentParser, settings: Namespace) -> tuple[SimulationPipeline, Recorder]:
-    """Build the components from parsed settings.
+def _groups(schema: type) -> dict[str, type]:
+    """Those that are one component each, and so a group of options."""
+    hints = get_type_hints(schema.__init__)  # type: ignore[misc]
+    found: dict[str, type] = {}
+    for name in arguments_of(schema):
+        kinds = get_args(hints[name]) if isinstance(hints[name], UnionType) else (hints[name],)
+        kinds = tuple(kind for kind in kinds if kind is not type(None))
+        if name not in NULLABLE and len(kinds) == 1 and inspect.isclass(kinds[0]) and not inspect.isabstract(kinds[0]):
+            found |= {name: kinds[0]} if kinds[0].__module__ != "builtins" else {}
+    return found
+
+
+def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespace:
+    """The settings of a configuration file.
 
     Args:
         parser: From :func:`build_parser`.
-        settings: What it parsed.
-
-    Returns:
-        Pipeline and recorder.
+        path: The YAML file.
 
     Raises:
-        ValueError: If a value is out of range; the message names the field.
+        ValueError: If it is not right; the message names the field.
+    """
+    arguments = ["--config", os.fspath(path)]
+    check_config_files(arguments)
+    try:
+        return parser.parse_args(arguments)
+    except ArgumentError as error:
+        raise ValueError(str(error)) from error
+
+
+def check_settings(schema: type, settings: Namespace) -> None:
+    """Raise ValueError if parsed settings hold what no configuration can.
+
+    Args:
+        schema: As of :func:`build_parser`.
+        settings: What its parser parsed.
     """
     from jsonargparse import Namespace
 
-    device = resolve_device(settings.device)
     for name in COMMAND_LINE_ONLY:
         if name in settings:
             raise ValueError(f"`{name}` is an option of the command line, not of a YAML: remove it and give --{name}.")
-    for name in ("scene", "material", "solver", "wind", "aero", "recorder"):
+    for name in _groups(schema):
         if not isinstance(settings[name], Namespace):
             raise ValueError(
                 f"Expected `{name}` to hold fields, such as those that --help lists, but got {settings[name]!r}."
             )
     if settings.frames < 1:
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
-    parts = parser.instantiate(settings)
-    solver = parts.solver
-    if parts.normalisation is not None:
-        frame = parts.normalisation.place(parts.scene, parts.material, solver, parts.get("camera"))
-        for path in (parts.get("cameras") or {}).values():
-            if isinstance(path, PhysGaussianCamera):
-                path.frame = frame
-        for edit in parts.edits:
-            edit.region = None if edit.region is None else RegionInFrame(edit.region, frame)
-    scene = SimulatedScene(parts.scene, parts.material, solver.dx, getattr(torch, settings.dtype))
-    pipeline = SimulationPipeline(
-        scene,
-        solver,
-        parts.wind,
-        parts.aero,
-        parts.get("shader"),
-        parts.get("camera") or OrbitCamera(),
-        background=check_vector("background", settings.background),
-        frame_dt=settings.frame_dt,
-        device=device,
-        cameras=parts.get("cameras"),
-        edits=parts.edits,
-    )
-    return pipeline, parts.recorder
+
+
+def config_text(parser: ArgumentParser, settings: Namespace) -> str:
+    """The settings that decide the result, as YAML."""
+    kept = settings.clone()
+    for name in RUN_ONLY:
+        kept.pop(name, None)
+    return str(parser.dump(kept, skip_validation=True))

@@ -16,7 +16,7 @@ import torch
 from gaussian_swaying.cli.errors import run_command, sentence
 from gaussian_swaying.cli.streams import SafeStream
 from gaussian_swaying.cli.suggestions import guessing
-from gaussian_swaying.simulation.config import build_parser
+from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 
@@ -168,14 +168,14 @@ def test_the_program_with_broken_streams(tmp_path):
     ],
 )
 def test_a_misspelt_option_is_guessed(arguments, guess):
-    parser = build_parser()
+    parser = Simulation.parser()
     with pytest.raises(ArgumentError, match="did you mean") as caught, guessing(parser):
         parser.parse_args(arguments)
     assert guess in str(caught.value)
 
 
 def test_no_guess_where_nothing_is_close():
-    parser = build_parser()
+    parser = Simulation.parser()
     with pytest.raises(ArgumentError) as caught, guessing(parser):
         parser.parse_args(["--quite_another_thing", "3"])
     assert "did you mean" not in str(caught.value)

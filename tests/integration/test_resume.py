@@ -14,9 +14,9 @@ import torch
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
 from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.simulation.run import Run
 
 ROOT = Path(__file__).parents[2]
 PIN = (
@@ -39,14 +39,14 @@ def _trajectory(folder):
 
 def _stop_after(monkeypatch, frames, error=KeyboardInterrupt):
     """Break the run while it records the given frame."""
-    record = SimulationPipeline._record
+    record = Run.record
 
-    def stop(self, recorder, state, frame, walls):
+    def stop(self, state, frame):
         if frame == frames:
             raise error("stopped")
-        record(self, recorder, state, frame, walls)
+        record(self, state, frame)
 
-    monkeypatch.setattr(SimulationPipeline, "_record", stop)
+    monkeypatch.setattr(Run, "record", stop)
 
 
 def _same_as_uninterrupted(folder, other):
@@ -99,12 +99,12 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
     # the same program, slowed down so that the kill surely comes in the middle
     code = (
         "import sys, time\n"
-        "from gaussian_swaying.simulation import config, pipeline\n"
-        "advance = pipeline.SimulationPipeline.advance\n"
+        "from gaussian_swaying.simulation import config, simulation\n"
+        "advance = simulation.Simulation.advance\n"
         "def slow(self, state):\n"
         "    time.sleep(60 if float(state.time) > 0.1 else 0)\n"
         "    return advance(self, state)\n"
-        "pipeline.SimulationPipeline.advance = slow\n"
+        "simulation.Simulation.advance = slow\n"
         "sys.exit(config.main(sys.argv[1:]))\n"
     )
     process = subprocess.Popen(
@@ -140,15 +140,15 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     code = (
         "import pathlib, signal, sys, time\n"
-        "from gaussian_swaying.simulation import config, pipeline\n"
+        "from gaussian_swaying.simulation import config, simulation\n"
         f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
-        "advance = pipeline.SimulationPipeline.advance\n"
+        "advance = simulation.Simulation.advance\n"
         "def slow(self, state):\n"
         "    if float(state.time) > 0.1:\n"
         f"        pathlib.Path({str(slow)!r}).touch()\n"
         "        while True: time.sleep(0.05)\n"
         "    return advance(self, state)\n"
-        "pipeline.SimulationPipeline.advance = slow\n"
+        "simulation.Simulation.advance = slow\n"
         "sys.exit(config.main(sys.argv[1:]))\n"
     )
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}

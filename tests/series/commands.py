@@ -29,10 +29,10 @@ def commands() -> dict[str, Callable[[list[str]], int | None]]:
     from gaussian_swaying.cli import train as training
     from gaussian_swaying.cli.errors import run_command
     from gaussian_swaying.cli.simulate import main
-    from gaussian_swaying.simulation.config import build_parser
+    from gaussian_swaying.simulation.simulation import Simulation
 
     torch.set_num_threads(1)
-    build_parser()  # imports what it needs
+    Simulation.parser()  # imports what it needs
 
     def look(arguments: list[str]) -> int:
         """Read a capture with all its pictures, as a training does first."""

@@ -22,10 +22,10 @@ CLASSES = (  # numbers of parts that are no options of their own; not the spacin
 @functools.cache
 def _fields() -> dict[str, int]:
     """Options that are numbers (1) or lists of three (3)."""
-    from gaussian_swaying.simulation.config import build_parser
+    from gaussian_swaying.simulation.simulation import Simulation
 
     found = dict.fromkeys(CLASSES, 1)
-    for action in build_parser()._actions:
+    for action in Simulation.parser()._actions:
         kind: Any = str(getattr(action, "_typehint", None) or getattr(action, "type", None))
         if action.dest.startswith(("help", "config")) or "cls" in kind:
             continue

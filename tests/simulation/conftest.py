@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
@@ -14,8 +13,8 @@ from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.simulation import Simulation
 
 
 class CloudScene(ProceduralScene):
@@ -61,7 +60,7 @@ def make_scene():
 
 
 @pytest.fixture
-def make_pipeline():
+def make_simulation():
     """A flag of 96 Gaussians on its pole, 32 x 18 pixels."""
 
     def make(
@@ -76,24 +75,26 @@ def make_pipeline():
         frame_dt=0.04,
         dtype=torch.float32,
         background=(0.0, 0.0, 0.0),
+        parts=None,
         **solver,
     ):
         source = FlagScene(spacing=0.1) if cloud is None else CloudScene(cloud)
         solver = {"dx": 0.2, **solver}
         if pinned:
             solver["boundaries"] = [PinnedRegion(Box([None, None, None], [0.11, None, None]))]
-        model = SimulatedScene(
-            Scene(generator=source, **(scene or {})), material or Material(E=3e3, density=30.0), solver["dx"], dtype
-        )
-        return SimulationPipeline(
-            model,
+        return Simulation(
+            Scene(generator=source, **(scene or {})),
+            material or Material(E=3e3, density=30.0),
             MPMSolver(**solver),
             wind or WindField([6.0, 1.5, 0.0]),
-            aero or AeroForce(),
-            shader,
-            camera or OrbitCamera(width=32, height=18, azimuth=-70.0, radius=1.9),
+            aero,
+            shader=shader,
+            camera=camera or OrbitCamera(width=32, height=18, azimuth=-70.0, radius=1.9),
             background=background,
             frame_dt=frame_dt,
+            dtype=str(dtype).removeprefix("torch."),
+            device="cpu",
+            **(parts or {}),
         )
 
     return make

@@ -29,17 +29,17 @@ def _free_half():
     return Box(*FREE_HALF)
 
 
-def _with(pipeline, *edits):
-    pipeline.editor.__init__(pipeline.scene, edits)
-    return pipeline
+def _with(simulation, *edits):
+    simulation.editor.__init__(simulation.scene, edits)
+    return simulation
 
 
-def _frames(pipeline, frames):
-    state, states = pipeline.start(), []
+def _frames(simulation, frames):
+    state, states = simulation.start(), []
     states.append(state)
     for _ in range(frames):
-        state, _ = pipeline.advance(state)
-        state = pipeline._edit_due(state)
+        state, _ = simulation.advance(state)
+        state = simulation.edit_due(state)
         states.append(state)
     return states
 
@@ -102,21 +102,21 @@ def test_bad_edits(fields, word):
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-def test_an_edit_at_load_is_a_region_of_the_material(formulation, make_pipeline):
+def test_an_edit_at_load_is_a_region_of_the_material(formulation, make_simulation):
     law = NeoHookean()
     base = Material(E=3e3, density=30.0)
     region = MaterialRegion(_free_half(), E=9e3, nu=0.1, density=60.0, law=law)
-    expected = make_pipeline(material=dataclasses.replace(base, regions=[region]), formulation=formulation)
+    expected = make_simulation(material=dataclasses.replace(base, regions=[region]), formulation=formulation)
     edit = Edit(_free_half(), E=9e3, nu=0.1, density=60.0, law=law)
-    found = _with(make_pipeline(material=base, formulation=formulation), edit)
+    found = _with(make_simulation(material=base, formulation=formulation), edit)
     assert torch.equal(_frames(found, 2)[-1].position, _frames(expected, 2)[-1].position)
     assert found.editor.applied == 1
 
 
-def test_a_colour_at_load_is_that_of_the_first_picture(make_pipeline, tmp_path):
-    pipeline = _with(make_pipeline(), Edit(color=[1.0, 0.0, 1.0]))
-    pipeline.run(Recorder(ply_every=1), tmp_path / "run", 1, progress=False)
-    color = pipeline.render(pipeline.start(), 0)
+def test_a_colour_at_load_is_that_of_the_first_picture(make_simulation, tmp_path):
+    simulation = _with(make_simulation(), Edit(color=[1.0, 0.0, 1.0]))
+    simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(ply_every=1))
+    color = simulation.painter.render(simulation.start(), 0)
     solid = color.alpha[..., 0] > 0.9
     assert bool(solid.any())
     torch.testing.assert_close(
@@ -124,19 +124,19 @@ def test_a_colour_at_load_is_that_of_the_first_picture(make_pipeline, tmp_path):
     )
 
 
-def test_no_region_is_all_that_moves(make_cloud, make_pipeline):
+def test_no_region_is_all_that_moves(make_cloud, make_simulation):
     """Also those that are carried along, but not what stays; a region reaches what stays too."""
     cloud = make_cloud()
     cloud.opacities[5] = -6.0
     settings = {"pinned": False, "scene": {"region": Box([None, None, None], [0.5, None, None])}}
-    pipeline = make_pipeline(cloud, **settings)
+    simulation = make_simulation(cloud, **settings)
     moves = cloud.means[:, 0] <= 0.5
     for region, expected in ((None, moves), (Box([0.3, None, None], [None] * 3), cloud.means[:, 0] >= 0.3)):
-        _with(pipeline, Edit(region, color=WHITE)).start()
-        white = (pipeline.scene.model.sh0[:, 0] * SH_DC + 0.5 - 0.95).abs().amax(-1) < 1e-6
+        _with(simulation, Edit(region, color=WHITE)).start()
+        white = (simulation.scene.model.sh0[:, 0] * SH_DC + 0.5 - 0.95).abs().amax(-1) < 1e-6
         assert torch.equal(white, expected)
-        pipeline.editor.reset()
-    particles, gaussians = pipeline.editor.reach(Edit(E=1.0))
+        simulation.editor.reset()
+    particles, gaussians = simulation.editor.reach(Edit(E=1.0))
     assert bool(particles.all())
     assert not gaussians.any()
 
@@ -145,18 +145,18 @@ def test_no_region_is_all_that_moves(make_cloud, make_pipeline):
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-def test_nothing_but_the_stress_changes_at_once(formulation, make_pipeline):
+def test_nothing_but_the_stress_changes_at_once(formulation, make_simulation):
     """A part ten times stiffer from 0.08 s: the same until then, other afterwards; positions do not jump."""
-    edited = _with(make_pipeline(formulation=formulation), Edit(_free_half(), time=0.08, E=3e4, color=WHITE))
+    edited = _with(make_simulation(formulation=formulation), Edit(_free_half(), time=0.08, E=3e4, color=WHITE))
     before = edited.scene.model.sh0.detach().clone()
-    found, plain = _frames(edited, 4), _frames(make_pipeline(formulation=formulation), 4)
+    found, plain = _frames(edited, 4), _frames(make_simulation(formulation=formulation), 4)
     for k in range(3):
         assert torch.equal(found[k].position, plain[k].position)
         assert torch.equal(found[k].velocity, plain[k].velocity)
     assert float((found[4].position - plain[4].position).abs().max()) > 1e-4
     white = (edited.scene.model.sh0[:, 0] * SH_DC + 0.5 - 0.95).abs().amax(-1) < 1e-6
     assert torch.equal(white, edited.scene.model.means[:, 0] >= 0.55)
-    # a second run of the same pipeline begins anew, with all as it was
+    # a second run of the same simulation begins anew, with all as it was
     again = _frames(edited, 4)
     assert all(torch.equal(a.position, b.position) for a, b in zip(again, found, strict=True))
     edited.start()
@@ -164,47 +164,47 @@ def test_nothing_but_the_stress_changes_at_once(formulation, make_pipeline):
     assert float(edited.scene.points.youngs_modulus.max()) == 3e3
 
 
-def test_an_edit_by_hand_is_that_of_the_list(make_pipeline):
+def test_an_edit_by_hand_is_that_of_the_list(make_simulation):
     edit = Edit(_free_half(), time=0.04, density=90.0)
-    expected = _frames(_with(make_pipeline(), edit), 3)[-1]
-    pipeline = make_pipeline()
-    state, _ = pipeline.advance(pipeline.start())
-    state = pipeline.edit(state, edit)
+    expected = _frames(_with(make_simulation(), edit), 3)[-1]
+    simulation = make_simulation()
+    state, _ = simulation.advance(simulation.start())
+    state = simulation.edit(state, edit)
     for _ in range(2):
-        state, _ = pipeline.advance(state)
+        state, _ = simulation.advance(state)
     assert torch.equal(state.position, expected.position)
-    mass = pipeline.solver.points.mass
+    mass = simulation.solver.points.mass
     assert float(mass.max() / mass.min()) > 2.0
 
 
-def test_sand_becomes_foam(make_cloud, make_pipeline):
+def test_sand_becomes_foam(make_cloud, make_simulation):
     """The paper's edit: the internal variable of sand is gone, deformations and positions are not."""
     block = make_cloud(60, degree=0)
     material = Material(E=1e5, nu=0.3, density=1600.0, thickness=0.2, law=Sand(friction_angle=30.0))
     settings = {"material": material, "pinned": False, "formulation": "updated", "wind": WindField()}
     foam = Edit(time=0.04, E=2e3, density=100.0, law=Foam(50.0, 1.0), color=WHITE)
-    pipeline = _with(make_pipeline(block, **settings), foam)
-    states = _frames(pipeline, 2)
-    assert [type(law) for law in pipeline.solver.points.laws] == [Foam]
+    simulation = _with(make_simulation(block, **settings), foam)
+    states = _frames(simulation, 2)
+    assert [type(law) for law in simulation.solver.points.laws] == [Foam]
     assert states[1].internal is None or not states[1].internal.any()
     assert torch.isfinite(states[2].position).all()
-    plain = _frames(make_pipeline(block, **settings), 1)
+    plain = _frames(make_simulation(block, **settings), 1)
     assert torch.equal(states[1].F_total, plain[1].F_total)
     assert torch.equal(states[1].F_elastic, plain[1].F_elastic)
 
 
-def test_what_has_flowed_and_turns_elastic_keeps_its_shape(make_cloud, make_pipeline):
+def test_what_has_flowed_and_turns_elastic_keeps_its_shape(make_cloud, make_simulation):
     """Both deformations go on: the elastic one drives the stress, the total one covariances and normals."""
     material = Material(E=1e5, density=1000.0, thickness=0.2, law=Plasticine(1.0, 0.0, 1.0))
-    pipeline = make_pipeline(make_cloud(60, degree=0), material=material, pinned=False, formulation="updated")
-    state = pipeline.start()
+    simulation = make_simulation(make_cloud(60, degree=0), material=material, pinned=False, formulation="updated")
+    state = simulation.start()
     shear = torch.tensor([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # 1/s, so 0.16 within a frame
     state = state.replace(velocity=state.position @ shear.T, affine=shear.expand_as(state.affine))
-    state, _ = pipeline.advance(state)
-    flowed = pipeline.edit(state, Edit(law=NeoHookean()))
+    state, _ = simulation.advance(state)
+    flowed = simulation.edit(state, Edit(law=NeoHookean()))
     gap = float((flowed.F_total - flowed.F_elastic).abs().max())
     assert gap > 0.05
-    end, _ = pipeline.advance(flowed)
+    end, _ = simulation.advance(flowed)
     assert float((end.F_total - end.F_elastic).abs().max()) > 0.5 * gap
     # the factor of flow that is kept: F_total = F_elastic F_plastic
     kept = torch.linalg.solve(end.F_elastic, end.F_total)
@@ -212,7 +212,7 @@ def test_what_has_flowed_and_turns_elastic_keeps_its_shape(make_cloud, make_pipe
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-def test_the_kernels_take_an_edit(formulation, make_cloud, make_pipeline):
+def test_the_kernels_take_an_edit(formulation, make_cloud, make_simulation):
     """The Triton substep before and after, also where a law that flowed turns elastic, against the one in torch."""
     if formulation == "updated":
         material, law = Material(E=1e5, density=1000.0, thickness=0.2, law=Plasticine(1.0, 0.0, 1.0)), NeoHookean()
@@ -222,7 +222,7 @@ def test_the_kernels_take_an_edit(formulation, make_cloud, make_pipeline):
     ends = []
     for transfer in ("torch", "triton"):
         try:
-            pipeline = make_pipeline(
+            simulation = make_simulation(
                 make_cloud(24, degree=0),
                 material=material,
                 pinned=False,
@@ -232,17 +232,17 @@ def test_the_kernels_take_an_edit(formulation, make_cloud, make_pipeline):
                 frame_dt=0.008,
                 dx=0.4,
             )
-            pipeline.start()
+            simulation.start()
         except ValueError as error:
             pytest.skip(str(error))  # neither a GPU nor Triton's interpreter
-        state = pipeline.solver.init_state(
-            pipeline.scene.points, pipeline.scene.points.position @ shear.T, frame=pipeline.scene.frame
+        state = simulation.solver.init_state(
+            simulation.scene.points, simulation.scene.points.position @ shear.T, frame=simulation.scene.frame
         )
         for edit in (Edit(E=3e5, law=law), Edit(Box([0.5, None, None], [None] * 3), E=2e5, law=law)):
-            state, _ = pipeline.advance(state)
-            state = pipeline.edit(state, edit)
-        state, _ = pipeline.advance(state)
-        assert (pipeline.solver.fused() is not None) == (transfer == "triton")
+            state, _ = simulation.advance(state)
+            state = simulation.edit(state, edit)
+        state, _ = simulation.advance(state)
+        assert (simulation.solver.fused() is not None) == (transfer == "triton")
         ends.append(state)
     for name in ("position", "velocity", "F_elastic", "F_total"):
         one, two = (getattr(end, name) for end in ends)
@@ -253,16 +253,16 @@ def test_the_kernels_take_an_edit(formulation, make_cloud, make_pipeline):
 
 
 @pytest.mark.parametrize("stop", [2, 3])
-def test_a_resumed_run_is_the_same_run(stop, make_pipeline, tmp_path):
+def test_a_resumed_run_is_the_same_run(stop, make_simulation, tmp_path):
     """Stopped before or after the edit, positions and pictures are those of the run that was not."""
     edits = [
         Edit(_free_half(), time=0.0, color=[0.0, 1.0, 0.0]),
         Edit(_free_half(), time=0.08, E=2e4, density=60.0, law=NeoHookean(), color=WHITE),
     ]
     one, two = tmp_path / "one", tmp_path / "two"
-    whole = _with(make_pipeline(), *edits).run(Recorder(), one, 5, progress=False)
-    _with(make_pipeline(), *edits).run(Recorder(), two, stop, progress=False)
-    resumed = _with(make_pipeline(), *edits).run(Recorder(), two, 5, resume=True, progress=False)
+    whole = _with(make_simulation(), *edits).run(one, 5, progress=False, recorder=Recorder())
+    _with(make_simulation(), *edits).run(two, stop, progress=False, recorder=Recorder())
+    resumed = _with(make_simulation(), *edits).run(two, 5, resume=True, progress=False, recorder=Recorder())
     assert resumed["per_frame"] == whole["per_frame"]
     assert resumed["edits"] == whole["edits"] == 2
     for frame in range(5):
@@ -275,29 +275,29 @@ def test_a_resumed_run_is_the_same_run(stop, make_pipeline, tmp_path):
     assert (one / "frames/00001.png").read_bytes() != (one / "frames/00002.png").read_bytes()
 
 
-def test_what_cannot_be_is_refused_before_anything_is_written(make_pipeline, tmp_path):
+def test_what_cannot_be_is_refused_before_anything_is_written(make_simulation, tmp_path):
     folder = tmp_path / "run"
-    flows = _with(make_pipeline(), Edit(time=0.08, law=Sand(friction_angle=30.0)))
+    flows = _with(make_simulation(), Edit(time=0.08, law=Sand(friction_angle=30.0)))
     with pytest.raises(ValueError, match=r"Sand flows.*`solver.formulation` to updated"):
-        flows.run(Recorder(), folder, 2, progress=False)
-    stiff = _with(make_pipeline(substep=0.004), Edit(time=0.08, E=3e7))
+        flows.run(folder, 2, progress=False, recorder=Recorder())
+    stiff = _with(make_simulation(substep=0.004), Edit(time=0.08, E=3e7))
     with pytest.raises(ValueError, match=r"fixed `substep` of 0\.004 s is longer than the stable one"):
-        stiff.run(Recorder(), folder, 2, progress=False)
+        stiff.run(folder, 2, progress=False, recorder=Recorder())
     with pytest.raises(ValueError, match=r"of `edits` at 0\.08 s holds no simulated Gaussian"):
-        _with(make_pipeline(), Edit(Box([9, 9, 9], [10, 10, 10]), time=0.08, E=1.0))
+        _with(make_simulation(), Edit(Box([9, 9, 9], [10, 10, 10]), time=0.08, E=1.0))
     with pytest.raises(ValueError, match="of `edits` at 0 s holds no Gaussian"):
-        _with(make_pipeline(), Edit(Box([9, 9, 9], [10, 10, 10]), color=WHITE))
+        _with(make_simulation(), Edit(Box([9, 9, 9], [10, 10, 10]), color=WHITE))
     assert not folder.exists()
 
 
 @pytest.mark.gpu
-def test_a_gpu_goes_on_with_new_graphs(make_pipeline):
+def test_a_gpu_goes_on_with_new_graphs(make_simulation):
     """The kernels and graphs that were recorded hold the old stiffness."""
     ends = []
     for device in ("cpu", "cuda"):
-        pipeline = make_pipeline().to(device)
-        _with(pipeline, Edit(_free_half(), time=0.08, E=3e4))
-        ends.append(_frames(pipeline, 4)[-1].position.cpu().numpy())
-    plain = _frames(make_pipeline(), 4)[-1].position.numpy()
+        simulation = make_simulation().to(device)
+        _with(simulation, Edit(_free_half(), time=0.08, E=3e4))
+        ends.append(_frames(simulation, 4)[-1].position.cpu().numpy())
+    plain = _frames(make_simulation(), 4)[-1].position.numpy()
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-4)
     assert np.abs(ends[0] - plain).max() > 1e-3

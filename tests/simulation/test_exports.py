@@ -16,17 +16,17 @@ QUIET = {"video": False, "images": False, "trajectory": False}
 @pytest.mark.parametrize(
     ("format", "suffix", "size"), [("splat", ".splat", 96 * 32), ("compressed_ply", ".compressed.ply", None)]
 )
-def test_small_formats(format, suffix, size, make_pipeline, tmp_path):
-    pipeline = make_pipeline()
-    pipeline.run(Recorder(ply_every=2, export_format=format, **QUIET), tmp_path / "run", 3, progress=False)
+def test_small_formats(format, suffix, size, make_simulation, tmp_path):
+    simulation = make_simulation()
+    simulation.run(tmp_path / "run", 3, progress=False, recorder=Recorder(ply_every=2, export_format=format, **QUIET))
     files = sorted((tmp_path / "run" / format).iterdir())
     assert [file.name for file in files] == [f"00000{suffix}", f"00002{suffix}"]
     assert files[0].read_bytes() != files[1].read_bytes()
     assert size is None or files[0].stat().st_size == size
-    assert tmp_path / "run" / format in pipeline.files
+    assert tmp_path / "run" / format in simulation.files
 
 
-def test_a_film_in_usd(make_pipeline, tmp_path):
+def test_a_film_in_usd(make_simulation, tmp_path):
     """Every frame of the run, resumed or not, as its .ply has it; metres, z up and the time of the run."""
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
@@ -34,10 +34,10 @@ def test_a_film_in_usd(make_pipeline, tmp_path):
     folder, scene = tmp_path / "run", {"metres_per_unit": 2.0}
     for frames in (2, 4):
         usd = Recorder(ply_every=1, export_format="usd", **QUIET)
-        pipeline = make_pipeline(scene=scene)
-        pipeline.run(usd, folder, frames, resume=frames > 2, progress=False)
-    plain = make_pipeline(scene=scene)
-    plain.run(Recorder(ply_every=1, **QUIET), tmp_path / "plain", 4, progress=False)
+        simulation = make_simulation(scene=scene)
+        simulation.run(folder, frames, resume=frames > 2, progress=False, recorder=usd)
+    plain = make_simulation(scene=scene)
+    plain.run(tmp_path / "plain", 4, progress=False, recorder=Recorder(ply_every=1, **QUIET))
     for frame in range(4):
         found, expected = (
             read_usd_frame(folder / "animation.usdc", frame),
@@ -51,24 +51,24 @@ def test_a_film_in_usd(make_pipeline, tmp_path):
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 3, 25)
     assert UsdGeom.GetStageMetersPerUnit(stage) == 2.0
     assert not (folder / "usd").exists()
-    assert folder / "animation.usdc" in pipeline.files
+    assert folder / "animation.usdc" in simulation.files
 
 
-def test_the_up_direction_of_a_film_is_z(flag_ply, make_pipeline, tmp_path):
+def test_the_up_direction_of_a_film_is_z(flag_ply, make_simulation, tmp_path):
     """In the world of the film every Gaussian is where the simulation has it, up to scale and origin."""
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
     settings = {"up": [0.0, 1.0, 0.0], "longest_side": 1.2}
-    pipeline = make_pipeline(read_ply(flag_ply), pinned=False, scene=settings)
+    simulation = make_simulation(read_ply(flag_ply), pinned=False, scene=settings)
     usd = Recorder(ply_every=1, export_format="usd", **QUIET)
-    pipeline.run(usd, tmp_path / "run", 1, progress=False)
+    simulation.run(tmp_path / "run", 1, progress=False, recorder=usd)
     stage = Usd.Stage.Open(str(tmp_path / "run" / "animation.usdc"))
     prim = stage.GetPrimAtPath("/World/Gaussians")
     matrix = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0))
     points = np.array(prim.GetAttribute("positions").Get(0), dtype=np.float64) @ matrix[:3, :3]
     points = points * UsdGeom.GetStageMetersPerUnit(stage)
-    expected = pipeline.scene.points.position.double().numpy()
+    expected = simulation.scene.points.position.double().numpy()
     np.testing.assert_allclose(points - points.mean(0), expected - expected.mean(0), atol=1e-5)
 
 

@@ -65,32 +65,32 @@ def test_indices_of_extremes():
     assert particle_of_extremes(torch.tensor([0.1, 0.2, 0.3]), squares).tolist() == [2, 2, 1]
 
 
-def test_a_run_that_folds_says_so_and_keeps_it(make_pipeline, tmp_path, capsys):
-    pipeline = make_pipeline(material=Material(E=20.0, density=10.0))
-    summary = pipeline.run(Recorder(images=False, video=False), tmp_path / "bad", 12)
+def test_a_run_that_folds_says_so_and_keeps_it(make_simulation, tmp_path, capsys):
+    simulation = make_simulation(material=Material(E=20.0, density=10.0))
+    summary = simulation.run(tmp_path / "bad", 12, recorder=Recorder(images=False, video=False))
     assert summary["stretch_max"] > 2
     said = capsys.readouterr().err
     for sentence in summary["warnings"]:
         assert f"warning: {sentence}" in said
     worst = max(summary["per_frame"], key=lambda frame: frame["displacement_max"])
-    place = pipeline.scene.model.means[pipeline.scene.simulated[worst["moved_particle"]]]
+    place = simulation.scene.model.means[simulation.scene.simulated[worst["moved_particle"]]]
     assert summary["extremes"]["moved"]["at"] == pytest.approx(place.tolist(), abs=1e-3)
     assert summary["extremes"]["moved"]["value"] == worst["displacement_max"]
     assert json.loads((tmp_path / "bad/summary.json").read_text())["warnings"] == summary["warnings"]
-    still = make_pipeline(material=Material(E=1e5, density=30.0))
-    good = still.run(Recorder(images=False, video=False), tmp_path / "good", 3)
+    still = make_simulation(material=Material(E=1e5, density=30.0))
+    good = still.run(tmp_path / "good", 3, recorder=Recorder(images=False, video=False))
     assert good["warnings"] == []
     assert "warning" not in capsys.readouterr().err
 
 
-def test_what_flows_is_not_reproached_with_its_stretch(make_pipeline, make_cloud):
-    pipeline = make_pipeline(
+def test_what_flows_is_not_reproached_with_its_stretch(make_simulation, make_cloud):
+    simulation = make_simulation(
         make_cloud(count=300), material=Material(E=1e4, law=Sand()), pinned=False, formulation="updated"
     )
     with torch.inference_mode():
-        pipeline.start()
+        simulation.start()
     log = [entry(0.1, low=(0.01, 0), high=(9.0, 1))]
-    found, said = pipeline.health(log)
+    found, said = simulation.health(log)
     assert said == []
     assert found["stretched"] is None
     assert found["moved"]["value"] == 0.1

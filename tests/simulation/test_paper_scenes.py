@@ -10,7 +10,7 @@ import yaml
 from gaussian_swaying.cli.simulate import output_folder
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 CONFIGS = Path(__file__).parents[2] / "configs/sim"
 # E, nu, density, C_D, C_F, C_L, flow, from the paper's table of parameters
@@ -37,7 +37,7 @@ def test_every_scene_has_its_preset():
 
 @pytest.mark.parametrize("name", PAPER)
 def test_the_numbers_are_the_papers(name):
-    settings = build_parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
+    settings = Simulation.parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
     material, aero, wind = settings.material, settings.aero, settings.wind
     flow = wind.schedule[0].flow if wind.schedule else wind.flow
     assert (material.E, material.nu, material.density) == PAPER[name][:3]
@@ -54,7 +54,7 @@ def test_the_numbers_are_the_papers(name):
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.yaml")))
 def test_what_flows_has_a_limit_on_its_area_and_all_have_one_on_what_is_drawn(name):
-    settings = build_parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
+    settings = Simulation.parser().parse_args(["--config", str(CONFIGS / f"{name}.yaml")])
     law = settings.material.law
     flows = law is not None and law.class_path.endswith("Sand")
     assert settings.aero.max_area_ratio == (1.0 if flows else None)
@@ -62,7 +62,7 @@ def test_what_flows_has_a_limit_on_its_area_and_all_have_one_on_what_is_drawn(na
 
 
 def test_the_wind_of_the_vase_turns():
-    parser = build_parser()
+    parser = Simulation.parser()
     wind = parser.instantiate(parser.parse_args(files("vase"))).wind
     assert [wind.mean_flow(torch.tensor(t, dtype=torch.float64)).tolist() for t in (0.0, 9.0)] == [
         [-1.5, 0, 0],
@@ -76,7 +76,7 @@ def test_the_preset_is_a_small_version(name):
 
     A coarse grid is stiffer, so thicknesses, which the paper leaves open, may be smaller; nothing else differs.
     """
-    parser = build_parser()
+    parser = Simulation.parser()
     full, small = (parser.parse_args(arguments) for arguments in (files(name)[:2], files(name)))
     changed = yaml.safe_load((CONFIGS / f"preview/{name}.yaml").read_text())
     if name == "sand":  # half as long, of a larger bear, as sand takes the most substeps
@@ -96,36 +96,36 @@ def test_the_preset_is_a_small_version(name):
     assert small.solver.dx > full.solver.dx
     assert (small.camera.init_args.width, small.camera.init_args.height) == (480, 270)
     assert output_folder(small) == Path("outputs") / name
-    pipeline, _ = build_pipeline(parser, small)
-    assert 500 < pipeline.scene.points.count < 5000
+    simulation = Simulation.from_settings(parser, small)
+    assert 500 < simulation.scene.points.count < 5000
     with torch.inference_mode():
-        pipeline.start()
+        simulation.start()
 
 
 @pytest.mark.parametrize("name", ["alocasia", "sand"])
 def test_two_frames(name):
     """The first steps of a stalk and of sand: all particles kept, something moves, and the picture shows the object."""
-    parser = build_parser()
+    parser = Simulation.parser()
     spacing, dx = {"alocasia": (0.1, 0.2), "sand": (0.15, 0.3)}[name]
     size = ["--camera.init_args.width", "64", "--camera.init_args.height", "36", "--device", "cpu"]
     size += ["--scene.generator.init_args.spacing", str(spacing), "--solver.dx", str(dx)]
-    pipeline, _ = build_pipeline(parser, parser.parse_args([*files(name), *size]))
+    simulation = Simulation.from_settings(parser, parser.parse_args([*files(name), *size]))
     with torch.inference_mode():
-        state = pipeline.start()
+        state = simulation.start()
         for _ in range(2):
-            state, health = pipeline.advance(state)
-        picture = pipeline.render(state, 2).color
+            state, health = simulation.advance(state)
+        picture = simulation.painter.render(state, 2).color
     assert health.lost == 0
-    assert 0 < health.displacement_mean < 0.1 * pipeline.scene.size
+    assert 0 < health.displacement_mean < 0.1 * simulation.scene.size
     assert math.isfinite(health.kinetic)
-    assert float((picture - pipeline.background).abs().amax()) > 0.2
+    assert float((picture - simulation.painter.background).abs().amax()) > 0.2
 
 
 def test_a_capture_takes_the_place_of_the_generated_splat(tmp_path):
     path = tmp_path / "capture.ply"
     write_ply(path, FlagScene(spacing=0.1).generate())
-    parser = build_parser()
+    parser = Simulation.parser()
     settings = parser.parse_args(["--config", str(CONFIGS / "flag2.yaml"), "--scene.ply", str(path), "--device", "cpu"])
-    pipeline, _ = build_pipeline(parser, settings)
-    assert len(pipeline.scene.simulated) == 96
-    assert pipeline.scene.points.count == 3 * 96  # three layers
+    simulation = Simulation.from_settings(parser, settings)
+    assert len(simulation.scene.simulated) == 96
+    assert simulation.scene.points.count == 3 * 96  # three layers

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gaussian_swaying.cli.simulate import main
-from gaussian_swaying.simulation.config import build_parser
+from gaussian_swaying.simulation.simulation import Simulation
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"
 
@@ -13,7 +13,7 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"
 @pytest.mark.parametrize("path", sorted((CONFIGS / "preview").glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_preset_is_reached(path):
     config = str(CONFIGS / path.name)
-    parser = build_parser()
+    parser = Simulation.parser()
     short = parser.parse_args(["--config", config, "--preset", "preview"])
     long = parser.parse_args(["--config", config, "--config", str(path)])
     full = parser.parse_args(["--config", config])
@@ -25,7 +25,7 @@ def test_every_preset_is_reached(path):
 
 def test_options_after_a_preset_override_it():
     given = ["--config", str(CONFIGS / "flag2.yaml"), "--preset", "preview", "--solver.dx", "0.123"]
-    assert build_parser().parse_args(given).solver.dx == 0.123
+    assert Simulation.parser().parse_args(given).solver.dx == 0.123
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import torch
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation import pipeline as pipeline_module
 from gaussian_swaying.simulation import progress as progress_module
+from gaussian_swaying.simulation import simulation as simulation_module
 from gaussian_swaying.simulation.progress import RunProgress
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
@@ -128,7 +128,7 @@ def test_substeps_without_end_are_refused(arguments, words, tmp_path, capsys):
 
 
 def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(pipeline_module, "MAX_SUBSTEPS", 20)
+    monkeypatch.setattr(simulation_module, "MAX_SUBSTEPS", 20)
     assert main([*SMALL, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert "substeps, and 20 are the most" in said
@@ -138,14 +138,14 @@ def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monk
 def test_the_cameras_of_a_billion_frames(tmp_path, monkeypatch):
     """Some of them are looked at, with the first and the last."""
     seen = []
-    monkeypatch.setattr(pipeline_module.SimulationPipeline, "check_camera", lambda self, frame: seen.append(frame))
+    monkeypatch.setattr(simulation_module.Simulation, "check_camera", lambda self, frame: seen.append(frame))
 
     def stop(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline_module.SimulationPipeline, "start", stop)
+    monkeypatch.setattr(simulation_module.Simulation, "start", stop)
     assert main([*SMALL, "--frames", "1000000000", "--output", str(tmp_path / "run")]) == 130
-    assert len(seen) == pipeline_module.MAX_LOOKS
+    assert len(seen) == simulation_module.MAX_LOOKS
     assert (seen[0], seen[-1]) == (0, 999_999_999)
     seen.clear()
     assert main([*SMALL, "--frames", "7", "--output", str(tmp_path / "run")]) == 130

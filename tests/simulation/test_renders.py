@@ -16,9 +16,9 @@ SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5
 ALL = ["color", "depth", "normal", "force"]
 
 
-def _cameras(pipeline, **cameras):
-    pipeline.cameras = cameras
-    return pipeline
+def _cameras(simulation, **cameras):
+    simulation.painter.cameras = cameras
+    return simulation
 
 
 def test_names_of_folders_and_videos():
@@ -29,9 +29,9 @@ def test_names_of_folders_and_videos():
     assert video_file("cameras/side/depth") == "cameras/side/depth.mp4"
 
 
-def test_files_of_a_run_with_two_cameras_and_all_renders(make_pipeline, tmp_path):
-    pipeline = _cameras(make_pipeline(), side=SIDE)
-    summary = pipeline.run(Recorder(renders=ALL), tmp_path / "run", 2, progress=False)
+def test_files_of_a_run_with_two_cameras_and_all_renders(make_simulation, tmp_path):
+    simulation = _cameras(make_simulation(), side=SIDE)
+    summary = simulation.run(tmp_path / "run", 2, progress=False, recorder=Recorder(renders=ALL))
     for prefix, size in (("", (18, 32)), ("cameras/side/", (20, 24))):
         for folder in ("frames", "depth", "normal", "force"):
             for frame in range(2):
@@ -44,14 +44,20 @@ def test_files_of_a_run_with_two_cameras_and_all_renders(make_pipeline, tmp_path
         assert raw.shape == size
         assert raw.dtype == np.uint16
     assert summary["force_scale_Pa"] == pytest.approx(0.5 * 1.225 * (6.0**2 + 1.5**2) * 0.91)
-    assert {path.name for path in pipeline.files} >= {"video.mp4", "depth.mp4", "normal.mp4", "force.mp4", "depth_raw"}
+    assert {path.name for path in simulation.files} >= {
+        "video.mp4",
+        "depth.mp4",
+        "normal.mp4",
+        "force.mp4",
+        "depth_raw",
+    }
 
 
-def test_the_depth_on_disk_is_in_metres(make_pipeline, tmp_path):
-    pipeline = make_pipeline(scene={"metres_per_unit": 2.0})
-    pipeline.run(Recorder(renders=["depth"], depth_step=0.01), tmp_path / "run", 1, progress=False)
-    state = pipeline.start()
-    depth = 2.0 * mean_depth(pipeline.render(state, 0)).numpy()
+def test_the_depth_on_disk_is_in_metres(make_simulation, tmp_path):
+    simulation = make_simulation(scene={"metres_per_unit": 2.0})
+    simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["depth"], depth_step=0.01))
+    state = simulation.start()
+    depth = 2.0 * mean_depth(simulation.painter.render(state, 0)).numpy()
     raw = iio.imread(tmp_path / "run" / "depth_raw" / "00000.png")
     assert (raw > 0).any()
     assert np.abs(0.01 * raw - depth).max() <= 0.005 + 1e-5
@@ -59,44 +65,50 @@ def test_the_depth_on_disk_is_in_metres(make_pipeline, tmp_path):
     assert not (tmp_path / "run" / "video.mp4").exists()
 
 
-def test_normals_of_a_flat_flag(make_pipeline):
+def test_normals_of_a_flat_flag(make_simulation):
     """Seen along its normal -y: towards the camera in its axes, -y in the world's, whatever the scene's up."""
-    pipeline = _cameras(make_pipeline(), side=SIDE)
-    camera, rest = pipeline.camera_at(0, "side"), pipeline.scene.rest()
+    simulation = _cameras(make_simulation(), side=SIDE)
+    camera, rest = simulation.painter.camera_at(0, "side"), simulation.scene.rest()
     for axes, normal in (("camera", [0.0, 0.0, 1.0]), ("world", [0.0, -1.0, 0.0])):
-        found = 2 * pipeline.draw_normals(rest, camera, axes)[10, 12] - 1
+        found = 2 * simulation.painter.draw_normals(rest, camera, axes)[10, 12] - 1
         # the flag ripples: its slope is up to 2 pi 1.5 ripple / width = 0.24
         assert float(found @ torch.tensor(normal)) > 0.95
         assert float(found.norm()) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_normals_in_world_axes_are_those_of_the_z_up_frame(flag_ply, make_pipeline):
+def test_normals_in_world_axes_are_those_of_the_z_up_frame(flag_ply, make_simulation):
     from gaussian_swaying.gaussians.ply import read_ply
 
-    pipeline = _cameras(make_pipeline(read_ply(flag_ply), pinned=False, scene={"up": [0.0, 1.0, 0.0]}), side=SIDE)
-    found = 2 * pipeline.draw_normals(pipeline.scene.rest(), pipeline.camera_at(0, "side"), "world")[10, 12] - 1
-    expected = pipeline.scene.patch_normal[len(pipeline.scene.patch_normal) // 2]
+    simulation = _cameras(make_simulation(read_ply(flag_ply), pinned=False, scene={"up": [0.0, 1.0, 0.0]}), side=SIDE)
+    found = (
+        2
+        * simulation.painter.draw_normals(simulation.scene.rest(), simulation.painter.camera_at(0, "side"), "world")[
+            10, 12
+        ]
+        - 1
+    )
+    expected = simulation.scene.patch_normal[len(simulation.scene.patch_normal) // 2]
     assert abs(float(found @ expected)) > 0.95
     assert abs(float(found[2])) < 0.1  # the flag hangs, so no normal points up
 
 
-def test_the_force_is_that_of_the_wind(make_pipeline):
+def test_the_force_is_that_of_the_wind(make_simulation):
     """Full drag and friction on a patch at rest, which the wind meets head-on, and nothing in still air."""
     aero = AeroForce(C_D=0.5, C_F=0.0, C_L=0.0)
-    pipeline = make_pipeline(wind=WindField([0.0, 4.0, 0.0]), aero=aero)
-    state = pipeline.start()
-    pressure = pipeline.wind_pressure(state)
+    simulation = make_simulation(wind=WindField([0.0, 4.0, 0.0]), aero=aero)
+    state = simulation.start()
+    pressure = simulation.wind_pressure(state)
     torch.testing.assert_close(pressure, torch.full_like(pressure, 0.5 * 1.225 * 16 * 0.5))
-    assert pipeline.force_scale() == pytest.approx(float(pressure[0]))
-    camera = pipeline.camera_at(0)
-    picture = pipeline.draw_force(state, pipeline.scene.rest(), camera, 2 * float(pressure[0]))
+    assert simulation.force_scale() == pytest.approx(float(pressure[0]))
+    camera = simulation.painter.camera_at(0)
+    picture = simulation.draw_force(state, simulation.scene.rest(), camera, 2 * float(pressure[0]))
     covered = picture.any(-1)
     assert bool(covered.any())
     expected = colormap(torch.tensor(0.5)).expand_as(picture[covered])
     torch.testing.assert_close(picture[covered], expected, rtol=0, atol=1e-5)
     moving = state.replace(velocity=torch.tensor([0.0, 4.0, 0.0]).expand_as(state.velocity))
-    assert float(pipeline.wind_pressure(moving).abs().max()) < 1e-6
-    assert not make_pipeline(aero=AeroForce(air_density=0.0)).wind_pressure(state).any()
+    assert float(simulation.wind_pressure(moving).abs().max()) < 1e-6
+    assert not make_simulation(aero=AeroForce(air_density=0.0)).wind_pressure(state).any()
 
 
 def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
@@ -116,24 +128,20 @@ def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     assert not found[static].any()
 
 
-def test_a_resumed_run_has_all_pictures(make_pipeline, tmp_path):
+def test_a_resumed_run_has_all_pictures(make_simulation, tmp_path):
     folder, recorder = tmp_path / "run", {"renders": ["color", "normal"]}
-    _cameras(make_pipeline(), side=SIDE).run(Recorder(**recorder), folder, 1, progress=False)
-    _cameras(make_pipeline(), side=SIDE).run(Recorder(**recorder), folder, 3, resume=True, progress=False)
+    _cameras(make_simulation(), side=SIDE).run(folder, 1, progress=False, recorder=Recorder(**recorder))
+    _cameras(make_simulation(), side=SIDE).run(folder, 3, resume=True, progress=False, recorder=Recorder(**recorder))
     for place in ("frames", "normal", "cameras/side/frames", "cameras/side/normal"):
         assert len(list((folder / place).glob("[0-9]*.png"))) == 3
         assert len(iio.imread(folder / video_file(place))) == 3
 
 
-def test_bad_names_and_renders(make_cloud, make_pipeline):
-    from gaussian_swaying.simulation.pipeline import SimulationPipeline
-
-    one = make_pipeline()
-    parts = (one.scene, one.solver, one.wind, one.aero, None, one.camera)
+def test_bad_names_and_renders(make_cloud, make_simulation):
     with pytest.raises(ValueError, match=r"name of `cameras` .* but got '\.\./up'"):
-        SimulationPipeline(*parts, cameras={"../up": SIDE})
+        make_simulation(parts={"cameras": {"../up": SIDE}})
     inside = _cameras(
-        make_pipeline(make_cloud(), pinned=False), near=OrbitCamera(width=8, height=8, radius=0.01, elevation=0.1)
+        make_simulation(make_cloud(), pinned=False), near=OrbitCamera(width=8, height=8, radius=0.01, elevation=0.1)
     )
     with pytest.raises(ValueError, match=r"lies inside the object.*`cameras\.near\.init_args\.radius`"):
         inside.check_camera(0)

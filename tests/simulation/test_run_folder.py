@@ -18,18 +18,18 @@ FRAMES = 3
 
 
 @pytest.fixture
-def run(make_pipeline, tmp_path):
+def run(make_simulation, tmp_path):
     """A complete run of three frames whose trajectory of the last is not joined yet, and how to go on to a fourth."""
-    pipeline, folder = make_pipeline(), tmp_path / "run"
+    simulation, folder = make_simulation(), tmp_path / "run"
     recorder = Recorder(renders=["color", "depth"], ply_every=1)
-    pipeline.run(recorder, folder, FRAMES, progress=False)
+    simulation.run(folder, FRAMES, progress=False, recorder=recorder)
     (folder / "trajectory").mkdir()
     position, F = load_trajectory(folder / "trajectory.npz", 2)
     arrays = {"position_00002": position.numpy(), "F_00002": F.numpy().astype(np.float16)}
     np.savez(folder / "trajectory" / "00002.npz", **arrays)
 
     def resume():
-        return pipeline.run(recorder, folder, FRAMES + 1, resume=True, progress=False)
+        return simulation.run(folder, FRAMES + 1, resume=True, progress=False, recorder=recorder)
 
     return folder, resume
 

@@ -48,16 +48,16 @@ def test_everything_follows_a_linear_motion_and_stays_at_rest(make_scene):
     assert float(values.min()) <= float(found.min()) <= float(found.max()) <= float(values.max())
 
 
-def test_it_moves_as_with_all_points(make_pipeline):
+def test_it_moves_as_with_all_points(make_simulation):
     """A flag of 11 points a cell: half a second of wind, within a twentieth of the distance moved."""
     ends = {}
     for sampling in ("gaussian", "grid"):
-        pipeline = make_pipeline(cloud=FlagScene(spacing=0.03).generate(), dx=0.2, scene={"sampling": sampling})
+        simulation = make_simulation(cloud=FlagScene(spacing=0.03).generate(), dx=0.2, scene={"sampling": sampling})
         with torch.inference_mode():
-            state = pipeline.start()
+            state = simulation.start()
             for _ in range(12):
-                state, _ = pipeline.advance(state)
-            ends[sampling] = pipeline.scene.deformed(state).means - pipeline.scene.rest().means
+                state, _ = simulation.advance(state)
+            ends[sampling] = simulation.scene.deformed(state).means - simulation.scene.rest().means
     moved = ends["gaussian"].norm(dim=-1)
     assert float(moved.max()) > 0.1
     assert float((ends["grid"] - ends["gaussian"]).norm(dim=-1).mean()) < 0.05 * float(moved.mean())
@@ -76,12 +76,12 @@ def test_further_points_are_grouped_with_the_gaussians(make_scene):
                        full.points.position[torch.isin(full.simulated, scene.simulated).nonzero()[:, 0]])  # fmt: skip
 
 
-def test_what_is_drawn_as_held_and_simulated_are_all_gaussians(make_pipeline):
-    pipeline = make_pipeline(cloud=FlagScene(spacing=0.02).generate(), dx=0.2, scene={"sampling": "grid"})
-    parts = classify(pipeline)
+def test_what_is_drawn_as_held_and_simulated_are_all_gaussians(make_simulation):
+    simulation = make_simulation(cloud=FlagScene(spacing=0.02).generate(), dx=0.2, scene={"sampling": "grid"})
+    parts = classify(simulation)
     assert bool(parts.simulated.all())
     assert not bool(parts.carried.any())
-    assert torch.equal(parts.pinned, pipeline.scene.model.means[:, 0] <= 0.11)
+    assert torch.equal(parts.pinned, simulation.scene.model.means[:, 0] <= 0.11)
 
 
 def test_bad_sampling_is_refused(make_scene):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.filling import InteriorFilling
@@ -19,10 +18,9 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
+from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 DX = 0.12  # m
@@ -37,14 +35,15 @@ def _scene(gaussians="shell", material=None, dtype=torch.float32, generator=None
     return SimulatedScene(Scene(generator=generator, **settings), material or Material(density=200.0), DX, dtype)
 
 
-def _pipeline(scene, **solver):
-    return SimulationPipeline(
-        scene,
-        MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.24]))], **solver),
+def _simulation(material=None, solver=None, **scene):
+    settings = {"generator": SolidScene(**SETTINGS), "filling": FILLING, **scene}
+    return Simulation(
+        Scene(**settings),
+        material or Material(density=200.0),
+        MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.24]))], **(solver or {})),
         WindField([6.0, 0.0, 0.0]),
-        AeroForce(),
-        None,
-        OrbitCamera(width=32, height=18, radius=2.0),
+        camera=OrbitCamera(width=32, height=18, radius=2.0),
+        device="cpu",
     )
 
 
@@ -75,12 +74,12 @@ def test_filled_points_feel_no_wind():
     assert torch.equal(filled.patch_area[:count], hollow.patch_area)
     assert not bool(filled.patch_area[count:].any())
     forces = []
-    for scene in (filled, hollow):
-        pipeline = _pipeline(scene)
-        state = pipeline.start()
+    for settings in ({}, {"filling": None}):
+        simulation = _simulation(**settings)
+        state = simulation.start()
         turned = torch.eye(3) + 0.1 * torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 2.0], [0.0, 0.5, 0.3]])
         state = state.replace(F_total=turned.expand_as(state.F_total))
-        forces.append(pipeline.wind_force(state)[0])
+        forces.append(simulation.wind_force(state)[0])
     assert torch.equal(forces[0][:count], forces[1])
     assert not bool(forces[0][count:].any())
     assert float(forces[1].norm(dim=-1).min()) > 0
@@ -107,19 +106,18 @@ def test_wind_on_the_surface_or_on_all():
 
 
 def test_the_filling_is_neither_drawn_nor_exported(tmp_path):
-    scene = _scene()
-    pipeline = _pipeline(scene)
-    state = pipeline.start()
+    simulation = _simulation()
+    scene, state = simulation.scene, simulation.start()
     shift = torch.linspace(0, 0.1, len(state.position))[:, None]
     state = state.replace(position=state.position + shift, F_total=state.F_total * 1.1)
     deformed = scene.deformed(state)
     count = len(scene.simulated)
     assert len(deformed.means) == count == len(scene.model.means)
     torch.testing.assert_close(deformed.means, scene.model.means + shift[:count])
-    assert len(pipeline.cloud(deformed)) == count
+    assert len(simulation.painter.cloud(deformed)) == count
     # a point that fills can be anywhere: the picture is the same
     other = state.replace(position=torch.cat([state.position[:count], state.position[count:] + 0.3]))
-    assert torch.equal(pipeline.render(state, 0).color, pipeline.render(other, 0).color)
+    assert torch.equal(simulation.painter.render(state, 0).color, simulation.painter.render(other, 0).color)
 
 
 def test_carried_gaussians_follow_gaussians():
@@ -133,9 +131,9 @@ def test_carried_gaussians_follow_gaussians():
         def generate(self):
             return faint
 
-    scene = _scene(generator=Given())
+    simulation = _simulation(generator=Given())
+    scene, state = simulation.scene, simulation.start()
     assert len(scene.carried) > 0
-    state = _pipeline(scene).start()
     moved = torch.cat([state.position[: len(scene.simulated)] + 0.2, state.position[len(scene.simulated) :]])
     means = scene.deformed(state.replace(position=moved)).means
     torch.testing.assert_close(means, cloud.means + 0.2, rtol=0, atol=1e-6)
@@ -182,7 +180,7 @@ def test_a_run_of_a_filled_solid(tmp_path):
     """Video, export, trajectory, summary and a resumed run; a heavier body moves less than its hollow splat."""
     recorder = {"video": False, "ply_every": 2, "checkpoint_every": 1}
     short, whole = tmp_path / "short", tmp_path / "whole"
-    summary = _pipeline(_scene()).run(Recorder(**recorder), whole, 4, progress=False)
+    summary = _simulation().run(whole, 4, progress=False, recorder=Recorder(**recorder))
     scene = _scene()
     count = len(scene.simulated)
     assert summary["filled_particles"] == scene.filled > 0
@@ -196,12 +194,12 @@ def test_a_run_of_a_filled_solid(tmp_path):
     files = sorted(whole.rglob("*.ply"))
     assert len(files) == 2
     assert all(len(read_ply(file)) == count for file in files)
-    _pipeline(_scene()).run(Recorder(**recorder), short, 2, progress=False)
-    _pipeline(_scene()).run(Recorder(**recorder), short, 4, resume=True, progress=False)
+    _simulation().run(short, 2, progress=False, recorder=Recorder(**recorder))
+    _simulation().run(short, 4, resume=True, progress=False, recorder=Recorder(**recorder))
     with np.load(short / "trajectory.npz") as a, np.load(whole / "trajectory.npz") as b:
         assert a.files == b.files
         assert all(np.array_equal(a[name], b[name]) for name in a.files)
-    hollow = _pipeline(_scene(filling=None)).run(Recorder(**recorder), tmp_path / "hollow", 4, progress=False)
+    hollow = _simulation(filling=None).run(tmp_path / "hollow", 4, progress=False, recorder=Recorder(**recorder))
     assert summary["wind_work_J"] < 0.5 * hollow["wind_work_J"]
 
 
@@ -211,8 +209,8 @@ def test_a_filled_solid_on_a_gpu(formulation):
     """The kernels take patches of no area; the same run as on the CPU."""
     ends = []
     for device in ("cpu", "cuda"):
-        pipeline = _pipeline(_scene(), formulation=formulation).to(device)
-        state, _ = pipeline.advance(pipeline.start())
+        simulation = _simulation(solver={"formulation": formulation}).to(device)
+        state, _ = simulation.advance(simulation.start())
         ends.append(state.position.cpu())
     torch.testing.assert_close(ends[0], ends[1], rtol=0, atol=1e-5)
 
@@ -224,10 +222,10 @@ SMALL += ["--camera.init_args.height", "18", "--material.E", "5e3"]
 
 def test_the_pair_of_the_experiment_differs_in_the_wind_alone(tmp_path):
     """Wind on all Gaussians does more work on the same body."""
-    parser, scenes, work = build_parser(), [], []
+    parser, scenes, work = Simulation.parser(), [], []
     for name, extra in (("surface", []), ("all", ["--config", str(ROOT / "configs/sim/variants/solid_all_wind.yaml")])):
-        pipeline, _ = build_pipeline(parser, parser.parse_args([*SMALL, *extra]))
-        scenes.append(pipeline.scene)
+        simulation = Simulation.from_settings(parser, parser.parse_args([*SMALL, *extra]))
+        scenes.append(simulation.scene)
         assert main([*SMALL, *extra, "--output", str(tmp_path / name)]) == 0
         work.append(json.loads((tmp_path / name / "summary.json").read_text())["wind_work_J"])
     assert torch.equal(scenes[0].points.position, scenes[1].points.position)

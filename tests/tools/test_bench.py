@@ -10,7 +10,7 @@ from bench.tables import pareto as sweep
 from bench.tables.rows import order
 
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.simulation.config import build_parser
+from gaussian_swaying.simulation.simulation import Simulation
 
 PAGE = """# Validation
 
@@ -83,7 +83,7 @@ def test_the_default_is_that_of_the_solver():
     default = pareto.DEFAULT
     assert (solver.formulation, solver.cfl, solver.substep) == (default["variant"], default["cfl"], default["substep"])
     assert solver.mls is False
-    parser = build_parser()
+    parser = Simulation.parser()
     assert parser.get_default("dtype") == default["dtype"]
 
 

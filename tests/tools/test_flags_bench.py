@@ -10,7 +10,7 @@ from bench.cases import flags
 from bench.tables import flags as tables
 from imageio.v3 import imread, imwrite
 
-from gaussian_swaying.simulation.config import build_parser
+from gaussian_swaying.simulation.simulation import Simulation
 
 DRAG = {2: 0.8, 3: 1.28}
 PIXEL = imwrite("<bytes>", np.zeros((4, 6, 3), np.uint8), extension=".png")
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_every_row_is_a_command_line_that_parses(tmp_path):
-    parser = build_parser()
+    parser = Simulation.parser()
     for name, variant in flags.VARIANTS.items():
         for pattern in variant.patterns:
             settings = parser.parse_args(flags.sim_arguments(pattern, variant, tmp_path, None))
@@ -43,7 +43,7 @@ def test_pictures_have_the_size_of_the_reference(tmp_path):
     video = tmp_path / "pattern2" / "video"
     video.mkdir(parents=True)
     (video / "camera.json").write_text(json.dumps({"w": 320, "h": 180}))
-    settings = build_parser().parse_args(flags.sim_arguments(2, flags.VARIANTS["ours"], tmp_path, None))
+    settings = Simulation.parser().parse_args(flags.sim_arguments(2, flags.VARIANTS["ours"], tmp_path, None))
     assert (settings.camera.init_args.width, settings.camera.init_args.height) == (320, 180)
 
 

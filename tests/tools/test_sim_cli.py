@@ -14,8 +14,7 @@ import yaml
 from gaussian_swaying.cli.simulate import config_text, main, output_folder
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -156,7 +155,7 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
 def parse_foam():
     """The shipped edit of the sand bear."""
     files = [str(ROOT / "configs/sim" / name) for name in ("sand.yaml", "variants/sand_to_foam.yaml")]
-    return build_parser().parse_args([item for file in files for item in ("--config", file)])
+    return Simulation.parser().parse_args([item for file in files for item in ("--config", file)])
 
 
 def test_edits_from_a_configuration(tmp_path, capsys):
@@ -194,7 +193,7 @@ def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
     """Each parses after the flag's, and makes its cameras, recorder and edits."""
     blocks = (ROOT / "docs/recording.md").read_text(encoding="utf-8").split("```yaml\n")[1:]
     assert len(blocks) == 5
-    parser = build_parser()
+    parser = Simulation.parser()
     for block in blocks:
         (tmp_path / "block.yaml").write_text(block.split("```")[0])
         parts = parser.instantiate(parser.parse_args(["--config", str(FLAG), "--config", str(tmp_path / "block.yaml")]))
@@ -204,17 +203,17 @@ def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
 def test_every_shipped_configuration_builds(config, tmp_path):
     """Parsed, and its components made; the splat is exchanged where the user has to give one."""
-    parser = build_parser()
+    parser = Simulation.parser()
     settings = parser.parse_args(["--config", str(config), "--device", "cpu"])
     if settings.scene.ply is None and settings.scene.generator is None:
         write_ply(tmp_path / "splat.ply", FlagScene(spacing=0.1).generate())
         settings.scene.ply = str(tmp_path / "splat.ply")
     elif settings.scene.generator is not None and "spacing" in settings.scene.generator.init_args:
         settings.scene.generator.init_args.spacing = 0.1
-    pipeline, recorder = build_pipeline(parser, settings)
-    assert pipeline.scene.points.count > 0
-    assert len(pipeline.solver.boundaries) > 0
-    assert pipeline.wind(0.0).norm() > 0
+    simulation, recorder = Simulation.from_settings(parser, settings)
+    assert simulation.scene.points.count > 0
+    assert len(simulation.solver.boundaries) > 0
+    assert simulation.wind(0.0).norm() > 0
     assert recorder.video
 
 
@@ -227,7 +226,7 @@ def test_print_config_parses_back(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert yaml.safe_load(printed)["material"]["E"] == 1234.5
     (tmp_path / "again.yaml").write_text(printed)
-    parser = build_parser()
+    parser = Simulation.parser()
     first = parser.parse_args([*SMALL, "--material.E", "1234.5"])
     second = parser.parse_args(["--config", str(tmp_path / "again.yaml")])
     assert config_text(parser, first) == config_text(parser, second)
@@ -271,12 +270,12 @@ def test_help_shows_the_units(capsys):
     ],
 )
 def test_any_field_can_be_overridden(option, value, path):
-    settings = build_parser().parse_args(["--config", str(FLAG), option, value])
+    settings = Simulation.parser().parse_args(["--config", str(FLAG), option, value])
     assert settings[path] == yaml.safe_load(value)
 
 
 def test_the_default_folder_is_named_after_the_configuration():
-    parser = build_parser()
+    parser = Simulation.parser()
     assert output_folder(parser.parse_args(["--config", str(FLAG)])) == Path("outputs/flag")
     assert output_folder(parser.parse_args(["--output", "there"])) == Path("there")
 
@@ -454,7 +453,7 @@ def test_ctrl_c(tmp_path, capsys, monkeypatch):
     def stop(self, state):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(SimulationPipeline, "advance", stop)
+    monkeypatch.setattr(Simulation, "advance", stop)
     assert main([*SMALL, "--output", str(tmp_path / "run")]) == 130
     assert "--resume" in capsys.readouterr().err
     assert (tmp_path / "run" / "frames" / "00000.png").exists()

@@ -37,8 +37,8 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state, diagnose
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.scene import Material, Scene
+from gaussian_swaying.simulation.simulation import Simulation
 
 FORMULATIONS = ["total", "updated"]
 UP = (0.0, 0.0, -9.8)
@@ -93,33 +93,41 @@ def _points(position, spacing=0.05, **material):
     return MaterialPoints.create(position, **(given | material))
 
 
-def _pipeline(points, boundaries=(), wind=None, aero=None, dx=0.1, frame_dt=0.01, gravity=(0, 0, 0), **solver):
-    """A pipeline around given material; it recentres, so that places are those of the scene."""
-    scene = SimulatedScene(Scene(generator=_Cloud(points.position)), Material(), dx, points.position.dtype)
-    scene.points = dataclasses.replace(points, position=scene.frame.point_to_sim(points.position))
+TINY = {"camera": OrbitCamera(width=8, height=8), "device": "cpu"}
+
+
+def _simulation(points, boundaries=(), wind=None, aero=None, dx=0.1, frame_dt=0.01, gravity=(0, 0, 0), **solver):
+    """A simulation around given material; it recentres, so that places are those of the scene."""
     solver = MPMSolver(dx=dx, gravity=gravity, boundaries=boundaries, **({"cfl": CFL} | solver))
-    still = aero or AeroForce(C_D=0.0, C_F=0.0, C_L=0.0)
-    camera = OrbitCamera(width=8, height=8)
-    return SimulationPipeline(scene, solver, wind or WindField(), still, None, camera, frame_dt=frame_dt)
+    simulation = Simulation(
+        Scene(generator=_Cloud(points.position)),
+        solver=solver,
+        wind=wind,
+        aero=aero or AeroForce(C_D=0.0, C_F=0.0, C_L=0.0),
+        dtype=str(points.position.dtype).removeprefix("torch."),
+        **(TINY | {"frame_dt": frame_dt}),
+    )
+    scene = simulation.scene
+    scene.points = dataclasses.replace(points, position=scene.frame.point_to_sim(points.position))
+    return simulation
 
 
 def _flag(wind, formulation, material=None, aero=None, width=0.8, spacing=0.1, dx=0.2, frame_dt=0.04, **solver):
     """A flag on its pole, without gravity unless given."""
     source = FlagScene(width=width, height=0.4, spacing=spacing)
-    scene = SimulatedScene(Scene(generator=source), material or Material(E=1e4, density=40.0), dx)
     pole = PinnedRegion(Box([None, None, None], [1.1 * spacing, None, None]))
     solver = {"gravity": (0.0, 0.0, 0.0), "boundaries": [pole], "cfl": CFL, **solver}
     solver = MPMSolver(dx=dx, formulation=formulation, **solver)
-    camera = OrbitCamera(width=8, height=8)
-    return SimulationPipeline(scene, solver, wind, aero or AeroForce(), None, camera, frame_dt=frame_dt)
+    material = material or Material(E=1e4, density=40.0)
+    return Simulation(Scene(generator=source), material, solver, wind, aero, **(TINY | {"frame_dt": frame_dt}))
 
 
-def _throw(pipeline, velocity):
+def _throw(simulation, velocity):
     """The state at rest with a velocity."""
-    pipeline.start()
-    scene = pipeline.scene
+    simulation.start()
+    scene = simulation.scene
     velocity = torch.as_tensor(velocity, dtype=scene.points.position.dtype).expand_as(scene.points.position)
-    return pipeline.solver.init_state(scene.points, velocity, frame=scene.frame)
+    return simulation.solver.init_state(scene.points, velocity, frame=scene.frame)
 
 
 def _shear(position, rate=5.0):
@@ -128,12 +136,12 @@ def _shear(position, rate=5.0):
     return torch.stack([rate * x[:, 2], torch.zeros_like(x[:, 0]), -0.5 * rate * x[:, 0]], -1)
 
 
-def _advance(pipeline, frames, state=None):
+def _advance(simulation, frames, state=None):
     """The state after some frames and the health of all, the first one included; whatever diverges is raised."""
-    state = pipeline.start() if state is None else state
-    log = [diagnose(pipeline.solver, state, 0, 0.0)]
+    state = simulation.start() if state is None else state
+    log = [diagnose(simulation.solver, state, 0, 0.0)]
     for _ in range(frames):
-        state, health = pipeline.advance(state)
+        state, health = simulation.advance(state)
         log.append(health)
         assert all(math.isfinite(value) for value in health.as_dict().values())
         assert health.lost == 0
@@ -156,11 +164,11 @@ def _rise(log):
     return max(later / min(energy[: k + 1]) for k, later in enumerate(energy))
 
 
-def _assert_conserved(pipeline, log):
+def _assert_conserved(simulation, log):
     """No more energy than at the start but for the shadow, and the momentum of the start to round-off of float32."""
     start = _energy(log[0])
     assert max(_energy(health) for health in log) <= SHADOW * start
-    mass = float(pipeline.solver.points.mass.sum())
+    mass = float(simulation.solver.points.mass.sum())
     for name in ("momentum_x", "momentum_y", "momentum_z"):
         # each of a few thousand substeps rounds a momentum of that of the whole body by eps at most
         bound = sum(health.substeps for health in log) * 2**-23 * math.sqrt(2 * mass * start)
@@ -190,10 +198,10 @@ def test_contrasts_within_one_body(case, formulation):
         light = torch.arange(36) == 17
         # of the same wave speed, so that the substep is not a thousand times shorter
         fields = {"density": torch.where(light, 1e-3, 1e3), "youngs_modulus": torch.where(light, 0.1, 1e5)}
-    pipeline = _pipeline(_points(position, **fields), formulation=formulation, frame_dt=frame_dt)
-    state, log = _advance(pipeline, frames, _throw(pipeline, _shear(position)))
-    _assert_conserved(pipeline, log)
-    points, laws = pipeline.solver.points, pipeline.solver.laws
+    simulation = _simulation(_points(position, **fields), formulation=formulation, frame_dt=frame_dt)
+    state, log = _advance(simulation, frames, _throw(simulation, _shear(position)))
+    _assert_conserved(simulation, log)
+    points, laws = simulation.solver.points, simulation.solver.laws
     # energy density >= K / 2 (J - 1)² for a solid with lambda > 0, and mu (a - 1)² for any
     paid = SHADOW * _energy(log[0]) / points.volume
     stretch = singular_values(state.F_elastic)
@@ -211,15 +219,15 @@ def test_contrasts_within_one_body(case, formulation):
 def test_an_inverted_body_turns_back(law):
     """`total`, a block mirrored onto itself and shaken: all det F are positive in the end, the energy never grows."""
     position = _lattice(3, 3, 3)
-    pipeline = _pipeline(_points(position, law=law()), formulation="total", damping=20.0, frame_dt=2e-3)
-    state = pipeline.start()
+    simulation = _simulation(_points(position, law=law()), formulation="total", damping=20.0, frame_dt=2e-3)
+    state = simulation.start()
     nodes = state.grid.node_positions(position)
     noise = 5e-3 * torch.randn(nodes.shape, generator=torch.Generator().manual_seed(0))
     mirror = torch.diag(torch.tensor([-0.1, 1.1, 0.9]))
     moved = nodes @ (mirror - torch.eye(3)).T + noise
-    state = pipeline.solver.step(state.replace(node_displacement=moved), 1e-9)
+    state = simulation.solver.step(state.replace(node_displacement=moved), 1e-9)
     assert bool((determinant(state.F_elastic) < 0).all())
-    state, log = _advance(pipeline, 25, state)
+    state, log = _advance(simulation, 25, state)
     assert bool((determinant(state.F_elastic) > 0).all())
     assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
 
@@ -227,13 +235,15 @@ def test_an_inverted_body_turns_back(law):
 def test_a_deeply_inverted_body_does_not_gain_energy():
     """`total`, neo-Hookean, det F = -0.6: what it passes within a frame is far stiffer than either end of it."""
     position = _lattice(3, 3, 3)
-    pipeline = _pipeline(_points(position, law=NeoHookean()), formulation="total", damping=20.0, frame_dt=1e-3, cfl=0.1)
-    state = pipeline.start()
+    simulation = _simulation(
+        _points(position, law=NeoHookean()), formulation="total", damping=20.0, frame_dt=1e-3, cfl=0.1
+    )
+    state = simulation.start()
     nodes = state.grid.node_positions(position)
     noise = 5e-3 * torch.randn(nodes.shape, generator=torch.Generator().manual_seed(0))
     moved = nodes @ torch.diag(torch.tensor([-1.6, 0.1, -0.1])) + noise
-    state = pipeline.solver.step(state.replace(node_displacement=moved), 1e-7)
-    _, log = _advance(pipeline, 30, state)
+    state = simulation.solver.step(state.replace(node_displacement=moved), 1e-7)
+    _, log = _advance(simulation, 30, state)
     share = 0.1 / 0.47
     assert _rise(log) <= (1 + share) / (1 - share)
 
@@ -246,13 +256,13 @@ def test_inverted_particles_of_updated_flatten(law):
     """
     position = _lattice(3, 2, 2, spacing=0.5)
     points = _points(position, law=law(), volume=1e-3)
-    pipeline = _pipeline(points, formulation="updated", damping=20.0, frame_dt=1e-3)
+    simulation = _simulation(points, formulation="updated", damping=20.0, frame_dt=1e-3)
     F = torch.eye(3) + 0.4 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(1))
     F[::4] = F[::4] @ torch.diag(torch.tensor([-0.5, 1.0, 1.0]))
     before = determinant(F)
     inverted = before < 0
     assert 3 <= int(inverted.sum()) < 12
-    state, log = _advance(pipeline, 4, pipeline.start().replace(F_elastic=F, F_total=F))
+    state, log = _advance(simulation, 4, simulation.start().replace(F_elastic=F, F_total=F))
     after = determinant(state.F_elastic)
     assert bool((after[inverted].abs() < before[inverted].abs()).all())
     assert bool((after[~inverted] > 0).all())
@@ -286,14 +296,14 @@ def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
     position = _lattice(3, 3, 3, low=(0, 0, 0.05))
     points = _points(position, law=make(), youngs_modulus=stiffness)
     plane = Plane([0, 0, 0], [0, 0, 1])
-    pipeline = _pipeline(points, [plane], formulation=formulation, frame_dt=2e-3, gravity=UP)
-    state, log = _advance(pipeline, 6, _throw(pipeline, [0.0, 0.0, -50.0]))
+    simulation = _simulation(points, [plane], formulation=formulation, frame_dt=2e-3, gravity=UP)
+    state, log = _advance(simulation, 6, _throw(simulation, [0.0, 0.0, -50.0]))
     assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
     mass = float(points.mass.sum())
     assert abs(log[-1].momentum_z) <= 50.0 * mass
     assert log[-1].momentum_z > -0.1 * 50.0 * mass  # it has been stopped
-    height = pipeline.scene.frame.point_to_scene(state.position)[:, 2]
-    assert float(height.min()) > -REACH * pipeline.solver.dx
+    height = simulation.scene.frame.point_to_scene(state.position)[:, 2]
+    assert float(height.min()) > -REACH * simulation.solver.dx
 
 
 @pytest.mark.parametrize("kind", ["sticky", "separate"])
@@ -302,12 +312,14 @@ def test_a_snowball_on_a_wall(kind):
     x = _lattice(4, 4, 4)
     x = x[(x - x.mean(0)).norm(dim=-1) < 0.1]
     wall = Plane([0.25, 0, 0], [-1, 0, 0], kind)
-    pipeline = _pipeline(_points(x, density=400.0, law=Snow()), [wall], formulation="updated", frame_dt=4e-3)
-    state, log = _advance(pipeline, 6, _throw(pipeline, [20.0, 0.0, 0.0]))
+    simulation = _simulation(_points(x, density=400.0, law=Snow()), [wall], formulation="updated", frame_dt=4e-3)
+    state, log = _advance(simulation, 6, _throw(simulation, [20.0, 0.0, 0.0]))
     assert _energy(log[-1]) < 0.9 * _energy(log[0])
     assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
     assert min(health.J_min for health in log) > 0
-    assert float(pipeline.scene.frame.point_to_scene(state.position)[:, 0].max()) < 0.25 + REACH * pipeline.solver.dx
+    assert (
+        float(simulation.scene.frame.point_to_scene(state.position)[:, 0].max()) < 0.25 + REACH * simulation.solver.dx
+    )
 
 
 # ---- thin, small, few
@@ -318,8 +330,8 @@ def test_a_snowball_on_a_wall(kind):
 def test_a_sheet_of_one_layer_and_some_cells_thick(cells, formulation):
     """Thickness changes mass and stiffness alike: the flag gains what the wind works, in `updated` at most that."""
     material = Material(E=1e4, density=40.0, thickness=0.2 * cells)
-    pipeline = _flag(WindField([6.0, 3.0, 0.0]), formulation, material)
-    _, log = _advance(pipeline, 5)
+    simulation = _flag(WindField([6.0, 3.0, 0.0]), formulation, material)
+    _, log = _advance(simulation, 5)
     work = sum(health.wind_work for health in log)
     assert work > 0
     assert _gain(log) <= SHARE * work
@@ -339,8 +351,8 @@ def test_a_sheet_coarser_than_its_grid_is_reported(formulation):
 @pytest.mark.parametrize("places", [[[0.3, 0.2, 0.1]], [[0.3, 0.2, 0.1]] * 2], ids=["one", "two at one place"])
 def test_particles_without_neighbours_fall(places, formulation):
     """Two at the same place stay together; either way they fall exactly as symplectic Euler sums it up."""
-    pipeline = _pipeline(_points(torch.tensor(places)), formulation=formulation, gravity=UP)
-    state, log = _advance(pipeline, 10)
+    simulation = _simulation(_points(torch.tensor(places)), formulation=formulation, gravity=UP)
+    state, log = _advance(simulation, 10)
     expected = speed = before = 0.0
     for health in log[1:]:
         dt = 0.01 / health.substeps
@@ -348,7 +360,7 @@ def test_particles_without_neighbours_fall(places, formulation):
             speed += 9.8 * 0.5 * ((before or dt) + dt)  # where the substep changes, the mean of both counts
             expected -= speed * dt
             before = dt
-    fallen = (state.position - pipeline.solver.points.position)[:, 2].double()
+    fallen = (state.position - simulation.solver.points.position)[:, 2].double()
     # position and velocity are rounded in each of the substeps
     steps = sum(health.substeps for health in log)
     torch.testing.assert_close(fallen, torch.full_like(fallen, expected), rtol=steps * 2**-23, atol=steps * 2**-26)
@@ -362,11 +374,11 @@ def test_a_body_within_one_cell(side, formulation):
     """Thinner than a cell every way: it flies and turns as any body does, and conserves its momentum."""
     position = _lattice(2, 2, 2, spacing=side / 2, low=(0.21, 0.21, 0.21))
     points = _points(position, volume=1e-6)
-    pipeline = _pipeline(points, formulation=formulation)
+    simulation = _simulation(points, formulation=formulation)
     velocity = _shear(position, 5.0) + torch.tensor([1.0, 0.0, 0.0])
-    state, log = _advance(pipeline, 10, _throw(pipeline, velocity))
-    _assert_conserved(pipeline, log)
-    moved = (state.position - pipeline.solver.points.position).double().mean(0)
+    state, log = _advance(simulation, 10, _throw(simulation, velocity))
+    _assert_conserved(simulation, log)
+    moved = (state.position - simulation.solver.points.position).double().mean(0)
     # float32 rounds the velocity, near 1 m/s, and the place, within 0.25 m, in each substep
     steps = sum(health.substeps for health in log)
     expected = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
@@ -382,8 +394,8 @@ def test_a_chain_of_stiff_and_soft_links_hangs(formulation):
     points = _points(position, youngs_modulus=stiffness, poisson_ratio=0.0)
     pin = PinnedRegion(Box([None, None, 0.26], [None, None, None]), held_share=0.2)
     # dx = h: neighbours share nodes, and a link is as long as a cell
-    pipeline = _pipeline(points, [pin], formulation=formulation, dx=h, gravity=UP)
-    state, log = _advance(pipeline, 15)
+    simulation = _simulation(points, [pin], formulation=formulation, dx=h, gravity=UP)
+    state, log = _advance(simulation, 15)
     weight = 9.8 * points.mass.cumsum(0)  # what hangs at each link, itself included
     static = float((weight * h / (stiffness * h**2)).sum())
     longest = max(health.displacement_max for health in log)
@@ -402,24 +414,24 @@ def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
     """100 m/s, 0.02 kg/m²: the energy is the work of the wind, and explicit drag takes the substeps that it needs."""
     material = Material(E=2e4, density=2.0)
     aero = AeroForce(C_D=1.2, C_F=0.1, C_L=0.0, law="projected", drag_step=drag_step)
-    pipeline = _flag(WindField([30.0, 95.0, 0.0]), formulation, material, aero, width=0.4, frame_dt=0.01)
+    simulation = _flag(WindField([30.0, 95.0, 0.0]), formulation, material, aero, width=0.4, frame_dt=0.01)
     if drag_step == "explicit":
         rate = 1.225 * 1.3 * 99.6 / 0.02
-        assert pipeline._substeps(pipeline.start()) >= 0.01 * rate / 2
-    _, log = _advance(pipeline, 4)
+        assert simulation._substeps(simulation.start()) >= 0.01 * rate / 2
+    _, log = _advance(simulation, 4)
     work = sum(health.wind_work for health in log)
     assert work > 0
     assert _gain(log) <= SHARE * work
     # drag ends where the sheet moves with the air: kinetic energy at twice the wind would need a slingshot
-    assert max(health.kinetic for health in log) <= 0.5 * float(pipeline.solver.points.mass.sum()) * 200.0**2
+    assert max(health.kinetic for health in log) <= 0.5 * float(simulation.solver.points.mass.sum()) * 200.0**2
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_gusts_that_turn_round_every_frame(formulation):
     """+-12 m/s, 25 reversals: the energy is the work of the wind, which no net flow adds up."""
     keys = [FlowKey(0.04 * k, [0.0, 12.0 * (-1) ** k, 0.0]) for k in range(25)]
-    pipeline = _flag(WindField(schedule=keys), formulation, width=0.4)
-    _, log = _advance(pipeline, 25)
+    simulation = _flag(WindField(schedule=keys), formulation, width=0.4)
+    _, log = _advance(simulation, 25)
     paid = sum(abs(health.wind_work) for health in log)
     assert paid > 0
     assert _gain(log) <= SHARE * paid
@@ -444,9 +456,9 @@ def test_a_modulation_that_breaks_the_wind_is_a_divergence(formulation, drag_ste
     wind = WindField([1.0, 0.0, 0.0], modulations=[_Broken(factor)])
     points = _points(_lattice(3, 3, 1))
     settings = {"formulation": formulation, "max_nodes": 100_000, "frame_dt": 1e-3}
-    pipeline = _pipeline(points, [], wind, AeroForce(drag_step=drag_step), **settings)
+    simulation = _simulation(points, [], wind, AeroForce(drag_step=drag_step), **settings)
     with pytest.raises(SimulationDiverged, match=r"(NaN or infinite|substeps).*Remedy: .*wind") as info:
-        _advance(pipeline, 1)
+        _advance(simulation, 1)
     assert info.value.particle is not None
 
 
@@ -467,11 +479,11 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
         Handle(Box([0.69, None, None], [None, None, None]), angular_velocity=[4 * math.pi, 0, 0], pivot=middle),
     ]
     points = _points(position, density=100.0, youngs_modulus=1e4)
-    pipeline = _pipeline(points, ends, formulation=formulation, frame_dt=0.04, damping=10.0, dx=0.1)
-    state, log = _advance(pipeline, 25)
+    simulation = _simulation(points, ends, formulation=formulation, frame_dt=0.04, damping=10.0, dx=0.1)
+    state, log = _advance(simulation, 25)
     # in `updated` all nodes of a held particle are held, in `total` for sure those of the last column
     held = points.position[:, 0] > (0.69 if formulation == "updated" else 0.76)
-    moved = (state.position - pipeline.solver.points.position)[held]
+    moved = (state.position - simulation.solver.points.position)[held]
     # the chord closes on itself; float32 rounds a place of half a metre in each substep
     steps = sum(health.substeps for health in log)
     assert float(moved.norm(dim=-1).max()) < steps * 2**-24
@@ -493,11 +505,11 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
         Handle(Box([None, None, 0.24], [None, None, None]), velocity=[0, 0, -fast], end=0.1),
     ]
     points = _points(position, law=law())
-    pipeline = _pipeline(points, grips, formulation=formulation, frame_dt=5e-3, damping=60.0)
-    state, _ = _advance(pipeline, 20)
-    pressed = pipeline.scene.frame.point_to_scene(state.position)[:, 2]
+    simulation = _simulation(points, grips, formulation=formulation, frame_dt=5e-3, damping=60.0)
+    state, _ = _advance(simulation, 20)
+    pressed = simulation.scene.frame.point_to_scene(state.position)[:, 2]
     assert float(pressed.max() - pressed.min()) < 0.15
-    state, after = _advance(pipeline, 40, state)
+    state, after = _advance(simulation, 40, state)
     assert _rise(after) <= SHADOW
     assert after[-1].J_min > 0.5
     assert _energy(after[-1]) < _energy(after[0])
@@ -508,11 +520,11 @@ def test_a_pin_that_holds_everything(formulation):
     """Nothing moves, and the wind does no work, for half a second in a gale."""
     pin = PinnedRegion(Everything())
     wind = WindField([20.0, 5.0, 0.0])
-    pipeline = _pipeline(
+    simulation = _simulation(
         _points(_lattice(3, 3, 2)), [pin], wind, AeroForce(), formulation=formulation, gravity=UP, frame_dt=0.05
     )
-    state, log = _advance(pipeline, 10)
-    assert torch.equal(state.position, pipeline.solver.points.position)
+    state, log = _advance(simulation, 10)
+    assert torch.equal(state.position, simulation.solver.points.position)
     assert float(state.velocity.abs().max()) == 0
     assert sum(health.wind_work for health in log) == 0
     assert log[-1].elastic == 0
@@ -523,9 +535,9 @@ def test_material_flows_through_a_moving_velocity_box(law):
     """What meets a wall that moves at 2 m/s leaves it at 4 m/s at the most, and later gains nothing more."""
     position = _lattice(6, 3, 3)
     box = VelocityBox(Box([0.1, None, None], [0.25, None, None]), velocity=[0.0, 0.0, 2.0], end=0.05)
-    pipeline = _pipeline(_points(position, law=law()), [box], formulation="updated", frame_dt=0.01)
-    _, log = _advance(pipeline, 8, _throw(pipeline, [2.0, 0.0, 0.0]))
-    mass = float(pipeline.solver.points.mass.sum())
+    simulation = _simulation(_points(position, law=law()), [box], formulation="updated", frame_dt=0.01)
+    _, log = _advance(simulation, 8, _throw(simulation, [2.0, 0.0, 0.0]))
+    mass = float(simulation.solver.points.mass.sum())
     # along x the box is a wall at rest, which turns 2 m/s round
     assert log[-1].kinetic + log[-1].elastic <= 0.5 * mass * (4.0**2 + 2.0**2)
     after = [_energy(health) for health in log[6:]]
@@ -539,11 +551,11 @@ def test_material_flows_through_a_moving_velocity_box(law):
 
 def test_a_body_in_free_flight_takes_its_grid_along():
     """30 m/s for 0.1 s: 30 cells from home, exactly where its velocity has taken it, on a grid as small as ever."""
-    pipeline = _pipeline(_points(_lattice(3, 3, 3)), formulation="updated", frame_dt=0.01)
-    start = _throw(pipeline, [30.0, 0.0, 0.0])
-    state, log = _advance(pipeline, 10, start)
+    simulation = _simulation(_points(_lattice(3, 3, 3)), formulation="updated", frame_dt=0.01)
+    start = _throw(simulation, [30.0, 0.0, 0.0])
+    state, log = _advance(simulation, 10, start)
     steps = sum(health.substeps for health in log)
-    moved = (state.position - pipeline.solver.points.position).double().mean(0)
+    moved = (state.position - simulation.solver.points.position).double().mean(0)
     # float32 rounds a place of up to 4 m by 2^-23 in each substep, and as much a velocity that then acts for 0.1 s
     expected = torch.tensor([3.0, 0.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(moved, expected, rtol=0, atol=2 * steps * 2**-22)
@@ -554,36 +566,36 @@ def test_a_body_in_free_flight_takes_its_grid_along():
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_body_absurdly_far_away_is_reported(formulation):
     """Free, a cell long: beyond 1000 times that from home."""
-    pipeline = _pipeline(_points(_lattice(2, 2, 2)), formulation=formulation)
+    simulation = _simulation(_points(_lattice(2, 2, 2)), formulation=formulation)
     if formulation == "total":
-        state = _throw(pipeline, [9e3, 0.0, 0.0])
+        state = _throw(simulation, [9e3, 0.0, 0.0])
     else:
-        state = _throw(pipeline, [20.0, 0.0, 0.0])
+        state = _throw(simulation, [20.0, 0.0, 0.0])
         state = state.replace(position=state.position + torch.tensor([99.7, 0.0, 0.0]))
     with pytest.raises(
         SimulationDiverged,
         match=r"t = 0\.02 s, particle \d+: it is more than 1000 object sizes \(0.1 m\).*pin or enclose",
     ) as info:
-        _advance(pipeline, 4, state)
+        _advance(simulation, 4, state)
     assert info.value.time == pytest.approx(0.02)
 
 
 def test_a_body_that_spreads_beyond_the_largest_grid_is_reported():
     """Two particles that part at 20 m/s: the span, the nodes and the limit are named."""
     points = _points(torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]))
-    pipeline = _pipeline(points, formulation="updated", max_nodes=20_000)
+    simulation = _simulation(points, formulation="updated", max_nodes=20_000)
     with pytest.raises(SimulationDiverged, match=r"span \[\d.*grid nodes at dx = 0.1 m, more than `max_nodes`") as info:
-        _advance(pipeline, 100, _throw(pipeline, torch.tensor([[-10.0] * 3, [10.0] * 3])))
+        _advance(simulation, 100, _throw(simulation, torch.tensor([[-10.0] * 3, [10.0] * 3])))
     assert 0 < info.value.time < 0.1
 
 
 def test_a_grid_too_large_for_the_speed_names_the_speed():
     """A small body at 10 km/s needs a grid for where it may go: its own span is not to blame."""
-    pipeline = _pipeline(_points(_lattice(2, 2, 2)), formulation="updated", frame_dt=0.04)
+    simulation = _simulation(_points(_lattice(2, 2, 2)), formulation="updated", frame_dt=0.04)
     with pytest.raises(
         SimulationDiverged, match=r"may fly .* m to any side within a frame, at 1e\+04 m/s.*`max_nodes`"
     ):
-        _advance(pipeline, 1, _throw(pipeline, [1e4, 0.0, 0.0]))
+        _advance(simulation, 1, _throw(simulation, [1e4, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -594,10 +606,10 @@ def test_an_energetic_body_in_a_closed_box(law, formulation):
     """5 m/s into a corner, half a second: it stays inside, and never has more energy than it came with."""
     box = EnclosingBox([0, 0, 0], [0.6, 0.6, 0.6])
     position = _lattice(3, 3, 3, low=(0.2, 0.2, 0.2))
-    pipeline = _pipeline(_points(position, law=law()), [box], formulation=formulation, frame_dt=0.02)
-    state, log = _advance(pipeline, 15, _throw(pipeline, [5.0, 4.0, 3.0]))
-    place = pipeline.scene.frame.point_to_scene(state.position)
-    slack = REACH * pipeline.solver.dx
+    simulation = _simulation(_points(position, law=law()), [box], formulation=formulation, frame_dt=0.02)
+    state, log = _advance(simulation, 15, _throw(simulation, [5.0, 4.0, 3.0]))
+    place = simulation.scene.frame.point_to_scene(state.position)
+    slack = REACH * simulation.solver.dx
     assert float(place.min()) > -slack
     assert float(place.max()) < 0.6 + slack
     assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
@@ -609,13 +621,13 @@ def test_sand_and_rubber_in_one_run():
     sand = _points(_lattice(3, 3, 2, low=(0, 0, 0.15)), youngs_modulus=1e6, law=Sand(), density=1600.0)
     plane = Plane([0, 0, 0], [0, 0, 1], "sticky")
     both = MaterialPoints.join([rubber, sand])
-    pipeline = _pipeline(both, [plane], formulation="updated", gravity=UP)
+    simulation = _simulation(both, [plane], formulation="updated", gravity=UP)
     velocity = torch.zeros(50, 3)
     velocity[32:, 2] = -3.0
-    state, log = _advance(pipeline, 10, _throw(pipeline, velocity))
+    state, log = _advance(simulation, 10, _throw(simulation, velocity))
     assert max(_energy(health) for health in log) <= _energy(log[0]) + (SHADOW - 1) * log[0].kinetic
     assert _energy(log[-1]) < _energy(log[0])
-    assert float(pipeline.scene.frame.point_to_scene(state.position)[:, 2].min()) > -REACH * pipeline.solver.dx
+    assert float(simulation.scene.frame.point_to_scene(state.position)[:, 2].min()) > -REACH * simulation.solver.dx
     assert log[-1].torn == 0
 
 
@@ -640,8 +652,8 @@ def test_ten_thousand_steps_of_nothing(formulation):
 def test_a_restart_from_rest_stays_at_rest(formulation, tmp_path):
     """Saved in the middle of its motion, its velocity and strain set to zero: not a bit moves any more."""
     position = _lattice(3, 3, 3)
-    pipeline = _pipeline(_points(position), formulation=formulation)
-    state, _ = _advance(pipeline, 2, _throw(pipeline, [1.0, 2.0, 0.5]))
+    simulation = _simulation(_points(position), formulation=formulation)
+    state, _ = _advance(simulation, 2, _throw(simulation, [1.0, 2.0, 0.5]))
     torch.save(state.state_dict(), tmp_path / "state.pt")
     state = MPMState.from_state_dict(torch.load(tmp_path / "state.pt"))
     eye = torch.eye(3).expand_as(state.F_elastic)
@@ -651,8 +663,8 @@ def test_a_restart_from_rest_stays_at_rest(formulation, tmp_path):
         # a rigid displacement is what strains nothing there
         shift = state.node_displacement.new_tensor([0.5, 0.25, 0.125]).expand_as(state.node_displacement)
         state = state.replace(node_velocity=torch.zeros_like(state.node_velocity), node_displacement=shift)
-        state = state.replace(position=pipeline.solver.points.position + shift[0])
-    end, log = _advance(pipeline, 3, state)
+        state = state.replace(position=simulation.solver.points.position + shift[0])
+    end, log = _advance(simulation, 3, state)
     # weights add up to one within a rounding of each of the 27 nodes
     assert float((end.position - state.position).abs().max()) <= 27 * 2**-24
     assert log[-1].kinetic == 0
@@ -663,13 +675,13 @@ def test_a_huge_fixed_substep_is_refused(formulation):
     """At the start with a ValueError, and when the material stiffens on the way with a divergence that names it."""
     points = _points(_lattice(3, 3, 3), law=NeoHookean())
     with pytest.raises(ValueError, match=r"`substep` of 10 s is longer than the stable one of 0.00\d+ s"):
-        _pipeline(points, formulation=formulation, substep=10.0).start()
-    pipeline = _pipeline(points, formulation=formulation, substep=2.5e-3)
-    state = pipeline.start()
+        _simulation(points, formulation=formulation, substep=10.0).start()
+    simulation = _simulation(points, formulation=formulation, substep=2.5e-3)
+    state = simulation.start()
     F = state.F_elastic.clone()
     F[5] *= 0.5
     with pytest.raises(SimulationDiverged, match=r"t = 0 s.*`substep` of 0.0025 s is longer.*Remedy: .*`solver.sub"):
-        pipeline.advance(state.replace(F_elastic=F))
+        simulation.advance(state.replace(F_elastic=F))
 
 
 # ---- Gaussians and coordinates
@@ -679,14 +691,17 @@ def test_a_huge_fixed_substep_is_refused(formulation):
 def test_gaussians_of_extreme_shape(scales):
     """1000:1 and 1e-8: positive finite mass, a finite picture, and needles as long after a free flight as before."""
     source = _Cloud(_lattice(4, 1, 4, spacing=0.1), scales)
-    scene = SimulatedScene(Scene(generator=source), Material(E=1e4, density=50.0), 0.2)
-    assert bool((scene.points.mass > 0).all())
-    assert float(scene.patch_area.sum()) < 10.0
     solver = MPMSolver(dx=0.2, formulation="total", gravity=UP, cfl=CFL)
     camera = OrbitCamera(width=32, height=18, azimuth=-70.0, radius=2.0)
-    pipeline = SimulationPipeline(scene, solver, WindField([2.0, 1.0, 0.0]), AeroForce(), None, camera)
-    state, log = _advance(pipeline, 3)
-    picture = pipeline.render(state, 3)
+    material = Material(E=1e4, density=50.0)
+    simulation = Simulation(
+        Scene(generator=source), material, solver, WindField([2.0, 1.0, 0.0]), camera=camera, device="cpu"
+    )
+    scene = simulation.scene
+    assert bool((scene.points.mass > 0).all())
+    assert float(scene.patch_area.sum()) < 10.0
+    state, log = _advance(simulation, 3)
+    picture = simulation.painter.render(state, 3)
     for image in (picture.color, picture.alpha, picture.depth):
         assert bool(torch.isfinite(image).all())
     assert 0 <= float(picture.alpha.min()) <= float(picture.alpha.max()) <= 1
@@ -709,9 +724,11 @@ def test_a_scene_ten_kilometres_away_moves_the_same(formulation):
         points = _points(position, volume=1e-3, density=40.0, youngs_modulus=1e4)
         pin = PinnedRegion(Box([None, None, None], [offset + 0.1, None, None]))
         wind, settings = WindField([6.0, 3.0, 0.0]), {"dx": 0.25, "frame_dt": 0.04, "gravity": UP}
-        pipeline = _pipeline(points, [pin], wind, AeroForce(), formulation=formulation, **settings)
-        state, _ = _advance(pipeline, 5)
-        ends.append((pipeline.solver.points.position, state.position, pipeline.scene.deformed(state).means - offset))
+        simulation = _simulation(points, [pin], wind, AeroForce(), formulation=formulation, **settings)
+        state, _ = _advance(simulation, 5)
+        ends.append(
+            (simulation.solver.points.position, state.position, simulation.scene.deformed(state).means - offset)
+        )
     torch.testing.assert_close(ends[1][0], ends[0][0], rtol=0, atol=0)
     assert float((ends[0][1] - ends[0][0]).norm(dim=-1).max()) > 4 * 2**-10
     torch.testing.assert_close(ends[1][1], ends[0][1], rtol=0, atol=0)
@@ -753,18 +770,15 @@ def _long_flag(damping):
     `updated` takes more than twice as long for the same, and loses energy in its transfers anyway.
     """
     minutes, frame_dt = 10, 0.04
-    scene = SimulatedScene(
-        Scene(generator=FlagScene(width=0.8, height=0.6, spacing=0.1)), Material(E=1e4, density=40.0), 0.2
-    )
+    scene = Scene(generator=FlagScene(width=0.8, height=0.6, spacing=0.1))
     pole = PinnedRegion(Box([None, None, None], [0.11, None, None]))
     solver = MPMSolver(dx=0.2, formulation="total", boundaries=[pole], damping=damping)
     wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(), UniformGust(0.3), GaussianGust(0.3)], seed=3)
-    camera = OrbitCamera(width=8, height=8)
-    pipeline = SimulationPipeline(scene, solver, wind, AeroForce(), None, camera, frame_dt=frame_dt)
-    state, visible, began = pipeline.start(), [], time.perf_counter()
+    simulation = Simulation(scene, Material(E=1e4, density=40.0), solver, wind, **(TINY | {"frame_dt": frame_dt}))
+    state, visible, began = simulation.start(), [], time.perf_counter()
     log = [diagnose(solver, state, 0, 0.0)]
     for _ in range(round(minutes * 60 / frame_dt)):
-        state, health = pipeline.advance(state)
+        state, health = simulation.advance(state)
         log.append(health)
         visible.append(0.5 * (scene.points.mass * state.velocity.square().sum(-1)).sum())
     wall = time.perf_counter() - began
@@ -792,7 +806,7 @@ def _long_flag(damping):
         "largest_displacement_m": max(health.displacement_max for health in log),
         "torn": max(health.torn for health in log),
         "lost": max(health.lost for health in log),
-        "device": describe_device(pipeline.device),
+        "device": describe_device(simulation.device),
         "versions": versions(),
     }
     _record("long_flag.json", "damped" if damping else "undamped", values)

@@ -16,7 +16,7 @@ from torch import Tensor
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 SWAY = 0.10  # largest displacement that is wanted, as a share of the longest side
 SOFTEST, STIFFEST = 3e4, 1e6  # Pa; ten times the stiffness takes three times the substeps
@@ -192,11 +192,11 @@ def _badness(motion: Motion, sway: float | None) -> float:
 # ---- the run
 
 
-def apply_setting(pipeline: SimulationPipeline, setting: Setting, base: Setting) -> None:
+def apply_setting(simulation: Simulation, setting: Setting, base: Setting) -> None:
     """Give a run whose material and wind are those of ``base`` another setting, before it starts."""
-    points, wind = pipeline.scene.points, pipeline.wind
+    points, wind = simulation.scene.points, simulation.wind
     thicker = setting.thickness / base.thickness
-    pipeline.scene.points = replace(
+    simulation.scene.points = replace(
         points,
         mass=points.mass * thicker,
         volume=points.volume * thicker,
@@ -208,7 +208,7 @@ def apply_setting(pipeline: SimulationPipeline, setting: Setting, base: Setting)
 
 @torch.inference_mode()
 def measure_motion(
-    pipeline: SimulationPipeline,
+    simulation: Simulation,
     setting: Setting,
     base: Setting,
     sway: float | None = None,
@@ -217,26 +217,26 @@ def measure_motion(
     """Run a scene from rest, without pictures, with another setting than its own; the scene stays as it is.
 
     Args:
-        pipeline: The run, whose material and wind are those of ``base``.
+        simulation: The run, whose material and wind are those of ``base``.
         setting: The setting to try.
-        base: The setting of the pipeline.
+        base: The setting of the simulation.
         sway: The run is stopped as soon as it moved :data:`STOP` times this share of the longest side; None for never.
         seconds: How much time to simulate.
 
     Returns:
         How far it moved; not complete if it was stopped or diverged.
     """
-    scene, wind = pipeline.scene, pipeline.wind
+    scene, wind = simulation.scene, simulation.wind
     points, flows = scene.points, wind.flows
-    apply_setting(pipeline, setting, base)
+    apply_setting(simulation, setting, base)
     side = scene.size * scene.frame.metres_per_unit
     limit = math.inf if sway is None else STOP * sway
     motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
     torch.set_num_threads(1)  # a few hundred particles: more threads would only wait for each other
     try:
-        state = pipeline.start()
-        for _ in range(max(1, round(seconds / pipeline.frame_dt))):
-            state, _ = pipeline.advance(state)
+        state = simulation.start()
+        for _ in range(max(1, round(seconds / simulation.frame_dt))):
+            state, _ = simulation.advance(state)
             moved = torch.linalg.vector_norm(state.position - points.position, dim=-1)
             F = state.F_total.double()
             stretch = symmetric_eigenvalues(matmul3(F.mT, F)).clamp(min=0).sqrt()

@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying._provenance import describe_device
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import wave_speed
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,12 @@ class Cost:
 
 @torch.inference_mode()
 def estimate_cost(
-    pipeline: SimulationPipeline, frames: int, tries: int = 9, picture: bool = True, startup_seconds: float = 0.0
+    simulation: Simulation, frames: int, tries: int = 9, picture: bool = True, startup_seconds: float = 0.0
 ) -> Cost:
     """Start a run, and measure a few substeps of its first frame and a picture.
 
     Args:
-        pipeline: The run.
+        simulation: The run.
         frames: How many frames it is to have.
         tries: Substeps to measure, after one that is not counted; on a GPU it is a frame.
         picture: Whether the run draws pictures.
@@ -77,25 +77,25 @@ def estimate_cost(
     Raises:
         ValueError: If the run cannot start: a pin holds nothing, the grid is too large, a fixed substep is too long.
     """
-    solver = pipeline.solver
-    state = pipeline.start()
-    steps = max(solver.substeps(state, pipeline.frame_dt), _drag_substeps(pipeline, state, frames))
-    forces = pipeline.forces
-    dt = pipeline.frame_dt / steps
-    if pipeline.device.type == "cuda":  # kernels are compiled and graphs recorded in the first frames
-        state, _ = pipeline.advance(state)
-        state, _ = pipeline.advance(state)
-        seconds = _seconds(pipeline, lambda: pipeline.advance(state)) / steps
+    solver = simulation.solver
+    state = simulation.start()
+    steps = max(solver.substeps(state, simulation.frame_dt), _drag_substeps(simulation, state, frames))
+    forces = simulation.forces
+    dt = simulation.frame_dt / steps
+    if simulation.device.type == "cuda":  # kernels are compiled and graphs recorded in the first frames
+        state, _ = simulation.advance(state)
+        state, _ = simulation.advance(state)
+        seconds = _seconds(simulation, lambda: simulation.advance(state)) / steps
     else:
         solver.rollout(state, dt, 1, forces)
-        seconds = min(_seconds(pipeline, lambda: solver.rollout(state, dt, 1, forces)) for _ in range(tries))
+        seconds = min(_seconds(simulation, lambda: solver.rollout(state, dt, 1, forces)) for _ in range(tries))
     drawn = None
     if picture:  # the further cameras are taken to be as large as the first
-        pipeline.render(state, 0)
-        work = min(_seconds(pipeline, lambda: _encode(pipeline.render(state, 0).color)) for _ in range(2))
-        drawn = work * (1 + len(pipeline.cameras))
+        simulation.painter.render(state, 0)
+        work = min(_seconds(simulation, lambda: _encode(simulation.painter.render(state, 0).color)) for _ in range(2))
+        drawn = work * (1 + len(simulation.painter.cameras))
     return Cost(
-        device=describe_device(pipeline.device),
+        device=describe_device(simulation.device),
         particles=solver.points.count,
         grid=tuple(state.grid.resolution),
         frames=frames,
@@ -110,15 +110,17 @@ def estimate_cost(
     )
 
 
-def _drag_substeps(pipeline: SimulationPipeline, state: MPMState, frames: int) -> int:
+def _drag_substeps(simulation: Simulation, state: MPMState, frames: int) -> int:
     """Substeps of a frame that explicit drag asks for at rest, on average over the wind of the run."""
-    if pipeline.idle or pipeline.aero.drag_step == "semi_implicit":
+    if simulation.idle or simulation.aero.drag_step == "semi_implicit":
         return 1
-    winds = pipeline.wind_force.samples(state, pipeline.frame_dt, frames)
+    winds = simulation.wind_force.samples(state, simulation.frame_dt, frames)
     speed = torch.linalg.vector_norm(winds, dim=-1).reshape(frames, -1).amax(1)
-    area, mass = pipeline.scene.patch_area, pipeline.solver.points.mass
-    rates = [float(pipeline.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values]
-    return math.ceil(statistics.mean(rates) * pipeline.frame_dt)
+    area, mass = simulation.scene.patch_area, simulation.solver.points.mass
+    rates = [
+        float(simulation.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values
+    ]
+    return math.ceil(statistics.mean(rates) * simulation.frame_dt)
 
 
 def _encode(image: Tensor) -> None:
@@ -130,12 +132,12 @@ def _encode(image: Tensor) -> None:
         iio.imwrite("<bytes>", pixels, extension=".png", compress_level=3)
 
 
-def _seconds(pipeline: SimulationPipeline, work: Callable[[], object]) -> float:
+def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
     """Time that some work takes [s] on a machine that does nothing else, to its end on a GPU too."""
     begin = Stopwatch()
     work()
-    if pipeline.device.type == "cuda":
-        torch.cuda.synchronize(pipeline.device)
+    if simulation.device.type == "cuda":
+        torch.cuda.synchronize(simulation.device)
         return begin.wall
     return begin.quiet
 

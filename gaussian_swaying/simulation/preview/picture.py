@@ -15,10 +15,10 @@ from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.geometry.regions import Box, Region
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
 from gaussian_swaying.simulation.preview.framing import SOLID, nearby, whole_box
 from gaussian_swaying.simulation.preview.ticks import draw_ticks, project
 from gaussian_swaying.simulation.preview.up import floor_mask
+from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -51,20 +51,20 @@ class Parts:
     names: list[str]
 
 
-def classify(pipeline: SimulationPipeline) -> Parts:
+def classify(simulation: Simulation) -> Parts:
     """Which Gaussians are simulated, carried, held and pushed.
 
     Raises:
         ValueError: If a condition holds nothing.
     """
-    scene = pipeline.scene
+    scene = simulation.scene
     simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
     index = scene.chosen.cpu()
     carried[scene.carried.cpu()] = True
     simulated[index], carried[index] = True, False
     where = scene.frame.point_to_sim(scene.model.means.detach()[scene.chosen].double()).to(scene.points.position.dtype)
     names = []
-    for boundary in conditions(pipeline):
+    for boundary in conditions(simulation):
         moved = boundary.in_frame(scene.frame)
         mask = moved.particle_mask(scene.points.position)
         name = type(boundary).__name__
@@ -78,9 +78,9 @@ def classify(pipeline: SimulationPipeline) -> Parts:
     return Parts(simulated, carried, pinned, pushed, names)
 
 
-def conditions(pipeline: SimulationPipeline) -> list[Boundary]:
+def conditions(simulation: Simulation) -> list[Boundary]:
     """The boundary conditions of a run, in scene units."""
-    return [b for b in pipeline.solver.boundaries if isinstance(b, Boundary)]
+    return [b for b in simulation.solver.boundaries if isinstance(b, Boundary)]
 
 
 def box_edges(low: Iterable[float], high: Iterable[float]) -> Tensor:
@@ -101,7 +101,7 @@ def region_box(region: Region, low: Tensor, high: Tensor) -> tuple[list[float], 
 
 @torch.no_grad()
 def preview_picture(
-    pipeline: SimulationPipeline,
+    simulation: Simulation,
     height: int = 540,
     normals: int = 140,
     whole: tuple[Sequence[float], Sequence[float]] | None = None,
@@ -109,7 +109,7 @@ def preview_picture(
     """The scene at rest from the side of its camera and from 90 degrees to the left, with a legend.
 
     Args:
-        pipeline: A run that need not have started.
+        simulation: A run that need not have started.
         height: Height of each view [pixels].
         normals: About how many normals to draw in each view.
         whole: Corners of the box to show [scene units]; that of the object with what does not move of it if None.
@@ -122,32 +122,32 @@ def preview_picture(
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    parts = classify(pipeline)
-    frame = pipeline.scene.frame
-    own = pipeline.camera_at(0)
+    parts = classify(simulation)
+    frame = simulation.scene.frame
+    own = simulation.painter.camera_at(0)
     eye = frame.direction_to_sim(-own.world_to_camera[2, :3].cpu().double())
     azimuth = math.degrees(math.atan2(float(eye[1]), float(eye[0])))
     elevation = math.degrees(math.atan2(float(eye[2]), math.hypot(float(eye[0]), float(eye[1]))))
     elevation = max(-60.0, min(60.0, elevation))
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in whole or _whole(pipeline, parts))
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in whole or _whole(simulation, parts))
     center, reach = (0.5 * (low + high)).tolist(), 1.7 * float((high - low).norm())  # room for arrows and coordinates
     views = []
     for turn in (0.0, 90.0):
         camera = orbit_camera(center, frame.rotation[2], reach, azimuth - turn, elevation, 40.0, height, height)
-        views.append(_view(pipeline, parts, camera.to(pipeline.device), normals, f"azimuth {azimuth - turn:.0f}°"))
+        views.append(_view(simulation, parts, camera.to(simulation.device), normals, f"azimuth {azimuth - turn:.0f}°"))
     legend = 108 if bool(parts.pushed.any()) else 84
     page = Image.new("RGB", (2 * height, height + legend), (255, 255, 255))
     for k, view in enumerate(views):
         page.paste(view, (k * height, 0))
     draw = ImageDraw.Draw(page)
     font = ImageFont.load_default(size=14)
-    _legend(draw, font, parts, pipeline, height, 2 * height)
+    _legend(draw, font, parts, simulation, height, 2 * height)
     return np.asarray(page)
 
 
-def _whole(pipeline: SimulationPipeline, parts: Parts) -> tuple[list[float], list[float]]:
+def _whole(simulation: Simulation, parts: Parts) -> tuple[list[float], list[float]]:
     """Corners of the box of the object with what does not move of it [scene units]."""
-    scene = pipeline.scene
+    scene = simulation.scene
     means, opacity = scene.model.means.detach().cpu(), scene.model.opacity().detach().cpu()
     solid = nearby(means, parts.simulated) & (opacity >= SOLID)
     outside = torch.zeros_like(solid)
@@ -155,21 +155,21 @@ def _whole(pipeline: SimulationPipeline, parts: Parts) -> tuple[list[float], lis
     outside[solid] = floor_mask(
         means[solid], scene.rest_normals.detach().cpu()[solid], weight[solid], scene.frame.rotation[2].tolist()
     )
-    return whole_box(means, opacity, parts.simulated, outside, pipeline.solver.dx / scene.frame.metres_per_unit)
+    return whole_box(means, opacity, parts.simulated, outside, simulation.solver.dx / scene.frame.metres_per_unit)
 
 
-def _view(pipeline: SimulationPipeline, parts: Parts, camera: Camera, normals: int, title: str) -> Any:
+def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, title: str) -> Any:
     """One view with what is drawn over it, as a PIL image."""
     from PIL import Image, ImageDraw, ImageFont
 
-    scene = pipeline.scene
+    scene = simulation.scene
     rest = scene.rest()
     view = torch.nn.functional.normalize(rest.means - camera.position.to(rest.means), dim=-1)
     colours = scene.model.colors(view).clamp(0, 1)
     colours = _tinted(colours, parts)
     plain = torch.full((3,), 0.96, device=colours.device)
     opacity = scene.model.opacity()
-    image = pipeline.renderer(rest.means, rest.covariances, opacity, colours, camera, plain).color
+    image = simulation.painter.renderer(rest.means, rest.covariances, opacity, colours, camera, plain).color
     pixels = (image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
     picture = Image.fromarray(pixels)
     draw = ImageDraw.Draw(picture)
@@ -179,12 +179,12 @@ def _view(pipeline: SimulationPipeline, parts: Parts, camera: Camera, normals: i
     _draw_edges(draw, box_edges(low - margin, high + margin), camera, REGION)
     font = ImageFont.load_default(size=14)
     draw_ticks(draw, font, (low - margin).tolist(), (high + margin).tolist(), camera)
-    for boundary in conditions(pipeline):
+    for boundary in conditions(simulation):
         region = getattr(boundary, "region", None)
         box = None if region is None else region_box(region, low - margin, high + margin)
         if box is not None:
             _draw_edges(draw, box_edges(*box), camera, PUSHED if boundary.held_share is None else PINNED)
-    _draw_wind(draw, pipeline, camera)
+    _draw_wind(draw, simulation, camera)
     up = scene.frame.rotation[2]
     base = scene.center.cpu().double() + 0.0
     _draw_up(draw, font, base, up, camera, scene.size)
@@ -263,10 +263,10 @@ def _draw_normals(draw: ImageDraw, scene: Any, parts: Parts, camera: Camera, cou
         draw.line([tuple(a), tuple(b)], fill=NORMAL, width=1)
 
 
-def _draw_wind(draw: ImageDraw, pipeline: SimulationPipeline, camera: Camera) -> None:
+def _draw_wind(draw: ImageDraw, simulation: Simulation, camera: Camera) -> None:
     """Arrows of the steady flow that end at the upwind side of the object's box."""
-    scene, frame = pipeline.scene, pipeline.scene.frame
-    flow = mean_flow(pipeline)
+    scene, frame = simulation.scene, simulation.scene.frame
+    flow = mean_flow(simulation)
     speed = float(flow.norm())
     if speed == 0:
         return
@@ -289,9 +289,9 @@ def _draw_wind(draw: ImageDraw, pipeline: SimulationPipeline, camera: Camera) ->
             _draw_arrow(draw, ends[0], ends[1], camera, WIND, 2)
 
 
-def mean_flow(pipeline: SimulationPipeline) -> Tensor:
+def mean_flow(simulation: Simulation) -> Tensor:
     """Flow without its modulations [m/s], z up, shape (3,), float64; the strongest entry of a schedule."""
-    flows = pipeline.flows().detach().cpu().double().reshape(-1, 3)
+    flows = simulation.flows().detach().cpu().double().reshape(-1, 3)
     return flows[int(flows.norm(dim=-1).argmax())]
 
 
@@ -313,10 +313,10 @@ def _draw_up(draw: ImageDraw, font: Any, base: Tensor, up: Tensor, camera: Camer
 
 
 def _legend(
-    draw: ImageDraw, font: FreeTypeFont | ImageFont, parts: Parts, pipeline: SimulationPipeline, top: int, width: int
+    draw: ImageDraw, font: FreeTypeFont | ImageFont, parts: Parts, simulation: Simulation, top: int, width: int
 ) -> None:
     """What the colours mean, below the views."""
-    flow = mean_flow(pipeline).tolist()
+    flow = mean_flow(simulation).tolist()
     entries = [
         (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
         (PINNED, f"held: {int(parts.pinned.sum()):,} Gaussians"),

@@ -22,14 +22,14 @@ from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.snow import Snow
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera, read_model_camera
 from gaussian_swaying.simulation.physgaussian.convert import convert, to_yaml
 from gaussian_swaying.simulation.physgaussian.space import Normalisation, heading, rotation_matrix
+from gaussian_swaying.simulation.simulation import Simulation
 
 TOOL = Path(__file__).parents[2] / "tools/convert_physgaussian.py"
 PAGE = Path(__file__).parents[2] / "docs/physgaussian.md"
-PARSER = build_parser()
+PARSER = Simulation.parser()
 REST = {"start_time": 0.0, "end_time": 1e3}
 STILL = [0.0, 0.0, 0.0]
 
@@ -361,13 +361,13 @@ def test_a_published_configuration_runs(tmp_path, capsys):
 def test_the_base_stays_and_the_crown_gets_the_momentum_of_the_kick(tmp_path):
     """Momentum of a free body after one substep: count x force x dt x num_dt, PhysGaussian's sum over particles."""
     free = {"boundary_conditions": PUBLISHED["ficus"]["boundary_conditions"][1:], "grid_v_damping_scale": 1.1}
-    pipeline, _ = build_pipeline(PARSER, PARSER.parse_args(_ficus(tmp_path, **free)))
-    state = pipeline.start()
-    assert pipeline.scene.points.count == 945
-    state = pipeline.solver.rollout(pipeline.solver.fit_grid(state, 1e-3), 5e-5, 4)
-    momentum = (pipeline.solver.points.mass[:, None] * state.velocity).sum(0)
+    simulation = Simulation.from_settings(PARSER, PARSER.parse_args(_ficus(tmp_path, **free)))
+    state = simulation.start()
+    assert simulation.scene.points.count == 945
+    state = simulation.solver.rollout(simulation.solver.fit_grid(state, 1e-3), 5e-5, 4)
+    momentum = (simulation.solver.points.mass[:, None] * state.velocity).sum(0)
     torch.testing.assert_close(momentum, torch.tensor([-0.18 * 1e-4 * 945, 0, 0]), rtol=1e-4, atol=1e-6)
-    held, _ = build_pipeline(PARSER, PARSER.parse_args([*_ficus(tmp_path), "--frame_dt", "0.002"]))
+    held = Simulation.from_settings(PARSER, PARSER.parse_args([*_ficus(tmp_path), "--frame_dt", "0.002"]))
     state, _ = held.advance(held.start())
     moved = (state.position - held.scene.points.position).norm(dim=-1)
     height = held.scene.points.position[:, 2] + 1  # metres are the normalised space's units, from the centre
@@ -445,8 +445,8 @@ def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_p
         ],
     }
     arguments = ["--scene.ply", str(tmp_path / "cube.ply")]
-    pipeline, _ = build_pipeline(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
-    scene, solver = pipeline.scene, pipeline.solver
+    simulation = Simulation.from_settings(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
+    scene, solver = simulation.scene, simulation.solver
     assert torch.equal(scene.simulated, inside.nonzero()[:, 0])
     soft = ((place - torch.tensor([1, 1, 1.3])).abs() < torch.tensor([1, 0.2, 0.3])).all(-1)
     assert torch.equal(scene.points.youngs_modulus == 3e5, soft)
@@ -480,17 +480,17 @@ def test_gravity_and_the_turn_point_where_physgaussian_has_them(degrees, axes, t
     config = {"g": gravity.tolist(), "rotation_degree": degrees, "rotation_axis": axes, "n_grid": 12, "E": 1e3}
     arguments = ["--scene.ply", str(tmp_path / "bar.ply"), "--frame_dt", "0.01"]
     arguments += ["--dtype", "float64", "--camera", "OrbitCamera"]
-    pipeline, _ = build_pipeline(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
-    state, _ = pipeline.advance(pipeline.start())
-    unit = pipeline.scene.frame.metres_per_unit
-    velocity = pipeline.scene.frame.direction_to_scene(state.velocity).mean(0)
+    simulation = Simulation.from_settings(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
+    state, _ = simulation.advance(simulation.start())
+    unit = simulation.scene.frame.metres_per_unit
+    velocity = simulation.scene.frame.direction_to_scene(state.velocity).mean(0)
     torch.testing.assert_close(velocity, rotation.T @ gravity * 0.01, rtol=1e-9, atol=1e-12)
     config |= {"g": STILL, "boundary_conditions": [turning]}
-    pipeline, _ = build_pipeline(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
-    start = pipeline.start()
-    state = pipeline.solver.rollout(pipeline.solver.fit_grid(start, 1e-3), 1e-7, 2)
-    moved = pipeline.scene.frame.direction_to_scene(state.velocity) @ rotation.T
-    means = pipeline.scene.model.means[pipeline.scene.simulated].double()
+    simulation = Simulation.from_settings(PARSER, _settings(config, *arguments, tmp_path=tmp_path))
+    start = simulation.start()
+    state = simulation.solver.rollout(simulation.solver.fit_grid(start, 1e-3), 1e-7, 2)
+    moved = simulation.scene.frame.direction_to_scene(state.velocity) @ rotation.T
+    means = simulation.scene.model.means[simulation.scene.simulated].double()
     place = _normalised(means, rotation, 1.0)
     torch.testing.assert_close(moved, _turned(place, center, normal, 1.5, 0.25), rtol=0, atol=1e-6)
     assert unit == pytest.approx(float(1 / (means @ rotation.T).amax(0).sub((means @ rotation.T).amin(0)).amax()))
@@ -521,11 +521,11 @@ def test_a_pin_that_holds_nothing_says_where_the_particles_are_in_its_own_units(
     }
     config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "boundary_conditions": [pin]}
     settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
-    pipeline, _ = build_pipeline(PARSER, settings)
+    simulation = Simulation.from_settings(PARSER, settings)
     place = _normalised(_bar(), rotation_matrix([135.0], [0]), 1.0)
     low, high = (corner.tolist() for corner in (place.amin(0), place.amax(0)))
     with pytest.raises(ValueError, match="holds no particle") as caught:
-        pipeline.start()
+        simulation.start()
     found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("lie between")[1])]
     assert found == pytest.approx([*low, *high], abs=1e-4)
 
@@ -537,14 +537,14 @@ def test_a_region_that_selects_nothing_says_where_the_splat_is_in_its_own_axes(t
     config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "sim_area": [90, 91, 90, 91, 90, 91]}
     settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
     with pytest.raises(ValueError, match=r"No Gaussian is selected.*in the axes of the region, 0 lie in Box") as caught:
-        build_pipeline(PARSER, settings)
+        Simulation.from_settings(PARSER, settings)
     found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("span")[1].split(" in ")[0])]
     assert found == pytest.approx([*low, *high], abs=1e-4)
     far = {"E": 1e5, "nu": 0.3, "density": 100, "point": [9, 9, 9], "size": [0.1, 0.1, 0.1]}
     config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "additional_material_params": [far]}
     settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
     with pytest.raises(ValueError, match="regions` holds no simulated Gaussian: they lie between") as caught:
-        build_pipeline(PARSER, settings)
+        Simulation.from_settings(PARSER, settings)
     place = _normalised(_bar(), rotation_matrix([135.0], [0]), 1.0)
     found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("between")[1])]
     assert found == pytest.approx([*place.amin(0).tolist(), *place.amax(0).tolist()], abs=1e-4)
@@ -554,7 +554,7 @@ def test_normalisation_sets_the_scale_alone(tmp_path):
     write_ply(tmp_path / "bar.ply", _body(_bar()))
     settings = _settings(BASE, "--scene.ply", str(tmp_path / "bar.ply"), "--scene.longest_side", "2", tmp_path=tmp_path)
     with pytest.raises(ValueError, match="`normalisation` sets the scale"):
-        build_pipeline(PARSER, settings)
+        Simulation.from_settings(PARSER, settings)
     with pytest.raises(ValueError, match="no extent"):
         Normalisation().fit(torch.ones(2, 3))
     with pytest.raises(ValueError, match=r"`normalisation.scale`"):

@@ -92,18 +92,20 @@ def test_a_share_that_cannot_be_meant_is_refused(sway):
         calibrate(beam(1.0), START, 1.0, sway)
 
 
-def test_a_run_leaves_the_scene_as_it_was_and_feels_the_setting(make_pipeline):
-    pipeline = make_pipeline(gravity=(0.0, 0.0, 0.0), material=Material(E=3e3, density=1000.0))  # slower than the wind
-    points, flows = pipeline.scene.points, pipeline.wind.flows
+def test_a_run_leaves_the_scene_as_it_was_and_feels_the_setting(make_simulation):
+    simulation = make_simulation(
+        gravity=(0.0, 0.0, 0.0), material=Material(E=3e3, density=1000.0)
+    )  # slower than the wind
+    points, flows = simulation.scene.points, simulation.wind.flows
     base = Setting(3e3, 0.01)
     shares = {}
     for name, setting in (("base", base), ("weak", Setting(3e3, 0.01, 0.5)), ("thick", Setting(3e3, 0.03))):
-        shares[name] = measure_motion(pipeline, setting, base, seconds=0.12).share
-        assert pipeline.scene.points is points
-        assert pipeline.wind.flows is flows
+        shares[name] = measure_motion(simulation, setting, base, seconds=0.12).share
+        assert simulation.scene.points is points
+        assert simulation.wind.flows is flows
     assert shares["weak"] == pytest.approx(shares["base"] / 4, rel=0.1)  # too short to be held back: by force
     assert shares["thick"] == pytest.approx(shares["base"] / 3, rel=0.15)  # by mass
-    assert not measure_motion(pipeline, base, base, sway=shares["base"] / 20, seconds=0.12).complete
+    assert not measure_motion(simulation, base, base, sway=shares["base"] / 20, seconds=0.12).complete
 
 
 # ---- real ones
@@ -145,7 +147,7 @@ def curtain():
 def test_draft_and_starter_move_as_wanted(what, tmp_path):
     """From the splat to the two configurations, which are run for 2 and 4 s."""
     from gaussian_swaying.cli import preview as preview_cli
-    from gaussian_swaying.simulation.config import build_parser, build_pipeline
+    from gaussian_swaying.simulation.simulation import Simulation
 
     cloud = {"standing": post, "hanging": lambda: post(upside_down=True), "sheet": curtain}[what]()
     write_ply(tmp_path / "it.ply", cloud)
@@ -156,10 +158,10 @@ def test_draft_and_starter_move_as_wanted(what, tmp_path):
     )
     share = {}
     for name, frames in (("draft", 51), ("starter", 101)):
-        parser = build_parser()
-        pipeline, _ = build_pipeline(parser, parser.parse_args(["--config", str(out / f"{name}.yaml")]))
+        parser = Simulation.parser()
+        simulation = Simulation.from_settings(parser, parser.parse_args(["--config", str(out / f"{name}.yaml")]))
         base = Setting(1.0, 1.0)
-        motion = measure_motion(pipeline, base, base, seconds=0.04 * (frames - 1))
+        motion = measure_motion(simulation, base, base, seconds=0.04 * (frames - 1))
         assert motion.complete
         assert motion.stretch_min > 0.7
         assert motion.stretch_max < 1.4

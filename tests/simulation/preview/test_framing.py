@@ -12,12 +12,12 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.preview.framing import RADIUS, orbit_frame, whole_box
 from gaussian_swaying.simulation.preview.picture import _whole, classify
 from gaussian_swaying.simulation.preview.starter import starter_yaml
 from gaussian_swaying.simulation.preview.suggest import suggest
 from gaussian_swaying.simulation.preview.ticks import COLOUR, draw_ticks, nice_ticks, project
+from gaussian_swaying.simulation.simulation import Simulation
 
 
 def column(count=3000, side=0.3, height=2.0):
@@ -114,16 +114,16 @@ def test_camera_of_the_starter_shows_all_of_it(tmp_path):
         assert found.whole[0][2] == pytest.approx(below, abs=0.05)
         config = tmp_path / "starter.yaml"
         config.write_text(starter_yaml(found, path, 2))
-        parser = build_parser()
-        pipeline, _ = build_pipeline(parser, parser.parse_args(["--config", str(config), "--device", "cpu"]))
-        camera = pipeline.camera_at(0)
+        parser = Simulation.parser()
+        simulation = Simulation.from_settings(parser, parser.parse_args(["--config", str(config), "--device", "cpu"]))
+        camera = simulation.painter.camera_at(0)
         shown = cloud.means[cloud.means[:, 2] >= below]
         pixel, depth = project(shown, camera)
         assert float(depth.min()) > 0
         edge = torch.tensor([camera.width, camera.height]) - pixel
         assert float(torch.minimum(pixel, edge).min()) > 0.05 * camera.height  # room to sway
         assert float(pixel[:, 1].amax() - pixel[:, 1].amin()) > 0.5 * camera.height  # and yet large
-        low, _ = _whole(pipeline, classify(pipeline))  # as a preview of this configuration has it
+        low, _ = _whole(simulation, classify(simulation))  # as a preview of this configuration has it
         assert low == pytest.approx(found.whole[0], abs=0.05)
 
 
@@ -135,7 +135,7 @@ def test_orbit_is_left_alone_where_all_of_it_moves():
     assert radius == pytest.approx(2 * RADIUS)
 
 
-def test_floor_is_not_framed(make_pipeline):
+def test_floor_is_not_framed(make_simulation):
     """A flag over a floor that stays: the picture is that of the flag."""
     flag = FlagScene(spacing=0.1).generate()
     side = torch.arange(-3, 3.01, 0.1)
@@ -150,8 +150,8 @@ def test_floor_is_not_framed(make_pipeline):
         torch.cat([flag.opacities, torch.full((count,), 3.0)]),
         torch.cat([flag.sh, torch.zeros(count, *flag.sh.shape[1:])]),
     )
-    pipeline = make_pipeline(cloud=cloud, scene={"region": Box([None, None, 0.0], [None, None, None])})
-    low, high = _whole(pipeline, classify(pipeline))
+    simulation = make_simulation(cloud=cloud, scene={"region": Box([None, None, 0.0], [None, None, None])})
+    low, high = _whole(simulation, classify(simulation))
     assert low == pytest.approx(flag.means.amin(0).tolist(), abs=1e-5)
     assert high == pytest.approx(flag.means.amax(0).tolist(), abs=1e-5)
     assert math.isfinite(sum(low))

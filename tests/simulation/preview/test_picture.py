@@ -15,7 +15,6 @@ from gaussian_swaying.mpm.boundary import Impulse, PinnedRegion, Plane
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
 from gaussian_swaying.simulation.preview.cost import estimate_cost
 from gaussian_swaying.simulation.preview.picture import (
     PINNED,
@@ -28,6 +27,7 @@ from gaussian_swaying.simulation.preview.picture import (
 )
 from gaussian_swaying.simulation.preview.starter import region_dict, starter_yaml
 from gaussian_swaying.simulation.preview.suggest import suggest
+from gaussian_swaying.simulation.simulation import Simulation
 
 POLE = Box([None, None, None], [0.11, None, None])
 
@@ -55,14 +55,14 @@ def test_edges_and_box_of_a_region():
     assert region_box(Sphere([0, 0, 0], 1), low, high) is None
 
 
-def test_parts_are_those_of_the_run(make_pipeline):
+def test_parts_are_those_of_the_run(make_simulation):
     boundaries = [PinnedRegion(POLE), Impulse(Box([0.8, None, None], [None, None, None]), [0, 0, 1]),
                   Plane([0, 0, -9], [0, 0, 1])]  # fmt: skip
     cloud = FlagScene(spacing=0.1).generate()
     cloud.opacities[-8:] = -6.0  # the last column is faint
-    pipeline = make_pipeline(cloud=cloud, pinned=False, boundaries=boundaries, scene={"region": Not(
+    simulation = make_simulation(cloud=cloud, pinned=False, boundaries=boundaries, scene={"region": Not(
         Box([None, None, 0.6], [None, None, None]))})  # fmt: skip
-    parts = classify(pipeline)
+    parts = classify(simulation)
     x, z = cloud.means[:, 0], cloud.means[:, 2]
     assert torch.equal(parts.simulated, (z < 0.6) & (x < 1.1))
     assert torch.equal(parts.carried, (z < 0.6) & (x > 1.1))
@@ -71,13 +71,13 @@ def test_parts_are_those_of_the_run(make_pipeline):
     assert parts.names == ["PinnedRegion: 6 particles", "Impulse: 18 particles", "Plane"]
 
 
-def test_picture_shows_pinned_and_static_gaussians(make_pipeline):
+def test_picture_shows_pinned_and_static_gaussians(make_simulation):
     """The flag is white: red where it is held, grey-blue lines apart nothing else."""
     from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera
 
     cloud = FlagScene(spacing=0.1, pattern="white").generate()
-    pipeline = make_pipeline(cloud=cloud, camera=LookAtCamera([0.6, -2.5, 0.4], [0.6, 0.0, 0.4]))
-    picture = preview_picture(pipeline, height=120)
+    simulation = make_simulation(cloud=cloud, camera=LookAtCamera([0.6, -2.5, 0.4], [0.6, 0.0, 0.4]))
+    picture = preview_picture(simulation, height=120)
     assert picture.dtype == np.uint8
     assert picture.shape[1:] == (240, 3)
     assert picture.shape[0] > 120
@@ -88,35 +88,35 @@ def test_picture_shows_pinned_and_static_gaussians(make_pipeline):
     assert reddish.sum() > 50
     assert columns.max() < np.nonzero(whiteish.any(0))[0].max()  # the pole is on the left
     assert list(picture[-1, -1]) == [255, 255, 255]
-    unpinned = preview_picture(make_pipeline(cloud=cloud, pinned=False, camera=pipeline.camera), height=120)
+    unpinned = preview_picture(make_simulation(cloud=cloud, pinned=False, camera=simulation.painter.camera), height=120)
     bare = unpinned[:120, :120].astype(int)
     assert ((bare[..., 0] > bare[..., 1] + 60) & (bare[..., 1] < 140)).sum() < reddish.sum() / 4
     assert PINNED[0] > PINNED[1] + 60
 
 
 @pytest.mark.gpu
-def test_picture_and_cost_on_a_gpu(make_pipeline):
-    pipeline = make_pipeline()
-    here = preview_picture(pipeline, height=96).astype(int)
-    pipeline.to("cuda")
-    there = preview_picture(pipeline, height=96).astype(int)
+def test_picture_and_cost_on_a_gpu(make_simulation):
+    simulation = make_simulation()
+    here = preview_picture(simulation, height=96).astype(int)
+    simulation.to("cuda")
+    there = preview_picture(simulation, height=96).astype(int)
     assert there.shape == here.shape
     assert np.abs(there - here).mean() < 1  # of 255: lines may fall on other pixels by round-off
-    assert estimate_cost(pipeline, 3, tries=1).particles == 96
+    assert estimate_cost(simulation, 3, tries=1).particles == 96
 
 
-def test_flow_is_the_strongest_of_a_schedule(make_pipeline):
+def test_flow_is_the_strongest_of_a_schedule(make_simulation):
     wind = WindField(schedule=[FlowKey(0.0, [0, 0, 0]), FlowKey(1.0, [0, 5, 0]), FlowKey(2.0, [1, 0, 0])])
-    assert mean_flow(make_pipeline(wind=wind)).tolist() == [0, 5, 0]
-    assert mean_flow(make_pipeline(wind=WindField([1.0, 2.0, 3.0]))).tolist() == [1, 2, 3]
+    assert mean_flow(make_simulation(wind=wind)).tolist() == [0, 5, 0]
+    assert mean_flow(make_simulation(wind=WindField([1.0, 2.0, 3.0]))).tolist() == [1, 2, 3]
 
 
 # ---- cost
 
 
-def test_cost_is_the_product_of_its_parts(make_pipeline):
-    pipeline = make_pipeline(frame_dt=0.04)
-    cost = estimate_cost(pipeline, frames=11, tries=1)
+def test_cost_is_the_product_of_its_parts(make_simulation):
+    simulation = make_simulation(frame_dt=0.04)
+    cost = estimate_cost(simulation, frames=11, tries=1)
     # E = 3e3, nu = 0.3, 30 kg/m^3 by default of the fixture; c^2 = (lambda + 2 mu) / rho
     speed = math.sqrt(3e3 * 0.7 / (1.3 * 0.4) / 30)
     assert cost.wave_speed == pytest.approx(speed, rel=1e-5)
@@ -126,12 +126,12 @@ def test_cost_is_the_product_of_its_parts(make_pipeline):
     assert cost.particles == 96
     assert cost.simulation_seconds == pytest.approx(10 * cost.substeps * cost.substep_seconds)
     assert cost.total_seconds == pytest.approx(cost.simulation_seconds + 11 * cost.picture_seconds)
-    assert estimate_cost(pipeline, 2, tries=1, picture=False).picture_seconds is None
+    assert estimate_cost(simulation, 2, tries=1, picture=False).picture_seconds is None
 
 
-def test_cost_of_a_run_that_cannot_start_is_its_error(make_pipeline):
+def test_cost_of_a_run_that_cannot_start_is_its_error(make_simulation):
     with pytest.raises(ValueError, match="holds no particle"):
-        estimate_cost(make_pipeline(pinned=False, boundaries=[PinnedRegion(Sphere([9, 9, 9], 0.1))]), 2)
+        estimate_cost(make_simulation(pinned=False, boundaries=[PinnedRegion(Sphere([9, 9, 9], 0.1))]), 2)
 
 
 # ---- starter
@@ -168,16 +168,16 @@ def test_starter_has_the_numbers_of_the_suggestion(tmp_path):
     found = suggest(cloud)
     config = tmp_path / "starter.yaml"
     config.write_text(starter_yaml(found, path, frames=3), encoding="utf-8")
-    parser = build_parser()
+    parser = Simulation.parser()
     settings = parser.parse_args(["--config", str(config), "--device", "cpu"])
     assert settings.frames == 3
     assert settings.scene.ply == str(path)
-    pipeline, _ = build_pipeline(parser, settings)
-    assert pipeline.solver.dx == found.dx
-    assert len(pipeline.scene.simulated) == int(found.region.simulated.sum())
-    assert pipeline.scene.frame.metres_per_unit == pytest.approx(found.metres_per_unit)
-    assert torch.equal(classify(pipeline).pinned, found.pin.contains(cloud.means))
-    assert mean_flow(pipeline).tolist() == list(found.flow)
+    simulation = Simulation.from_settings(parser, settings)
+    assert simulation.solver.dx == found.dx
+    assert len(simulation.scene.simulated) == int(found.region.simulated.sum())
+    assert simulation.scene.frame.metres_per_unit == pytest.approx(found.metres_per_unit)
+    assert torch.equal(classify(simulation).pinned, found.pin.contains(cloud.means))
+    assert mean_flow(simulation).tolist() == list(found.flow)
     longest = max(len(line) for line in starter_yaml(found, "x.ply").splitlines())
     assert longest <= 160, "a line of the file is too long to read"
     free = yaml.safe_load(starter_yaml(suggest(cloud, hold="none"), path))

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.mpm.boundary import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.runs.seal import check_seal, seal
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
@@ -34,14 +33,15 @@ def formulation(request):
 
 
 @pytest.fixture
-def run(make_pipeline, tmp_path, formulation):
-    """A pipeline, the folder of its run of two frames, and how to go on from it to a third."""
-    pipeline, folder = make_pipeline(formulation=formulation), tmp_path / "run"
+def run(make_simulation, tmp_path, formulation):
+    """A simulation, the folder of its run of two frames, and how to go on from it to a third."""
+    simulation, folder = make_simulation(formulation=formulation), tmp_path / "run"
     recorder = Recorder(video=False)
-    pipeline.run(recorder, folder, 2, CONFIG, progress=False)
+    simulation.config = CONFIG
+    simulation.run(folder, 2, progress=False, recorder=recorder)
 
     def resume(frames=3):
-        return pipeline.run(recorder, folder, frames, CONFIG, resume=True, progress=False)
+        return simulation.run(folder, frames, resume=True, progress=False, recorder=recorder)
 
     return folder, resume
 
@@ -203,19 +203,18 @@ def test_a_configuration_that_is_no_yaml(run):
         assert "`config` is not valid YAML" in _refused(resume, folder, text[:20])
 
 
-def test_a_splat_that_was_exchanged(make_cloud, make_pipeline, tmp_path):
+def test_a_splat_that_was_exchanged(make_cloud, make_simulation, tmp_path):
     """As many Gaussians under the same name, one of them elsewhere."""
     from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-    from gaussian_swaying.simulation.pipeline import SimulationPipeline
-    from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+    from gaussian_swaying.simulation.scene import Scene
+    from gaussian_swaying.simulation.simulation import Simulation
 
-    like, file, folder = make_pipeline(pinned=False), tmp_path / "splat.ply", tmp_path / "run"
+    like, file, folder = make_simulation(pinned=False), tmp_path / "splat.ply", tmp_path / "run"
 
     def go(frames, resume):
-        scene = SimulatedScene(Scene(ply=str(file)), Material(), 0.25)
         camera = OrbitCamera(width=8, height=8)
-        pipeline = SimulationPipeline(scene, MPMSolver(dx=0.25), like.wind, like.aero, None, camera)
-        pipeline.run(Recorder(images=False, video=False), folder, frames, resume=resume, progress=False)
+        simulation = Simulation(Scene(ply=str(file)), None, MPMSolver(dx=0.25), like.wind, camera=camera, device="cpu")
+        simulation.run(folder, frames, resume=resume, progress=False, recorder=Recorder(images=False, video=False))
 
     cloud = make_cloud()
     write_ply(file, cloud)
@@ -230,27 +229,23 @@ def test_a_splat_that_was_exchanged(make_cloud, make_pipeline, tmp_path):
 
 
 @pytest.mark.parametrize("formulation", ["total"], indirect=True)
-def test_edits_that_bring_an_internal_variable(make_pipeline, tmp_path, formulation):
+def test_edits_that_bring_an_internal_variable(make_simulation, tmp_path, formulation):
     """A law that flows from the second frame on: the state has then what it had not at the start."""
     from gaussian_swaying.mpm.laws.snow import Snow
     from gaussian_swaying.simulation.edits import Edit
-    from gaussian_swaying.simulation.pipeline import SimulationPipeline
 
     def make():
-        like = make_pipeline(formulation="updated")
-        edit = Edit(time=0.04, law=Snow())
-        solver = MPMSolver(dx=0.2, formulation="updated", boundaries=[PinnedRegion(like.solver.boundaries[0].region)])
-        return SimulationPipeline(like.scene, solver, like.wind, like.aero, None, like.camera, edits=[edit])
+        return make_simulation(formulation="updated", parts={"edits": [Edit(time=0.04, law=Snow())]})
 
     recorder = Recorder(images=False, video=False)
-    make().run(recorder, tmp_path / "run", 3, progress=False)
+    make().run(tmp_path / "run", 3, progress=False, recorder=recorder)
     held = read_checkpoint(tmp_path / "run" / "checkpoint.pt")
     assert held["state"]["internal"] is not None
-    make().run(recorder, tmp_path / "run", 4, resume=True, progress=False)
+    make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
     held["state"]["internal"] = torch.full_like(held["state"]["internal"], torch.nan)
     write_checkpoint(tmp_path / "run" / "checkpoint.pt", held | {"frame": 2})
     with pytest.raises(ValueError, match="its `internal` is NaN"):
-        make().run(recorder, tmp_path / "run", 4, resume=True, progress=False)
+        make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
 
 
 def test_the_diagnostics_of_a_frame_are_what_a_log_holds(run):
@@ -277,7 +272,7 @@ def test_a_seal(tmp_path):
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 @pytest.mark.parametrize("law", [None, "Snow"])
-def test_states_that_the_kernels_made_are_whole(formulation, law, make_pipeline, tmp_path):
+def test_states_that_the_kernels_made_are_whole(formulation, law, make_simulation, tmp_path):
     """On a GPU, or here in Triton's interpreter: nothing in them is refused."""
     pytest.importorskip("triton")
     import gaussian_swaying
@@ -286,7 +281,7 @@ def test_states_that_the_kernels_made_are_whole(formulation, law, make_pipeline,
     if law and formulation == "total":
         pytest.skip("what flows needs `updated`")
     material = Material(E=300.0, density=30.0, law=getattr(gaussian_swaying, law)() if law else None)
-    pipeline = make_pipeline(formulation=formulation, transfer="triton", material=material, frame_dt=0.01)
+    simulation = make_simulation(formulation=formulation, transfer="triton", material=material, frame_dt=0.01)
     recorder = Recorder(images=False, video=False)
-    pipeline.run(recorder, tmp_path / "run", 2, progress=False)
-    assert pipeline.run(recorder, tmp_path / "run", 3, resume=True, progress=False)["frames"] == 3
+    simulation.run(tmp_path / "run", 2, progress=False, recorder=recorder)
+    assert simulation.run(tmp_path / "run", 3, resume=True, progress=False, recorder=recorder)["frames"] == 3

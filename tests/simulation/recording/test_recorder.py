@@ -28,14 +28,15 @@ from gaussian_swaying.simulation.recording import recorder as recorder_module
 from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.recording.video import VideoEncoder
+from gaussian_swaying.simulation.run import Run
 
 
 def _names(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def _run(pipeline, folder, frames=3, recorder=None, **settings):
-    return pipeline.run(recorder or Recorder(), folder, frames, progress=False, **settings)
+def _run(simulation, folder, frames=3, recorder=None, **settings):
+    return simulation.run(folder, frames, progress=False, **settings, recorder=recorder or Recorder())
 
 
 # ---- files
@@ -53,7 +54,7 @@ def _failing(monkeypatch, target, name):
 
 
 @pytest.mark.parametrize("what", ["image", "trajectory", "checkpoint", "ply", "summary"])
-def test_a_failing_write_leaves_no_half_file(what, make_pipeline, tmp_path, monkeypatch):
+def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, monkeypatch):
     recorder = Recorder(ply_every=1, video=False)
     recorder.open(tmp_path / "run")
     before = _names(tmp_path)
@@ -69,7 +70,7 @@ def test_a_failing_write_leaves_no_half_file(what, make_pipeline, tmp_path, monk
     elif what == "ply":
         import plyfile
 
-        pipeline = make_pipeline()
+        simulation = make_simulation()
 
         def fail(self, path):
             with open(path, "wb") as stream:
@@ -77,7 +78,7 @@ def test_a_failing_write_leaves_no_half_file(what, make_pipeline, tmp_path, monk
             raise OSError("No space left on device")
 
         monkeypatch.setattr(plyfile.PlyData, "write", fail)
-        write = lambda: recorder.write_ply(1, lambda p: pipeline.export(pipeline.scene.rest(), p))  # noqa: E731
+        write = lambda: recorder.write_ply(1, lambda p: simulation.painter.export(simulation.scene.rest(), p))  # noqa: E731
     else:
         write = lambda: recorder.write_summary({"a": object()})  # noqa: E731
 
@@ -90,8 +91,8 @@ def test_a_failing_write_leaves_no_half_file(what, make_pipeline, tmp_path, monk
     assert _names(tmp_path) == before
 
 
-def test_files_of_a_run(make_pipeline, tmp_path):
-    _run(make_pipeline(), tmp_path / "run", recorder=Recorder(ply_every=2), config="frames: 3\n")
+def test_files_of_a_run(make_simulation, tmp_path):
+    _run(make_simulation(), tmp_path / "run", recorder=Recorder(ply_every=2), config="frames: 3\n")
     assert _names(tmp_path / "run") == [
         "checkpoint.pt",
         "config.yaml",
@@ -111,9 +112,9 @@ def test_files_of_a_run(make_pipeline, tmp_path):
     assert (tmp_path / "run" / "config.yaml").read_text() == "frames: 3\n"
 
 
-def test_diagnostics_are_a_table_too(make_pipeline, tmp_path):
+def test_diagnostics_are_a_table_too(make_simulation, tmp_path):
     """One row per frame with the numbers of summary.json, readable by any spreadsheet."""
-    summary = _run(make_pipeline(), tmp_path / "run")
+    summary = _run(make_simulation(), tmp_path / "run")
     with (tmp_path / "run" / "diagnostics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(summary["per_frame"]) == 3
@@ -122,9 +123,9 @@ def test_diagnostics_are_a_table_too(make_pipeline, tmp_path):
     assert float(rows[-1]["wind_work"]) > 0
 
 
-def test_what_is_switched_off_is_not_written(make_pipeline, tmp_path):
+def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
     recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0)
-    _run(make_pipeline(), tmp_path / "run", recorder=recorder)
+    _run(make_simulation(), tmp_path / "run", recorder=recorder)
     assert _names(tmp_path / "run") == ["diagnostics.csv", "run.json", "summary.json"]
     with pytest.raises(ValueError, match=r"`recorder.images`"):
         Recorder(images=False)
@@ -133,11 +134,11 @@ def test_what_is_switched_off_is_not_written(make_pipeline, tmp_path):
             Recorder(**{name: value})
 
 
-def test_images_are_the_pictures_rounded_to_8_bits(make_pipeline, tmp_path):
-    pipeline = make_pipeline(background=(0.25, 0.5, 1.0))
-    _run(pipeline, tmp_path / "run", 1)
+def test_images_are_the_pictures_rounded_to_8_bits(make_simulation, tmp_path):
+    simulation = make_simulation(background=(0.25, 0.5, 1.0))
+    _run(simulation, tmp_path / "run", 1)
     stored = iio.imread(tmp_path / "run" / "frames" / "00000.png")
-    color = pipeline.render(pipeline.start(), 0).color
+    color = simulation.painter.render(simulation.start(), 0).color
     assert stored.shape == (18, 32, 3)
     assert stored[0, 0].tolist() == [64, 128, 255]
     assert np.abs(stored / 255 - color.numpy()).max() <= 0.5 / 255 + 1e-6
@@ -146,13 +147,13 @@ def test_images_are_the_pictures_rounded_to_8_bits(make_pipeline, tmp_path):
 # ---- trajectory and .ply
 
 
-def test_the_trajectory_holds_every_frame(make_pipeline, tmp_path):
-    pipeline = make_pipeline()
-    _run(pipeline, tmp_path / "run")
-    state = pipeline.start()
+def test_the_trajectory_holds_every_frame(make_simulation, tmp_path):
+    simulation = make_simulation()
+    _run(simulation, tmp_path / "run")
+    state = simulation.start()
     for frame in range(3):
         if frame:
-            state, _ = pipeline.advance(state)
+            state, _ = simulation.advance(state)
         position, F = load_trajectory(tmp_path / "run" / "trajectory.npz", frame)
         assert torch.equal(position, state.position)
         torch.testing.assert_close(F, state.F_total, rtol=1e-3, atol=1e-3)
@@ -160,27 +161,27 @@ def test_the_trajectory_holds_every_frame(make_pipeline, tmp_path):
         load_trajectory(tmp_path / "run" / "trajectory.npz", 3)
 
 
-def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_pipeline, tmp_path):
+def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_simulation, tmp_path):
     """Log scales, logit opacities, unit quaternions wxyz, means in scene units, harmonics turned with the patches."""
     cloud = make_cloud()
     settings = {"pinned": False, "scene": {"up": [0.0, -1.0, 0.0], "longest_side": 0.7}}
-    pipeline = make_pipeline(cloud, wind=WindField([0.0, 9.0, 0.0]), **settings)
-    _run(pipeline, tmp_path / "run", recorder=Recorder(ply_every=1))
-    state = pipeline.start()
+    simulation = make_simulation(cloud, wind=WindField([0.0, 9.0, 0.0]), **settings)
+    _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=1))
+    state = simulation.start()
     rest = read_ply(tmp_path / "run" / "ply" / "00000.ply")
     torch.testing.assert_close(rest.sh, cloud.sh, rtol=0, atol=1e-5)
     for _ in range(2):
-        state, _ = pipeline.advance(state)
-    deformed = pipeline.scene.deformed(state)
+        state, _ = simulation.advance(state)
+    deformed = simulation.scene.deformed(state)
     found = read_ply(tmp_path / "run" / "ply" / "00002.ply")
     assert float((deformed.means - cloud.means).abs().max()) > 0.01
     torch.testing.assert_close(found.means, deformed.means)
     torch.testing.assert_close(found.quats.norm(dim=-1), torch.ones(40), rtol=0, atol=1e-5)
     torch.testing.assert_close(covariance(found.quats, found.scales), deformed.covariances, rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(found.opacities, cloud.opacities)
-    camera = pipeline.camera_at(2).to(dtype=torch.float32)
+    camera = simulation.painter.camera_at(2).to(dtype=torch.float32)
     seen = sh_to_color(found.sh, found.means - camera.position)
-    torch.testing.assert_close(seen, pipeline.colors(deformed, camera), rtol=0, atol=1e-4)
+    torch.testing.assert_close(seen, simulation.painter.colors(deformed, camera), rtol=0, atol=1e-4)
     unturned = sh_to_color(cloud.sh, found.means - camera.position)
     assert float((seen - unturned).abs().max()) > 0.01
     torch.testing.assert_close(found.normals, deformed.normals)
@@ -195,10 +196,10 @@ def _probe(path):
     return next(line for line in done.stderr.splitlines() if "Video:" in line)
 
 
-def test_the_video(make_pipeline, tmp_path):
+def test_the_video(make_simulation, tmp_path):
     """As many frames as pictures, even sides though the pictures are odd, in the format that every player knows."""
-    pipeline = make_pipeline(camera=OrbitCamera(width=33, height=19, azimuth=-70.0, radius=1.9))
-    _run(pipeline, tmp_path / "run", 4)
+    simulation = make_simulation(camera=OrbitCamera(width=33, height=19, azimuth=-70.0, radius=1.9))
+    _run(simulation, tmp_path / "run", 4)
     frames = iio.imread(tmp_path / "run" / "video.mp4")
     assert frames.shape == (4, 20, 34, 3)
     line = _probe(tmp_path / "run" / "video.mp4")
@@ -209,10 +210,10 @@ def test_the_video(make_pipeline, tmp_path):
     assert iio.imread(tmp_path / "run" / "frames" / "00000.png").shape == (19, 33, 3)
 
 
-def test_a_video_that_cannot_be_made_loses_nothing_else(make_pipeline, tmp_path, monkeypatch):
+def test_a_video_that_cannot_be_made_loses_nothing_else(make_simulation, tmp_path, monkeypatch):
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: "false")
     with pytest.raises(OSError, match=r"ffmpeg could not write video\.mp4"):
-        _run(make_pipeline(), tmp_path / "run")
+        _run(make_simulation(), tmp_path / "run")
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 3
     load_trajectory(tmp_path / "run" / "trajectory.npz", 2)
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
@@ -346,7 +347,7 @@ def test_close_tells_what_nobody_asked_about_before(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("frame", [2, 3])
-def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_pipeline, tmp_path, monkeypatch):
+def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_path, monkeypatch):
     """Also if the last frame is the one that cannot be written, and that shows only after the simulation."""
     fail = threading.Event()
 
@@ -360,13 +361,13 @@ def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_pipeline, tmp_path,
         patch.setattr(Recorder, "wait", lambda self: (fail.set() if self._folder else None, wait(self)))
         _before_imwrite(patch, disk_full)
         with pytest.raises(OSError, match=f"frames/0000{frame}.png could not be written: No space left on device"):
-            _run(make_pipeline(), tmp_path / "run", 4)
+            _run(make_simulation(), tmp_path / "run", 4)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["status"] == "failed"
     assert "No space left" in summary["reason"]
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["frame"] < frame
-    _run(make_pipeline(), tmp_path / "run", 4, resume=True)
-    _run(make_pipeline(), tmp_path / "whole", 4)
+    _run(make_simulation(), tmp_path / "run", 4, resume=True)
+    _run(make_simulation(), tmp_path / "whole", 4)
     videos = [iio.imread(tmp_path / name / "video.mp4") for name in ("run", "whole")]
     assert len(videos[0]) == 4
     assert np.array_equal(*videos)
@@ -478,7 +479,7 @@ def test_a_program_that_ends_without_closing_loses_no_frame(tmp_path):
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
 
 
-def test_a_run_holds_no_more_than_the_queue(make_pipeline, tmp_path, monkeypatch):
+def test_a_run_holds_no_more_than_the_queue(make_simulation, tmp_path, monkeypatch):
     most = []
 
     class Watched(recorder_module.FrameWriter):
@@ -489,7 +490,7 @@ def test_a_run_holds_no_more_than_the_queue(make_pipeline, tmp_path, monkeypatch
     monkeypatch.setattr(recorder_module, "FrameWriter", partial(Watched, limit=3, workers=1))
     _before_imwrite(monkeypatch, lambda _: time.sleep(0.05))
     _not_again(monkeypatch)
-    _run(make_pipeline(), tmp_path / "run", 5)
+    _run(make_simulation(), tmp_path / "run", 5)
     assert max(most) == 3
     assert len(most) == 20
     assert len(iio.imread(tmp_path / "run" / "video.mp4")) == 5
@@ -527,14 +528,14 @@ def test_recording_never_makes_the_host_wait_for_the_gpu(tmp_path):
 # ---- summary
 
 
-def test_kernels_are_loaded_without_a_trace(make_pipeline, tmp_path):
+def test_kernels_are_loaded_without_a_trace(make_simulation, tmp_path):
     """A run that did so first has the frames and the log of one that did not."""
     runs = []
     for load in (False, True):
-        pipeline = make_pipeline(wind=WindField([6.0, 1.5, 0.0], seed=7))
+        simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
         if load:
-            pipeline._warm_up(Recorder(), pipeline.start(), 0)
-        runs.append(_run(pipeline, tmp_path / str(load), 3))
+            Run(simulation, 3, None).warm_up(simulation.start(), 0)
+        runs.append(_run(simulation, tmp_path / str(load), 3))
     assert runs[0]["per_frame"] == runs[1]["per_frame"]
     for name in ("00000", "00002"):
         one, two = ((tmp_path / str(load) / "frames" / f"{name}.png").read_bytes() for load in (False, True))
@@ -542,15 +543,15 @@ def test_kernels_are_loaded_without_a_trace(make_pipeline, tmp_path):
 
 
 @pytest.mark.gpu
-def test_startup_is_not_counted_as_simulation(make_pipeline, tmp_path):
-    summary = _run(make_pipeline(wind=WindField([6.0, 1.5, 0.0], seed=7)).to("cuda"), tmp_path / "run", 3)
+def test_startup_is_not_counted_as_simulation(make_simulation, tmp_path):
+    summary = _run(make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7)).to("cuda"), tmp_path / "run", 3)
     assert set(summary["wall_s"]) == {"startup", "simulation", "shading", "rendering", "writing"}
     assert summary["wall_s"]["startup"] > 0
 
 
-def test_the_summary(make_pipeline, tmp_path):
-    pipeline = make_pipeline(wind=WindField([6.0, 1.5, 0.0], seed=7))
-    returned = _run(pipeline, tmp_path / "run", 3, settings={"note": "kept"})
+def test_the_summary(make_simulation, tmp_path):
+    simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
+    returned = _run(simulation, tmp_path / "run", 3, settings={"note": "kept"})
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary == json.loads(json.dumps(returned))
     assert (summary["status"], summary["reason"], summary["note"]) == ("complete", None, "kept")
@@ -566,12 +567,12 @@ def test_the_summary(make_pipeline, tmp_path):
     assert all(seconds > 0 for seconds in summary["wall_s"].values())
     assert summary["peak_memory_bytes"]["host"] > 2**20
     assert summary["peak_memory_bytes"]["device"] is None
-    state, log = pipeline.start(), []
-    start = pipeline.solver.energies(state)
+    state, log = simulation.start(), []
+    start = simulation.solver.energies(state)
     for _ in range(2):
-        state, health = pipeline.advance(state)
+        state, health = simulation.advance(state)
         log.append(health)
-    end = pipeline.solver.energies(state)
+    end = simulation.solver.energies(state)
     for name in ("kinetic", "elastic", "potential"):
         assert summary["energy_start_J"][name] == pytest.approx(float(start[name]), abs=1e-9)
         assert summary["energy_end_J"][name] == pytest.approx(float(end[name]))
@@ -584,8 +585,8 @@ def test_the_summary(make_pipeline, tmp_path):
 # ---- a run that ends badly
 
 
-def _fail_at(pipeline, monkeypatch, frame, error):
-    advance, done = pipeline.advance, []
+def _fail_at(simulation, monkeypatch, frame, error):
+    advance, done = simulation.advance, []
 
     def fail(state):
         if len(done) == frame - 1:
@@ -593,7 +594,7 @@ def _fail_at(pipeline, monkeypatch, frame, error):
         done.append(1)
         return advance(state)
 
-    monkeypatch.setattr(pipeline, "advance", fail)
+    monkeypatch.setattr(simulation, "advance", fail)
 
 
 @pytest.mark.parametrize(
@@ -604,11 +605,11 @@ def _fail_at(pipeline, monkeypatch, frame, error):
         (ValueError("something else"), "failed"),
     ],
 )
-def test_what_was_recorded_before_the_end_is_kept(error, status, make_pipeline, tmp_path, monkeypatch):
-    pipeline, folder = make_pipeline(), tmp_path / "run"
-    _fail_at(pipeline, monkeypatch, 3, error)
+def test_what_was_recorded_before_the_end_is_kept(error, status, make_simulation, tmp_path, monkeypatch):
+    simulation, folder = make_simulation(), tmp_path / "run"
+    _fail_at(simulation, monkeypatch, 3, error)
     with pytest.raises(type(error)):
-        _run(pipeline, folder, 10, Recorder(ply_every=1))
+        _run(simulation, folder, 10, Recorder(ply_every=1))
     assert len(list((folder / "frames").glob("*.png"))) == 3
     assert len(list((folder / "ply").glob("*.ply"))) == 3
     assert len(iio.imread(folder / "video.mp4")) == 3
@@ -619,14 +620,14 @@ def test_what_was_recorded_before_the_end_is_kept(error, status, make_pipeline, 
     assert not [name for name in _names(folder) if "/." in name or name.startswith(".")]
 
 
-def test_a_run_that_diverges_by_itself_is_kept(make_pipeline, tmp_path):
+def test_a_run_that_diverges_by_itself_is_kept(make_simulation, tmp_path):
     """The wind rises to a hurricane at 0.1 s with a substep that is too long for it."""
     from gaussian_swaying.aero.wind import FlowKey
 
     wind = WindField(schedule=[FlowKey(0.0, [2.0, 0.5, 0.0]), FlowKey(0.1, [0.0, 3000.0, 0.0])])
-    pipeline = make_pipeline(wind=wind, cfl=0.4)
+    simulation = make_simulation(wind=wind, cfl=0.4)
     with pytest.raises(SimulationDiverged, match="Remedy"):
-        _run(pipeline, tmp_path / "run", 40)
+        _run(simulation, tmp_path / "run", 40)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["status"] == "diverged"
     assert 3 <= summary["frames"] < 40
@@ -639,26 +640,26 @@ def test_a_run_that_diverges_by_itself_is_kept(make_pipeline, tmp_path):
 # ---- the folder
 
 
-def test_an_earlier_run_is_moved_aside(make_pipeline, tmp_path, capsys):
-    _run(make_pipeline(), tmp_path / "run", 2)
+def test_an_earlier_run_is_moved_aside(make_simulation, tmp_path, capsys):
+    _run(make_simulation(), tmp_path / "run", 2)
     (tmp_path / "run" / "mine.txt").write_text("precious")
-    _run(make_pipeline(), tmp_path / "run", 1)
-    _run(make_pipeline(), tmp_path / "run", 1)
+    _run(make_simulation(), tmp_path / "run", 1)
+    _run(make_simulation(), tmp_path / "run", 1)
     assert len(list((tmp_path / "run.1" / "frames").glob("*.png"))) == 2
     assert (tmp_path / "run.1" / "mine.txt").read_text() == "precious"
     assert len(list((tmp_path / "run.2" / "frames").glob("*.png"))) == 1
     assert "run.1" in capsys.readouterr().out
 
 
-def test_a_folder_behind_a_link(make_pipeline, tmp_path):
+def test_a_folder_behind_a_link(make_simulation, tmp_path):
     """A run through it, one that continues there, and one that moves both aside."""
     disk, link = tmp_path / "disk", tmp_path / "link"
     disk.mkdir()
     link.symlink_to(disk / "flag")
     recorder = Recorder(video=False, ply_every=1)
-    _run(make_pipeline(), link, 2, recorder)
-    _run(make_pipeline(), link, 3, recorder, resume=True)
-    _run(make_pipeline(), link, 1, recorder)
+    _run(make_simulation(), link, 2, recorder)
+    _run(make_simulation(), link, 3, recorder, resume=True)
+    _run(make_simulation(), link, 1, recorder)
     assert link.is_symlink()
     assert len(list((disk / "flag.1" / "frames").iterdir())) == 3
     assert len(list((disk / "flag" / "frames").iterdir())) == 1
@@ -666,22 +667,22 @@ def test_a_folder_behind_a_link(make_pipeline, tmp_path):
     load_trajectory(disk / "flag.1" / "trajectory.npz", 2)
 
 
-def test_foreign_files_are_left_alone(make_pipeline, tmp_path):
+def test_foreign_files_are_left_alone(make_simulation, tmp_path):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "notes.txt").write_text("precious")
-    _run(make_pipeline(), folder, 1)
+    _run(make_simulation(), folder, 1)
     assert (folder / "notes.txt").read_text() == "precious"
 
 
 @pytest.mark.parametrize("name", ["summary.json", "frames/00000.png", "trajectory/walk.npz", "config.yaml"])
-def test_foreign_files_are_not_overwritten(name, make_pipeline, tmp_path):
+def test_foreign_files_are_not_overwritten(name, make_simulation, tmp_path):
     """They bear a name that the run would write, but no run made them."""
     file = tmp_path / "mine" / name
     file.parent.mkdir(parents=True)
     file.write_text("precious")
     with pytest.raises(ValueError, match=r"mine holds \w+.* choose another with --output"):
-        _run(make_pipeline(), tmp_path / "mine", 1)
+        _run(make_simulation(), tmp_path / "mine", 1)
     assert file.read_text() == "precious"
     assert len([path for path in (tmp_path / "mine").rglob("*") if path.is_file()]) == 1
 

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from bench.cases.flags import what_failed
 from bench.record import ROOT
 from bench.slots import table, value
@@ -55,9 +57,17 @@ def arguments(name: str, preset: str | None) -> list[str]:
 
 
 def fingerprint(name: str, preset: str | None) -> str:
-    """A few letters that change when a configuration file of a scene does."""
+    """A few letters that change when a value in a configuration of a scene does; comments and modules do not count."""
     files = [Path(part) for part in arguments(name, preset) if part != "--config"]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+    values = [_without_modules(yaml.safe_load(file.read_text())) for file in files]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:12]
+
+
+def _without_modules(value: Any) -> Any:
+    """A configuration whose classes are named without their modules."""
+    if isinstance(value, dict):
+        return {k: v.split(".")[-1] if k == "class_path" else _without_modules(v) for k, v in value.items()}
+    return [_without_modules(v) for v in value] if isinstance(value, list) else value
 
 
 def strip(frames: Path, target: Path) -> None:

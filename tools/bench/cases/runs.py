@@ -17,7 +17,7 @@ from bench import record
 from bench.clock import timed
 from bench.problems import CUBE, sheet
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 
 def bench_substep(
@@ -51,16 +51,16 @@ def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, 
 
 def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
     """PSNR between the splat as it is and the picture of frame 0 of the run, at the size of the config's camera."""
-    parser = build_parser()
+    parser = Simulation.parser()
     settings = parser.parse_args(["--config", config, "--scene.ply", ply, "--device", device.type])
-    pipeline, _ = build_pipeline(parser, settings)
+    simulation = Simulation.from_settings(parser, settings)
     with torch.inference_mode():
-        state = pipeline.start()
-        moved = pipeline.render(state, 0).color
-        pipeline.shader = None
-        rest = pipeline.scene.rest()
-        camera = pipeline.camera_at(0)
-        plain = pipeline.draw(rest, pipeline.colors(rest, camera), camera).color
+        state = simulation.start()
+        moved = simulation.painter.render(state, 0).color
+        simulation.painter.shader = None
+        rest = simulation.scene.rest()
+        camera = simulation.painter.camera_at(0)
+        plain = simulation.painter.draw(rest, simulation.painter.colors(rest, camera), camera).color
     error = float((moved - plain).square().mean())
     return float("inf") if error == 0 else -10 * float(torch.log10(torch.tensor(error)))
 

@@ -21,7 +21,7 @@ from bench.problems import CUBE, block, fewest_bytes, nodes_in_reach, sheet, wav
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.simulation.config import build_parser, build_pipeline
+from gaussian_swaying.simulation.simulation import Simulation
 
 Row = dict[str, Any]
 
@@ -217,10 +217,10 @@ def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
     arguments = ["--config", str(CONFIG), "--device", device.type, "--solver.dx", str(dx)]
     arguments += ["--scene.generator.init_args.spacing", str(plan.spacing)]
     arguments += ["--camera.init_args.width", str(width), "--camera.init_args.height", str(height)]
-    parser = build_parser()
+    parser = Simulation.parser()
     peak = Peak(device)
-    pipeline, _ = build_pipeline(parser, parser.parse_args(arguments))
-    state = pipeline.start()
+    simulation = Simulation.from_settings(parser, parser.parse_args(arguments))
+    state = simulation.start()
     build_memory = peak.read()
     peak.start()
     parts: list[list[float]] = []
@@ -228,12 +228,13 @@ def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
     for frame in range(1, 1 + sum(plan.frames)):
         clock = Clock(device)
         clock.mark()
-        state, health = pipeline.advance(state)
+        state, health = simulation.advance(state)
         clock.mark()
-        camera = pipeline.camera_at(frame)
-        gaussians, colours = pipeline.shade(state, camera)
+        camera = simulation.painter.camera_at(frame)
+        gaussians = simulation.painter.deformed(state)
+        colours = simulation.painter.colors(gaussians, camera)
         clock.mark()
-        pipeline.draw(gaussians, colours, camera)
+        simulation.painter.draw(gaussians, colours, camera)
         clock.mark()
         if frame > plan.frames[0]:
             parts.append(clock.read())
@@ -241,8 +242,8 @@ def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
     row: Row = spread([sum(part) for part in parts])
     names = ("simulation_ms", "shading_ms", "rendering_ms")
     row |= {name: statistics.median(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
-    row |= {"particles": pipeline.solver.points.count, "width": width, "height": height}
-    row |= {"substeps": statistics.median(substeps), "renderer": type(pipeline.renderer).__name__}
+    row |= {"particles": simulation.solver.points.count, "width": width, "height": height}
+    row |= {"substeps": statistics.median(substeps), "renderer": type(simulation.painter.renderer).__name__}
     return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory}
 
 

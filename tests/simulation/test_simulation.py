@@ -24,14 +24,14 @@ from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import scene as scene_module
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged, diagnose
-from gaussian_swaying.simulation.pipeline import SimulationPipeline
-from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.scene import Material, Scene
+from gaussian_swaying.simulation.simulation import Simulation
 
 
-def _advance(pipeline, frames):
-    state, log = pipeline.start(), []
+def _advance(simulation, frames):
+    state, log = simulation.start(), []
     for _ in range(frames):
-        state, health = pipeline.advance(state)
+        state, health = simulation.advance(state)
         log.append(health)
     return state, log
 
@@ -40,113 +40,114 @@ def _advance(pipeline, frames):
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-def test_the_substep_does_not_depend_on_the_frame(formulation, make_pipeline):
+def test_the_substep_does_not_depend_on_the_frame(formulation, make_simulation):
     """0.16 s in frames of 40, 80 or 160 ms with gusts that change every 40 ms: the same substeps, the same motion."""
     ends = []
     for frame_dt, frames in ((0.04, 4), (0.08, 2), (0.16, 1)):
         wind = WindField([6.0, 1.5, 0.0], modulations=[SineSway(period=0.3), GaussianGust(1.0)])
         settings = {"frame_dt": frame_dt, "formulation": formulation, "substep": 0.004, "dtype": torch.float64}
-        state, log = _advance(make_pipeline(wind=wind, **settings), frames)
+        state, log = _advance(make_simulation(wind=wind, **settings), frames)
         assert sum(health.substeps for health in log) == 40
         assert float(state.time) == pytest.approx(0.16)
         ends.append(state.position)
-    moved = float((ends[0] - make_pipeline(dtype=torch.float64).start().position).abs().max())
+    moved = float((ends[0] - make_simulation(dtype=torch.float64).start().position).abs().max())
     assert moved > 0.05
     for end in ends[1:]:
         torch.testing.assert_close(end, ends[0], rtol=0, atol=1e-9)
 
 
-def test_the_adaptive_substep_follows_the_courant_number(make_pipeline):
+def test_the_adaptive_substep_follows_the_courant_number(make_simulation):
     """c = sqrt((lambda + 2 mu) / rho) at rest: ceil(frame_dt c / (cfl dx)) substeps, whatever the frame."""
     speed = math.sqrt(3e3 * 0.7 / (1.3 * 0.4) / 30.0)
     for frame_dt in (0.04, 0.1):
         for cfl in (0.4, 0.1):
-            pipeline = make_pipeline(wind=WindField(), frame_dt=frame_dt, cfl=cfl, gravity=(0.0, 0.0, 0.0))
-            _, (health,) = _advance(pipeline, 1)
+            simulation = make_simulation(wind=WindField(), frame_dt=frame_dt, cfl=cfl, gravity=(0.0, 0.0, 0.0))
+            _, (health,) = _advance(simulation, 1)
             assert health.substeps == math.ceil(frame_dt * speed / (cfl * 0.2))
             assert health.cfl == pytest.approx(frame_dt / health.substeps * speed / 0.2, rel=1e-5)
 
 
-def test_strong_drag_on_light_patches_shortens_the_substep(make_pipeline):
+def test_strong_drag_on_light_patches_shortens_the_substep(make_simulation):
     """Explicit drag is stable for dt < 2 m / (rho A C v)."""
     light = Material(E=10.0, density=1.0, thickness=1e-3)
     wind = WindField([30.0, 0.0, 0.0])
-    pipeline = make_pipeline(wind=wind, material=light, aero=AeroForce(C_D=1.0, C_F=0.0, C_L=0.0))
-    _, (health,) = _advance(pipeline, 1)
+    simulation = make_simulation(wind=wind, material=light, aero=AeroForce(C_D=1.0, C_F=0.0, C_L=0.0))
+    _, (health,) = _advance(simulation, 1)
     areal = 1.0 * 1e-3
     assert health.substeps > 0.04 * 1.225 * 1.0 * 30.0 / areal / 2
     assert math.isfinite(health.kinetic)
 
 
-def test_aerodynamics_are_asked_only_where_they_can_push(make_pipeline, monkeypatch):
+def test_aerodynamics_are_asked_only_where_they_can_push(make_simulation, monkeypatch):
     calls = []
     forward = AeroForce.forward
     monkeypatch.setattr(AeroForce, "forward", lambda self, *a: calls.append(1) or forward(self, *a))
     for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce(air_density=0.0)):
         assert aero.idle
-        _, (health,) = _advance(make_pipeline(aero=aero), 1)
+        _, (health,) = _advance(make_simulation(aero=aero), 1)
         assert calls == []
         assert health.kinetic > 0
-    _, (health,) = _advance(make_pipeline(), 1)
+    _, (health,) = _advance(make_simulation(), 1)
     assert len(calls) == health.substeps
 
 
-def test_still_air_resists_a_fall(make_pipeline):
+def test_still_air_resists_a_fall(make_simulation):
     """No wind is not no air: a light free flag falls slower than in a vacuum, broadside most of all."""
     light = Material(E=1e3, density=10.0, thickness=1e-3)
     speed = []
     for air in (0.0, 1.225):
         aero = AeroForce(C_D=1.0, C_F=1.0, air_density=air)
-        pipeline = make_pipeline(wind=WindField(), aero=aero, material=light, pinned=False)
-        state, _ = _advance(pipeline, 5)
+        simulation = make_simulation(wind=WindField(), aero=aero, material=light, pinned=False)
+        state, _ = _advance(simulation, 5)
         speed.append(-float(state.velocity[:, 2].mean()))
     assert speed[0] == pytest.approx(9.8 * 0.2, rel=1e-4)
     assert speed[1] < 0.9 * speed[0]
 
 
-def test_a_solver_can_serve_two_pipelines(make_pipeline):
+def test_a_solver_can_serve_two_simulations(make_simulation):
     """Boundaries stay as they were given, in scene units."""
-    one = make_pipeline()
+    one = make_simulation()
     given = list(one.solver.boundaries)
     one.start()
-    two = SimulationPipeline(one.scene, one.solver, one.wind, one.aero, None, one.camera)
+    source = Scene(generator=FlagScene(spacing=0.1))
+    two = Simulation(source, Material(E=3e3, density=30.0), one.solver, one.wind, one.aero, device="cpu")
     two.start()
     assert list(two.solver.boundaries) == given
 
 
-def test_a_grid_that_was_outrun_is_enlarged(make_pipeline):
+def test_a_grid_that_was_outrun_is_enlarged(make_simulation):
     """A strong wind takes an unpinned flag farther in one frame than its speed at the start foretells."""
-    pipeline = make_pipeline(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
-    state, _ = _advance(pipeline, 3)
+    simulation = make_simulation(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
+    state, _ = _advance(simulation, 3)
     assert not bool(state.lost.any())
-    assert float((state.position - pipeline.scene.points.position).norm(dim=-1).max()) > 0.1
+    assert float((state.position - simulation.scene.points.position).norm(dim=-1).max()) > 0.1
 
 
-def test_the_wind_blows_the_flag_its_way(make_pipeline):
+def test_the_wind_blows_the_flag_its_way(make_simulation):
     """Along y, the normal of the flag, with either sign."""
     for sign in (1.0, -1.0):
-        pipeline = make_pipeline(wind=WindField([0.0, 4.0 * sign, 0.0]), gravity=(0.0, 0.0, 0.0))
-        state, _ = _advance(pipeline, 2)
-        assert sign * float((state.position - pipeline.scene.points.position)[:, 1].mean()) > 0.01
+        simulation = make_simulation(wind=WindField([0.0, 4.0 * sign, 0.0]), gravity=(0.0, 0.0, 0.0))
+        state, _ = _advance(simulation, 2)
+        assert sign * float((state.position - simulation.scene.points.position)[:, 1].mean()) > 0.01
 
 
-def test_a_frame_whose_substep_was_too_long_is_done_again(make_pipeline, monkeypatch):
+def test_a_frame_whose_substep_was_too_long_is_done_again(make_simulation, monkeypatch):
     """The first try ends with a Courant number of 2, so more substeps are taken, from the same start."""
-    pipeline = make_pipeline(wind=WindField())
-    state = pipeline.start()
-    _, expected = _advance(make_pipeline(wind=WindField()), 1)
+    simulation = make_simulation(wind=WindField())
+    state = simulation.start()
+    _, expected = _advance(make_simulation(wind=WindField()), 1)
     tries = []
-    roll, number = pipeline._roll, pipeline.solver.cfl_number
+    roll, number = simulation._roll, simulation.solver.cfl_number
 
     def record(start, steps):
         tries.append((start, steps))
         return roll(start, steps)
 
-    monkeypatch.setattr(pipeline, "_roll", record)
+    monkeypatch.setattr(simulation, "_roll", record)
     monkeypatch.setattr(
-        pipeline.solver, "cfl_number", lambda s, dt: torch.tensor(2.0) if len(tries) == 1 else number(s, dt)
+        simulation.solver, "cfl_number", lambda s, dt: torch.tensor(2.0) if len(tries) == 1 else number(s, dt)
     )
-    end, health = pipeline.advance(state)
+    end, health = simulation.advance(state)
     steps = [n for _, n in tries]
     assert steps[0] < steps[1] <= 4 * steps[0] + 1
     assert len(tries) == 2
@@ -155,26 +156,26 @@ def test_a_frame_whose_substep_was_too_long_is_done_again(make_pipeline, monkeyp
     assert float(end.time) == pytest.approx(0.04)
 
 
-def test_a_fixed_substep_is_kept(make_pipeline):
-    _, log = _advance(make_pipeline(substep=0.004), 3)
+def test_a_fixed_substep_is_kept(make_simulation):
+    _, log = _advance(make_simulation(substep=0.004), 3)
     assert [health.substeps for health in log] == [10, 10, 10]
 
 
-def test_a_fixed_substep_above_the_stable_one_is_refused_with_the_stable_one(make_pipeline):
-    pipeline = make_pipeline(substep=0.5)
+def test_a_fixed_substep_above_the_stable_one_is_refused_with_the_stable_one(make_simulation):
+    simulation = make_simulation(substep=0.5)
     with pytest.raises(ValueError, match=r"`substep` of 0.5 s is longer than the stable one of \d") as info:
-        pipeline.start()
-    assert f"{pipeline.solver.stable_substep():.4g} s" in str(info.value)
+        simulation.start()
+    assert f"{simulation.solver.stable_substep():.4g} s" in str(info.value)
 
 
 # ---- energy, tearing, light things
 
 
-def test_the_work_of_the_wind_is_what_the_energy_gains(make_pipeline):
+def test_the_work_of_the_wind_is_what_the_energy_gains(make_simulation):
     """Kinetic, elastic and gravitational energy of a flag that no pin holds, against the work, over 5 frames."""
-    pipeline = make_pipeline(pinned=False, dtype=torch.float64, cfl=0.1)
-    _, log = _advance(pipeline, 5)
-    start = diagnose(pipeline.solver, pipeline.start(), 0, 0.0)
+    simulation = make_simulation(pinned=False, dtype=torch.float64, cfl=0.1)
+    _, log = _advance(simulation, 5)
+    start = diagnose(simulation.solver, simulation.start(), 0, 0.0)
     gained = sum(getattr(log[-1], n) - getattr(start, n) for n in ("kinetic", "elastic", "potential"))
     work = sum(health.wind_work for health in log)
     assert work > 0.01
@@ -182,26 +183,26 @@ def test_the_work_of_the_wind_is_what_the_energy_gains(make_pipeline):
     assert gained == pytest.approx(work, rel=0.02)
 
 
-def test_a_sheet_that_tears_is_reported(make_pipeline):
+def test_a_sheet_that_tears_is_reported(make_simulation):
     """A soft flag on a grid finer than its particles: `updated` falls apart and says so, `total` cannot."""
-    _, log = _advance(make_pipeline(formulation="updated", dx=0.08), 6)
+    _, log = _advance(make_simulation(formulation="updated", dx=0.08), 6)
     assert log[0].torn == 0
     assert log[-1].torn > 5
-    _, log = _advance(make_pipeline(formulation="updated", dx=0.2), 6)
+    _, log = _advance(make_simulation(formulation="updated", dx=0.2), 6)
     assert log[-1].torn == 0
-    _, log = _advance(make_pipeline(formulation="total", dx=0.08), 6)
+    _, log = _advance(make_simulation(formulation="total", dx=0.08), 6)
     assert log[-1].torn == 0
 
 
-def test_semi_implicit_drag_needs_no_shorter_substep(make_pipeline):
+def test_semi_implicit_drag_needs_no_shorter_substep(make_simulation):
     """A storm on a sheet of 0.02 kg/m²: hundreds of substeps of explicit drag, or the elastic ones."""
     storm = WindField([0.0, 100.0, 0.0])
     light = Material(E=3e3, density=2.0)
     substeps = {}
     for step in ("explicit", "semi_implicit"):
         aero = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, law="projected", drag_step=step)
-        pipeline = make_pipeline(wind=storm, aero=aero, material=light, pinned=False, gravity=(0.0, 0.0, 0.0))
-        state, log = _advance(pipeline, 2)
+        simulation = make_simulation(wind=storm, aero=aero, material=light, pinned=False, gravity=(0.0, 0.0, 0.0))
+        state, log = _advance(simulation, 2)
         substeps[step] = log[0].substeps
         assert float(state.velocity[:, 1].mean()) == pytest.approx(100.0, rel=0.05)
     assert substeps["explicit"] > 2 * substeps["semi_implicit"]
@@ -210,28 +211,28 @@ def test_semi_implicit_drag_needs_no_shorter_substep(make_pipeline):
 # ---- divergence
 
 
-def test_a_courant_number_beyond_any_stability_is_a_divergence(make_pipeline):
-    pipeline = make_pipeline(cfl=50.0)
+def test_a_courant_number_beyond_any_stability_is_a_divergence(make_simulation):
+    simulation = make_simulation(cfl=50.0)
     with pytest.raises(
         SimulationDiverged, match=r"t = 0.04 s, particle \d+: the Courant number .*`solver.cfl`"
     ) as info:
-        _advance(pipeline, 1)
+        _advance(simulation, 1)
     assert info.value.particle is not None
 
 
-def test_a_frame_of_endless_substeps_is_a_divergence(make_pipeline):
+def test_a_frame_of_endless_substeps_is_a_divergence(make_simulation):
     """An enormous stretch would take years of substeps; the most stretched particle is named."""
-    pipeline = make_pipeline(wind=WindField())
-    state = pipeline.start()
+    simulation = make_simulation(wind=WindField())
+    state = simulation.start()
     F = state.F_elastic.clone()
     F[12] *= 1e4
     with pytest.raises(SimulationDiverged, match=r"particle 12: a frame would take [\d,]+ substeps"):
-        pipeline.advance(state.replace(F_elastic=F))
+        simulation.advance(state.replace(F_elastic=F))
 
 
-def test_a_particle_that_becomes_nan_is_a_divergence(make_pipeline, monkeypatch):
-    pipeline = make_pipeline(wind=WindField())
-    state, roll = pipeline.start(), pipeline._roll
+def test_a_particle_that_becomes_nan_is_a_divergence(make_simulation, monkeypatch):
+    simulation = make_simulation(wind=WindField())
+    state, roll = simulation.start(), simulation._roll
 
     def poison(start, steps):
         end, *more = roll(start, steps)
@@ -239,28 +240,32 @@ def test_a_particle_that_becomes_nan_is_a_divergence(make_pipeline, monkeypatch)
         velocity[7] = math.nan
         return end.replace(velocity=velocity), *more
 
-    monkeypatch.setattr(pipeline, "_roll", poison)
+    monkeypatch.setattr(simulation, "_roll", poison)
     with pytest.raises(SimulationDiverged, match=r"particle 7: .*NaN"):
-        pipeline.advance(state)
+        simulation.advance(state)
 
 
 # ---- camera
 
 
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-def test_the_camera_orbits_the_object_in_scene_units(up, make_cloud, make_pipeline):
+def test_the_camera_orbits_the_object_in_scene_units(up, make_cloud, make_simulation):
     cloud = make_cloud(offset=5.0)
-    pipeline = make_pipeline(cloud, pinned=False, scene={"up": up, "longest_side": 0.1}, camera=OrbitCamera(radius=3.0))
+    simulation = make_simulation(
+        cloud, pinned=False, scene={"up": up, "longest_side": 0.1}, camera=OrbitCamera(radius=3.0)
+    )
     low, high = cloud.means.amin(0), cloud.means.amax(0)
-    eye = pipeline.camera_at(0).position
+    eye = simulation.painter.camera_at(0).position
     assert float((eye - 0.5 * (low + high)).norm()) == pytest.approx(3 * float((high - low).amax()), rel=1e-4)
 
 
-def test_a_camera_inside_the_object_is_an_error(make_cloud, make_pipeline):
-    inside = make_pipeline(make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 0.5], target=[2.0, 0.5, 0.5]))
+def test_a_camera_inside_the_object_is_an_error(make_cloud, make_simulation):
+    inside = make_simulation(
+        make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 0.5], target=[2.0, 0.5, 0.5])
+    )
     with pytest.raises(ValueError, match=r"camera at \[0.5, 0.5, 0.5\] lies inside the object"):
         inside.check_camera(0)
-    outside = make_pipeline(
+    outside = make_simulation(
         make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 3.0], target=[0.5, 0.4, 0.5])
     )
     outside.check_camera(0)
@@ -277,18 +282,23 @@ def _turn():
     return torch.matrix_exp(math.radians(70.0) * skew)
 
 
-def test_colours_turn_with_the_object(make_cloud, make_pipeline):
+def _colours(simulation, state, frame=0):
+    painter = simulation.painter
+    return painter.colors(painter.deformed(state), painter.camera_at(frame))
+
+
+def test_colours_turn_with_the_object(make_cloud, make_simulation):
     """Object and eye turned alike about the object's centre: the same colours. The eye left behind: other ones."""
-    pipeline = make_pipeline(make_cloud(), pinned=False, scene={"up": [0.0, -1.0, 0.0], "longest_side": 0.5})
-    frame, state, R = pipeline.scene.frame, pipeline.start(), _turn()
+    simulation = make_simulation(make_cloud(), pinned=False, scene={"up": [0.0, -1.0, 0.0], "longest_side": 0.5})
+    frame, state, R = simulation.scene.frame, simulation.start(), _turn()
     turned = state.replace(position=(state.position.double() @ R.T).float(), F_total=R.float().expand_as(state.F_total))
     eye = torch.tensor([3.0, 1.0, -2.0], dtype=torch.float64)
     turned_eye = frame.point_to_scene(frame.point_to_sim(eye) @ R.T)
     target = frame.origin.tolist()
 
     def colours(state, eye):
-        pipeline.camera = LookAtCamera(eye=eye.tolist(), target=target, width=32, height=18)
-        return pipeline.shade(state, pipeline.camera_at(0))[1]
+        simulation.painter.camera = LookAtCamera(eye=eye.tolist(), target=target, width=32, height=18)
+        return _colours(simulation, state)
 
     rest = colours(state, eye)
     torch.testing.assert_close(colours(turned, turned_eye), rest, rtol=0, atol=1e-5)
@@ -296,7 +306,7 @@ def test_colours_turn_with_the_object(make_cloud, make_pipeline):
     assert float((colours(state, turned_eye) - rest).abs().max()) > 0.05
 
 
-def test_only_moving_gaussians_are_shaded(make_cloud, make_pipeline):
+def test_only_moving_gaussians_are_shaded(make_cloud, make_simulation):
     from gaussian_swaying.geometry.regions import Box
 
     cloud = make_cloud(degree=0)
@@ -305,40 +315,40 @@ def test_only_moving_gaussians_are_shaded(make_cloud, make_pipeline):
     cloud = dataclasses.replace(cloud, opacities=opacities)
     region = Box([None, None, None], [0.5, None, None])
     settings = {"scene": {"region": region}, "pinned": False}
-    plain = make_pipeline(cloud, **settings)
-    dark = make_pipeline(cloud, shader=DiffuseShader([0.0, 0.0, 1.0]), **settings)
-    before = plain.shade(plain.start(), plain.camera_at(0))[1]
-    gaussians, after = dark.shade(dark.start(), dark.camera_at(0))
+    plain = make_simulation(cloud, **settings)
+    dark = make_simulation(cloud, shader=DiffuseShader([0.0, 0.0, 1.0]), **settings)
+    before = _colours(plain, plain.start())
+    gaussians, after = dark.painter.deformed(dark.start()), _colours(dark, dark.start())
     inside = cloud.means[:, 0] <= 0.5
     assert torch.equal(after[~inside], before[~inside])
     expected = before * gaussians.normals[:, 2:].clamp_min(0)  # max(0, n . L), light from above
     torch.testing.assert_close(after[inside], expected[inside], rtol=0, atol=1e-6)
 
 
-def test_the_light_is_given_in_the_z_up_frame(make_pipeline):
+def test_the_light_is_given_in_the_z_up_frame(make_simulation):
     """y up in the scene: a sheet whose normal is y is fully lit by light from above."""
     flag = FlagScene(spacing=0.1, ripple=0.0, pattern="white").generate()
     shader = DiffuseShader([0.0, 0.0, 1.0], two_sided=True)
     for up, factor in (([0.0, 1.0, 0.0], 1.0), ([0.0, 0.0, 1.0], 0.0)):
-        pipeline = make_pipeline(flag, shader=shader, pinned=False, scene={"up": up})
+        simulation = make_simulation(flag, shader=shader, pinned=False, scene={"up": up})
         camera = LookAtCamera(eye=[0.6, -3.0, 1.0], target=[0.6, 0.0, 0.4])
-        pipeline.camera = camera
-        colours = pipeline.shade(pipeline.start(), pipeline.camera_at(0))[1]
+        simulation.painter.camera = camera
+        colours = _colours(simulation, simulation.start())
         torch.testing.assert_close(colours, torch.full_like(colours, 0.9 * factor), rtol=0, atol=1e-5)
 
 
 # ---- pictures
 
 
-def test_the_first_picture_is_that_of_the_splat(flag_ply, make_pipeline):
+def test_the_first_picture_is_that_of_the_splat(flag_ply, make_simulation):
     """A file with y up and another unit, scaled to 1 m and back, against the file drawn as it is."""
-    scene = SimulatedScene(Scene(ply=flag_ply, up=[0.0, 1.0, 0.0], longest_side=1.0), Material(), 0.1)
+    scene = Scene(ply=flag_ply, up=[0.0, 1.0, 0.0], longest_side=1.0)
     camera = LookAtCamera(eye=[7.0, -2.0, -5.0], target=[7.0, -1.7, 2.0], up=[0.0, 1.0, 0.0], width=64, height=36)
     background = (0.2, 0.3, 0.4)
-    pipeline = SimulationPipeline(
-        scene, MPMSolver(dx=0.1), WindField([5.0, 0.0, 0.0]), AeroForce(), None, camera, background
+    simulation = Simulation(
+        scene, Material(), MPMSolver(dx=0.1), [5, 0, 0], camera=camera, background=background, device="cpu"
     )
-    picture = pipeline.render(pipeline.start(), 0)
+    picture = simulation.painter.render(simulation.start(), 0)
     model = GaussianSurfaceModel.from_cloud(read_ply(flag_ply), requires_grad=False)
     view = camera(0, 0.0, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]), 1.0)
     colours = model.colors(torch.nn.functional.normalize(model.means - view.position, dim=-1))
@@ -346,8 +356,8 @@ def test_the_first_picture_is_that_of_the_splat(flag_ply, make_pipeline):
     assert float(direct.alpha.mean()) > 0.1  # the flag is in the picture
     error = float((picture.color - direct.color).square().mean())
     assert -10 * math.log10(max(error, 1e-12)) >= 35
-    state, _ = _advance(pipeline, 3)
-    moved = pipeline.render(state, 0)
+    state, _ = _advance(simulation, 3)
+    moved = simulation.painter.render(state, 0)
     assert float((moved.color - direct.color).square().mean()) > 100 * max(error, 1e-12)
 
 
@@ -376,45 +386,47 @@ class _Operations(TorchDispatchMode):
 
 @pytest.mark.parametrize("name", PICTURES)
 @pytest.mark.parametrize("degree", [0, 3])
-def test_a_picture_takes_few_operations(name, degree, make_cloud, make_pipeline, monkeypatch):
+def test_a_picture_takes_few_operations(name, degree, make_cloud, make_simulation, monkeypatch):
     """Each costs a GPU's host microseconds. What is one kernel there counts as one here."""
     shader, settings = PICTURES[name]
-    pipeline = make_pipeline(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings)
-    state, camera = pipeline.start(), pipeline.camera_at(0)
+    simulation = make_simulation(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings)
+    state, camera = simulation.start(), simulation.painter.camera_at(0)
     monkeypatch.setattr(
         scene_module, "deform_all", lambda F, a, n, rotations, *limit: (a.neg(), n, F if rotations else None)
     )
     harmonics._basis_by_product(torch.ones(1, 3), degree)
     monkeypatch.setattr(harmonics, "sh_basis", harmonics._basis_by_product)
-    pipeline.shade(state, camera)  # what is kept is made
+    painter = simulation.painter
+    painter.colors(painter.deformed(state), camera)  # what is kept is made
     with _Operations() as operations:
-        gaussians, colours = pipeline.shade(state, camera)
+        gaussians = painter.deformed(state)
+        colours = painter.colors(gaussians, camera)
     shading = operations.count
     assert 10 < shading <= {"plain": 28, "diffuse": 42, "phong": 66, "part": 74}[name]
     with _Operations() as operations:
-        finite_gaussians(gaussians.means, gaussians.covariances, pipeline.scene.model.opacity(), colours)
+        finite_gaussians(gaussians.means, gaussians.covariances, simulation.scene.model.opacity(), colours)
     assert operations.count <= 4
 
 
-def _on_gpu(pipeline):
-    pipeline.to("cuda")
-    pipeline.renderer = make_renderer("cuda")
-    return pipeline
+def _on_gpu(simulation):
+    simulation.to("cuda")
+    simulation.painter.renderer = make_renderer("cuda")
+    return simulation
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", PICTURES)
 @pytest.mark.parametrize("degree", [0, 3])
-def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_pipeline, monkeypatch):
+def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_simulation, monkeypatch):
     """But in gsplat, which asks how many tiles the Gaussians touch: what happens in there is not looked at."""
     gsplat = pytest.importorskip("gsplat")
     shader, settings = PICTURES[name]
     camera = OrbitCamera(width=64, height=36, degrees_per_second=100.0)
-    pipeline = make_pipeline(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings, camera=camera)
-    pipeline = _on_gpu(pipeline)
-    if not isinstance(pipeline.renderer, GsplatRenderer):
+    simulation = make_simulation(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings, camera=camera)
+    simulation = _on_gpu(simulation)
+    if not isinstance(simulation.painter.renderer, GsplatRenderer):
         pytest.skip("gsplat cannot compile its kernels here")
-    state, rasterization = pipeline.start(), gsplat.rasterization
+    state, rasterization = simulation.start(), gsplat.rasterization
 
     def let_wait(**arguments):
         mode = torch.cuda.get_sync_debug_mode()
@@ -426,10 +438,10 @@ def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_pipe
 
     monkeypatch.setattr(gsplat, "rasterization", let_wait)
     for frame in range(2):
-        pipeline.render(state, frame)
+        simulation.painter.render(state, frame)
     torch.cuda.set_sync_debug_mode("error")
     try:
-        pictures = [pipeline.render(state, frame) for frame in (2, 3)]
+        pictures = [simulation.painter.render(state, frame) for frame in (2, 3)]
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert float(pictures[0].alpha.mean()) > 0.01
@@ -438,23 +450,23 @@ def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_pipe
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", PICTURES)
-def test_a_gpu_shades_as_the_cpu_does(name, make_cloud, make_pipeline):
+def test_a_gpu_shades_as_the_cpu_does(name, make_cloud, make_simulation):
     shader, settings = PICTURES[name]
     cloud = make_cloud(degree=3)
     F = torch.eye(3) + 0.3 * torch.rand(40, 3, 3, generator=torch.Generator().manual_seed(3))
     shaded = []
     for place in ("cpu", "cuda"):
-        pipeline = make_pipeline(cloud, pinned=False, shader=copy.deepcopy(shader), scene=settings)
-        pipeline = _on_gpu(pipeline) if place == "cuda" else pipeline
-        state = pipeline.start()
+        simulation = make_simulation(cloud, pinned=False, shader=copy.deepcopy(shader), scene=settings)
+        simulation = _on_gpu(simulation) if place == "cuda" else simulation
+        state = simulation.start()
         state = state.replace(position=1.1 * state.position, F_total=F[: len(state.position)].to(place))
-        gaussians, colours = pipeline.shade(state, pipeline.camera_at(1))
+        gaussians, colours = simulation.painter.deformed(state), _colours(simulation, state, 1)
         shaded.append([colours, *(getattr(gaussians, n) for n in ("means", "covariances", "normals", "rotations"))])
     for ours, theirs in zip(*shaded, strict=True):
         torch.testing.assert_close(theirs.cpu(), ours, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("frame_dt", [0.0, -1.0, math.nan])
-def test_bad_frame_length(frame_dt, make_pipeline):
+def test_bad_frame_length(frame_dt, make_simulation):
     with pytest.raises(ValueError, match="frame_dt"):
-        make_pipeline(frame_dt=frame_dt)
+        make_simulation(frame_dt=frame_dt)

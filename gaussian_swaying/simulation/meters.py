@@ -1,0 +1,73 @@
+"""What a run costs: seconds of its parts, and memory."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+class WallClock:
+    """Seconds spent in each part of the run.
+
+    Startup: on a GPU, a first frame that is thrown away, with which kernels are loaded and compiled. Simulation,
+    shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the host need not
+    wait there. Writing: how long the main thread was kept by the recorder, not what its threads did meanwhile.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.seconds = {"simulation": 0.0, "shading": 0.0, "rendering": 0.0, "writing": 0.0}
+        self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
+
+    @contextmanager
+    def __call__(self, part: str) -> Iterator[None]:
+        """Count the block among a part."""
+        if self.device.type == "cuda" and part != "writing":
+            stream = torch.cuda.current_stream(self.device)
+            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            start.record(stream)
+            try:
+                yield
+            finally:
+                end.record(stream)
+                self._events.append((part, start, end))
+            return
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[part] += time.perf_counter() - begin
+
+    def read(self, wait: bool = False) -> dict[str, float]:
+        """The seconds of each part [s], without what a GPU has still to do unless asked to wait for it."""
+        if wait and self._events:
+            self._events[-1][2].synchronize()
+        while self._events and self._events[0][2].query():
+            part, start, end = self._events.pop(0)
+            self.seconds[part] = self.seconds.get(part, 0.0) + start.elapsed_time(end) / 1000
+        return dict(self.seconds)
+
+
+class PeakMemory:
+    """Largest memory of the process and, on a GPU, of torch's allocator."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device)
+
+    def read(self) -> dict[str, int | None]:
+        """Bytes of the process and of torch's allocator; None where it is not known."""
+        try:
+            import resource
+        except ImportError:  # Windows
+            host = None
+        else:
+            unit = 1 if sys.platform == "darwin" else 1024
+            host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+        device = torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
+        return {"host": host, "device": device}

@@ -1,0 +1,215 @@
+"""Pictures of a simulated scene: cameras, colours, renders, and the Gaussians as a splat again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import rotate_sh
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering import passes
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
+from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
+from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.recording.recorder import check_camera_name
+from gaussian_swaying.simulation.scene import SimulatedScene
+
+MAX_PIXELS = 1 << 26  # of a picture: twice those of 8K
+
+
+class Painter(nn.Module):
+    """Draws a simulated scene from its cameras.
+
+    Args:
+        scene: The Gaussians, and how they follow the material.
+        shader: Colours from normals and light; None leaves the colours of the splat.
+        camera: Where each frame is seen from; an orbit camera if None.
+        cameras: Further cameras by name.
+        background: Background colour, in [0, 1].
+        frame_dt: Time between frames [s].
+        renderer: Draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere, chosen at the first
+            picture.
+
+    Raises:
+        ValueError: If the background or the name of a camera is not one.
+    """
+
+    def __init__(
+        self,
+        scene: SimulatedScene,
+        shader: Shader | None = None,
+        camera: CameraPath | None = None,
+        cameras: Mapping[str, CameraPath] | None = None,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        frame_dt: float = 0.04,
+        renderer: Renderer | None = None,
+    ) -> None:
+        super().__init__()
+        if not all(0 <= value <= 1 for value in background):
+            raise ValueError(f"Expected `background` within [0, 1], but got {list(background)}: 1 is white, not 255.")
+        self.scene, self.shader, self.frame_dt = scene, shader, float(frame_dt)
+        self.camera, self.cameras = camera or OrbitCamera(), dict(cameras or {})
+        for name in self.cameras:
+            check_camera_name(name)
+        self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
+        self.background: Tensor
+        self._renderer = renderer
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.background.device
+
+    @property
+    def renderer(self) -> Renderer:
+        """What draws the Gaussians."""
+        if self._renderer is None:
+            self._renderer = make_renderer(self.device)
+        return self._renderer
+
+    @renderer.setter
+    def renderer(self, renderer: Renderer) -> None:
+        self._renderer = renderer
+
+    def camera_at(self, frame: int, name: str = "") -> Camera:
+        """The camera of a frame, on the device and in the precision of the Gaussians; one copy, which nobody awaits.
+
+        Args:
+            frame: Frame number.
+            name: Which of ``cameras``; empty for ``camera``.
+        """
+        return self._camera(frame, name).to(self.device, self.scene.model.means.dtype)
+
+    def _camera(self, frame: int, name: str = "") -> Camera:
+        """The camera of a frame, in float64 on the host."""
+        scene, path = self.scene, self.cameras[name] if name else self.camera
+        return path(frame, frame * self.frame_dt, scene.center, scene.frame.rotation[2], scene.size)
+
+    def check_camera(self, frame: int) -> None:
+        """Raise ValueError if a camera of a frame lies inside the box of the object at rest, or has too many pixels.
+
+        The first is not asked of cameras of a capture, which stood where they stood: around an object or in a room.
+        """
+        low, high = self.scene.bounds
+        for name, path in {"": self.camera, **self.cameras}.items():
+            camera, field = self._camera(frame, name), f"cameras.{name}" if name else "camera"
+            if camera.width * camera.height > MAX_PIXELS:
+                raise ValueError(
+                    f"A picture of {camera.width:,} x {camera.height:,} pixels is too large, {MAX_PIXELS:,} are the "
+                    f"most: lower `{field}.init_args.width` and `height`."
+                )
+            if path.captured:
+                continue
+            eye = camera.position.to(low)
+            if bool(((eye > low) & (eye < high)).all()):
+                raise ValueError(
+                    f"The camera at {[round(v, 3) for v in eye.tolist()]} lies inside the object, whose box reaches "
+                    f"from {[round(v, 3) for v in low.tolist()]} to {[round(v, 3) for v in high.tolist()]} (scene "
+                    f"units): move it out with `{field}.init_args.radius` or `eye`."
+                )
+
+    def deformed(self, state: MPMState) -> DeformedGaussians:
+        """The Gaussians of a state, in scene units, with the rotations that their colours need."""
+        return self.scene.deformed(state, rotations=self.scene.model.view_dependent)
+
+    def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
+        """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
+        scene = self.scene
+        view = torch.nn.functional.normalize(gaussians.means - camera.position.to(gaussians.means), dim=-1)
+        at_rest = (view[..., None] * gaussians.rotations).sum(-2) if scene.model.view_dependent else view
+        colours = scene.model.colors(at_rest)
+        if self.shader is None:
+            return colours
+        index = scene.moving
+        parts = (colours, gaussians.normals, view)
+        if not scene.all_move:
+            parts = (colours[index], gaussians.normals[index], view[index])
+        normal, to_eye = (scene.frame.direction_to_sim(part) for part in (parts[1], -parts[2]))
+        shaded = self.shader(parts[0], normal, rest_normal=scene.rest_facing, view_direction=to_eye)
+        return shaded if scene.all_move else colours.index_copy(0, index, shaded)
+
+    def shade(self, gaussians: DeformedGaussians, camera: Camera) -> DeformedGaussians:
+        """The same Gaussians with their colours as a camera sees them."""
+        return replace(gaussians, colors=self.colors(gaussians, camera))
+
+    def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
+        """Draw Gaussians given in scene units."""
+        opacity = self.scene.model.opacity()
+        return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
+
+    def render(self, state: MPMState, frame: int, name: str = "") -> RenderOutput:
+        """The picture of a state from the camera of a frame.
+
+        Args:
+            state: The state.
+            frame: Frame number.
+            name: Which of ``cameras``; empty for ``camera``.
+        """
+        camera = self.camera_at(frame, name)
+        gaussians = self.deformed(state)
+        return self.draw(gaussians, self.colors(gaussians, camera), camera)
+
+    def draw_normals(self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera") -> Tensor:
+        """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3).
+
+        Args:
+            gaussians: In scene units.
+            camera: The camera, on the device of the Gaussians.
+            axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (z up).
+        """
+        normals = passes.facing(gaussians.normals, gaussians.means - camera.position.to(gaussians.means))
+        picture = self._draw(gaussians, normals, camera)
+        if axes == "world":
+            rotation = self.scene.frame.direction_to_sim(self.scene.identity).mT  # its rows are the scene's axes
+        else:
+            rotation = torch.cat([camera.world_to_camera[:1, :3], -camera.world_to_camera[1:3, :3]])
+        return passes.normal_colors(picture.color, picture.alpha, rotation)
+
+    def draw_pressure(self, pressure: Tensor, gaussians: DeformedGaussians, camera: Camera, largest: float) -> Tensor:
+        """Picture of a force per area, its colours ending at ``largest`` [Pa], shape (H, W, 3).
+
+        Args:
+            pressure: Of each particle [Pa], shape (P,).
+            gaussians: In scene units.
+            camera: The camera, on the device of the Gaussians.
+            largest: End of the colour scale [Pa].
+        """
+        shown = self.scene.on_gaussians(pressure)
+        picture = self._draw(gaussians, shown[:, None].expand(-1, 3), camera)
+        return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest)
+
+    def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
+        """Blend any three numbers of each Gaussian."""
+        return self.renderer(gaussians.means, gaussians.covariances, self.scene.model.opacity(), values, camera)
+
+    def cloud(self, gaussians: DeformedGaussians) -> GaussianCloud:
+        """Deformed Gaussians in storage form, harmonics turned with the patches."""
+        cloud = self.scene.model.to_cloud()
+        quats, scales = covariance_to_quat_scale(gaussians.covariances)
+        return GaussianCloud(
+            means=gaussians.means,
+            quats=quats,
+            scales=scales,
+            opacities=cloud.opacities,
+            sh=rotate_sh(cloud.sh, gaussians.rotations),
+            normals=gaussians.normals,
+        )
+
+    def export(self, gaussians: DeformedGaussians, path: Path) -> None:
+        """Write deformed Gaussians as a 3DGS .ply that any splat viewer opens, harmonics turned with the patches."""
+        write_ply(path, self.cloud(gaussians))
+
+    def depth_range(self, frame: int, name: str) -> tuple[float, float]:
+        """Ends of the depth's colours [scene units]: the object's longest side before its centre, and behind it."""
+        distance = float((self._camera(frame, name).position.to(self.scene.center) - self.scene.center).norm())
+        return distance - self.scene.size, distance + self.scene.size

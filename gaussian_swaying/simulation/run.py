@@ -1,0 +1,275 @@
+"""A whole run: simulate, draw and record, from rest or from a checkpoint."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying._provenance import describe_device, versions
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering import passes
+from gaussian_swaying.runs import signals
+from gaussian_swaying.runs.seal import sha256
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.meters import PeakMemory, WallClock
+from gaussian_swaying.simulation.progress import RunProgress
+from gaussian_swaying.simulation.recording.checkpoint import check_state, unreadable
+from gaussian_swaying.simulation.recording.recorder import frame_folder
+
+if TYPE_CHECKING:
+    from gaussian_swaying.simulation.simulation import Simulation
+
+MAX_LOOKS = 2_000  # how many frames' cameras are looked at before a run
+
+
+@torch.inference_mode()
+def run(
+    simulation: Simulation, output: Path, frames: int, resume: bool, settings: dict[str, Any], progress: bool
+) -> dict[str, Any]:
+    """See :meth:`~gaussian_swaying.simulation.simulation.Simulation.run`."""
+    check_positive("frames", frames)
+    recorder = simulation.recorder
+    for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
+        simulation.painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
+    state = simulation.start()  # what is refused is refused before anything is written
+    splat = _splat(simulation)
+
+    def check(checkpoint: dict[str, Any]) -> None:
+        _check_checkpoint(simulation, checkpoint, state, output, frames, splat)
+
+    simulation.resumable = None
+    fps, cameras = 1 / simulation.frame_dt, tuple(simulation.painter.cameras)
+    checkpoint = recorder.open(output, simulation.config, resume, fps, cameras, check)
+    try:
+        return Run(simulation, frames, splat).go(state, checkpoint, settings, progress)
+    finally:
+        if recorder.checkpoint_frame is not None:
+            simulation.resumable = (recorder.folder / "checkpoint.pt", recorder.checkpoint_frame)
+        recorder.release()
+
+
+def _splat(simulation: Simulation) -> str | None:
+    """Checksum of the splat's file, which tells it from another one of the same name."""
+    path = simulation.scene.source
+    return None if path is None else sha256(Path(path))
+
+
+def _check_checkpoint(
+    simulation: Simulation, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
+) -> None:
+    """Raise ValueError unless the run can go on from a checkpoint as if it had never stopped."""
+    scene, held = simulation.scene, checkpoint["state"].get("position")
+    if checkpoint.get("splat") != splat:
+        raise ValueError(
+            f"The splat {scene.source} is not the one that the run in {output} began with, its content has "
+            "changed: put that file back, or start again without --resume."
+        )
+    if isinstance(held, Tensor) and held.ndim == 2 and len(held) != scene.points.count:
+        raise ValueError(
+            f"The checkpoint in {output} holds {len(held)} particles, but the scene has "
+            f"{scene.points.count}: resume with the same splat, or start again without --resume."
+        )
+    most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
+    try:
+        check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited)
+    except (ValueError, TypeError, KeyError, RuntimeError) as error:
+        raise unreadable(output / "checkpoint.pt", error) from error
+    if checkpoint["frame"] >= frames:
+        raise ValueError(
+            f"The run in {output} has {checkpoint['frame'] + 1} frames already, and `frames` asks for {frames}: "
+            "ask for more, or leave out --resume."
+        )
+
+
+class Run:
+    """What a run carries from frame to frame besides the state."""
+
+    def __init__(self, simulation: Simulation, frames: int, splat: str | None) -> None:
+        self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
+        self.frames, self.splat = frames, splat
+        self.log: list[dict[str, Any]] = []
+        self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
+        self.force_end = self.recorder.force_scale or simulation.force_scale()
+
+    def go(
+        self, state: MPMState, checkpoint: dict[str, Any] | None, settings: dict[str, Any], progress: bool
+    ) -> dict[str, Any]:
+        """Run from a state at rest, or from a checkpoint, to the end; the summary."""
+        simulation, recorder, walls = self.simulation, self.recorder, self.walls
+        first = 0
+        if checkpoint is not None:
+            restored = MPMState.from_state_dict(checkpoint["state"], simulation.device)
+            state = simulation.edit_due(restored, resumed=True)
+            first, self.log = checkpoint["frame"] + 1, checkpoint["log"]
+            walls.seconds.update(checkpoint["wall_s"])
+        status, reason, done = "complete", None, first
+        bar = simulation.progress = RunProgress(self.frames, first, progress)
+        try:
+            if simulation.device.type == "cuda" and first < self.frames:
+                with walls("startup"):
+                    self.warm_up(state, first)
+            frames = simulation.frames_from(state, first, self.frames)
+            for index in range(first, self.frames):
+                bar.begin(index)
+                with walls("simulation"):
+                    frame = next(frames)
+                state = frame.state
+                self.record(state, index)
+                self.log.append(frame.health.as_dict())
+                with walls("writing"):
+                    self.keep(state, index)
+                done = index + 1
+                bar.end(frame.health.substeps, frame.health.displacement_mean)
+            with walls("writing"):
+                recorder.wait()
+        except SimulationDiverged as error:
+            status, reason = "diverged", str(error)
+            raise
+        except KeyboardInterrupt as stop:
+            status, reason = "interrupted", signals.reason(stop)
+            raise
+        except Exception as error:
+            status, reason = "failed", str(error)
+            raise
+        finally:
+            with suppress(OSError):  # a terminal that has gone
+                bar.close()
+                if progress:
+                    for sentence in simulation.health(self.log[:done])[1]:
+                        print(f"warning: {sentence}", file=sys.stderr)
+            simulation.progress = None
+            summary: dict[str, Any] = {"status": status, "reason": reason}
+            summary |= self.summary(state, self.log[:done]) | settings
+            if recorder.images and "force" in recorder.renders:
+                summary["force_scale_Pa"] = self.force_end
+            # the video of a run that was stopped early is made too: nothing that was recorded is lost
+            simulation.files = []
+            try:
+                with walls("writing"):
+                    simulation.files = recorder.close(done, summary, release=False)
+            except OSError as error:
+                if status == "complete":
+                    raise
+                print(f"{error}", file=sys.stderr)  # what stopped the run matters more
+        summary["wall_s"] = walls.read(wait=True)
+        recorder.write_summary(summary)
+        return summary
+
+    def warm_up(self, state: MPMState, frame: int) -> None:
+        """Load and compile the kernels of a frame, of which nothing is kept."""
+        with suppress(SimulationDiverged):  # the frame itself will say so
+            state, _ = self.simulation.advance(state)
+        if self.recorder.images:
+            self.painter.render(state, frame)
+
+    def keep(self, state: MPMState, frame: int) -> None:
+        """Write a checkpoint, if one is due."""
+        if self.recorder.checkpoint_every and (frame + 1) % self.recorder.checkpoint_every == 0:
+            self.recorder.write_checkpoint(
+                {
+                    "frame": frame,
+                    "state": state.state_dict(),
+                    "log": self.log,
+                    "config": self.simulation.config,
+                    "wall_s": self.walls.read(),
+                    "splat": self.splat,
+                }
+            )
+
+    def record(self, state: MPMState, frame: int) -> None:
+        """Draw, export and keep what is wanted of a frame."""
+        recorder, walls = self.recorder, self.walls
+        exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
+        if recorder.images or exporting:
+            with walls("shading"):
+                gaussians = self.painter.deformed(state)
+        if recorder.images:
+            for name in ("", *self.painter.cameras):
+                self.picture(state, gaussians, frame, name)
+        with walls("writing"):
+            if exporting:
+                recorder.write_splat(frame, self.painter.cloud(gaussians), self.simulation.scene.frame)
+            if recorder.trajectory:
+                recorder.write_trajectory(frame, state.position, state.F_total)
+
+    def picture(self, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str) -> None:
+        """Draw and hand over what is wanted of a frame from one camera."""
+        recorder, painter, walls = self.recorder, self.painter, self.walls
+        with walls("shading"):
+            camera = painter.camera_at(frame, name)
+            colours = painter.colors(gaussians, camera)
+        images: dict[str, Tensor] = {}
+        with walls("rendering"):
+            if {"color", "depth"} & set(recorder.renders):
+                picture = painter.draw(gaussians, colours, camera)
+                images["color"] = picture.color
+            if "depth" in recorder.renders:
+                depth, (near, far) = passes.mean_depth(picture), painter.depth_range(frame, name)
+                images["depth"] = passes.depth_colors(depth, near, far)
+                steps = passes.depth_steps(depth, recorder.depth_step / self.simulation.scene.frame.metres_per_unit)
+            if "normal" in recorder.renders:
+                images["normal"] = painter.draw_normals(gaussians, camera, recorder.normal_axes)
+            if "force" in recorder.renders:
+                pressure = self.simulation.wind_pressure(state)
+                images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)
+        with walls("writing"):
+            for render in recorder.renders:
+                recorder.write_image(frame, images[render], frame_folder(render, name))
+            if "depth" in recorder.renders:
+                recorder.write_depth(frame, steps, frame_folder("depth", name))
+
+    def summary(self, state: MPMState, log: list[dict[str, Any]]) -> dict[str, Any]:
+        """What is told of a run: see docs/runs.md."""
+        simulation, scene, solver = self.simulation, self.simulation.scene, self.simulation.solver
+        moved = [entry["displacement_mean"] for entry in log]
+        found, sentences = simulation.health(log)
+        energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
+        return {
+            "device": describe_device(simulation.device),
+            "versions": versions(),
+            "seed": getattr(simulation.wind, "seed", None),
+            "particles": solver.points.count,
+            "gaussians": len(scene.model.means),
+            "simulated_gaussians": len(scene.chosen),
+            "surface_particles": scene.on_surface,
+            "filled_particles": scene.filled,
+            "mass_kg": float(solver.points.mass.sum()),
+            "patch_area_m2": float(scene.patch_area.sum()),
+            "formulation": solver.formulation,
+            "dtype": str(state.position.dtype).removeprefix("torch."),
+            "grid": {"dx_m": solver.dx, "resolution": list(state.grid.resolution)},
+            "frame": scene.frame.describe(),
+            "sim_frame": {
+                "origin": scene.frame.origin.tolist(),
+                "rotation": scene.frame.rotation.tolist(),
+                "metres_per_unit": scene.frame.metres_per_unit,
+            },
+            "size_m": scene.size * scene.frame.metres_per_unit,
+            "frames": len(log),
+            "frames_wanted": self.frames,
+            "frame_dt_s": simulation.frame_dt,
+            "edits": simulation.editor.applied,
+            "substeps": int(sum(entry["substeps"] for entry in log)),
+            "simulated_s": float(state.time),
+            "wall_s": self.walls.read(wait=True),
+            "peak_memory_bytes": self.peak.read(),
+            "energy_start_J": energy[0] if energy else None,
+            "energy_end_J": energy[-1] if energy else None,
+            "largest_cfl": max((entry["cfl"] for entry in log), default=None),
+            "wind_work_J": sum(entry.get("wind_work", 0.0) for entry in log),
+            "lost_particles": int(log[-1]["lost"]) if log else 0,
+            "torn_particles": int(log[-1].get("torn", 0)) if log else 0,
+            "stretch_min": min((entry["stretch_min"] for entry in log), default=None),
+            "stretch_max": max((entry["stretch_max"] for entry in log), default=None),
+            "displacement_mean_max_m": max(moved, default=None),
+            "extremes": found,
+            "warnings": sentences,
+            "per_frame": log,
+        }

@@ -1,0 +1,547 @@
+"""The front door: a splat in the wind, frame by frame."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundary import RegionInFrame
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
+from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.config import arguments_of, build_parser, check_settings, config_text, parse_file
+from gaussian_swaying.simulation.defaults import (
+    DeviceLike,
+    SceneLike,
+    WindLike,
+    as_scene,
+    as_solver,
+    as_wind,
+    resolve_device,
+)
+from gaussian_swaying.simulation.diagnostics import (
+    FrameDiagnostics,
+    SimulationDiverged,
+    TearingGauge,
+    check_spacing,
+    diagnose,
+    measure,
+)
+from gaussian_swaying.simulation.edits import Edit, SceneEditor
+from gaussian_swaying.simulation.health import advice, extremes
+from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
+from gaussian_swaying.simulation.physgaussian.space import Normalisation
+from gaussian_swaying.simulation.progress import RunProgress
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.run import run
+from gaussian_swaying.simulation.scene import Material, SimulatedScene
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+MAX_RETRIES = 4
+CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
+CFL_SAMPLES = 8  # how often a frame is looked at, as material may stiffen and slacken again within it
+MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
+MAX_WIND = 1e6  # m/s; any more is a mistake, and would overflow positions
+MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
+MAX_SUBSTEPS = 1_000_000  # in a frame: hours of a processor, and minutes of the fastest GPU
+
+
+class Simulation(nn.Module):
+    """A splat in the wind. The constructor is the schema of the YAML; every component can be used without it.
+
+    Positions and regions are given in scene units and axes; velocities, gravity and light in metres, z up.
+
+    Args:
+        scene: Where the Gaussians come from and which of them move. In Python also a file, Gaussians or a scene made
+            in code, of which all is simulated, by points chosen for the grid (``sampling: grid``).
+        material: What it is made of; :class:`Material` with its defaults if None.
+        solver: Grid, formulation, gravity and boundaries; if None, a grid of 32 cells along the longest side.
+        wind: Air velocity over time; in Python also one that depends on the place, or three numbers [m/s]. Still air
+            if None.
+        aero: Force of the wind on patches; :class:`AeroForce` with its defaults if None.
+        forces: Custom forces beside gravity and wind, each by its class path.
+        shader: Shading; null keeps the splat's colours.
+        camera: Where each frame is seen from; an orbit camera if null.
+        cameras: Further cameras by name; their pictures and videos are in the folders cameras/NAME.
+        edits: Changes of a part of the object: its `region` (at rest, scene units; null for all that moves), the
+            `time` from which they hold [s], any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a `color` (red,
+            green, blue in [0, 1]) with the part `detail` of the old differences in brightness.
+        recorder: What :meth:`run` writes; :class:`Recorder` with its defaults if None.
+        normalisation: Take boundaries and regions of the material in PhysGaussian's normalised space; null for scene
+            units.
+        background: Background colour in [0, 1].
+        frame_dt: Time between frames [s].
+        dtype: Precision of the solver.
+        device: auto takes a CUDA GPU if there is one.
+        up: Python only, where ``scene`` is no :class:`Scene`: direction in the scene that points up.
+        hold: Python only, where no solver is given: region whose points are held.
+        renderer: Python only: draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
+
+    Raises:
+        ValueError: If a value is out of range, or given twice; the message names the field.
+
+    Example:
+        >>> from gaussian_swaying.geometry.regions import Box
+        >>> from gaussian_swaying.scenes.procedural import FlagScene
+        >>> simulation = Simulation(
+        ...     FlagScene(spacing=0.1), hold=Box([None, None, None], [0.11, None, None]), wind=[4, 0, 0], device="cpu"
+        ... )
+        >>> [round(frame.time, 2) for frame in simulation.frames(3)]
+        [0.0, 0.04, 0.08]
+    """
+
+    def __init__(
+        self,
+        scene: SceneLike,
+        material: Material | None = None,
+        solver: MPMSolver | None = None,
+        wind: WindLike | None = None,
+        aero: AeroForce | None = None,
+        forces: list[Force] = [],  # noqa: B006  (never changed; the schema of the config shows it)
+        shader: Shader | None = None,
+        camera: CameraPath | None = None,
+        cameras: dict[str, CameraPath] | None = None,
+        edits: list[Edit] = [],  # noqa: B006
+        recorder: Recorder | None = None,
+        normalisation: Normalisation | None = None,
+        background: list[float] = [0.0, 0.0, 0.0],  # noqa: B006
+        frame_dt: float = 0.04,
+        dtype: Literal["float32", "float64"] = "float32",
+        device: DeviceLike = "auto",
+        up: Sequence[float] | None = None,
+        hold: Region | None = None,
+        renderer: Renderer | None = None,
+    ) -> None:
+        super().__init__()
+        check_positive("frame_dt", frame_dt)
+        colour = check_vector("background", background)
+        target = resolve_device(device)
+        settings, material = as_scene(scene, up), material or Material()
+        solver = as_solver(solver, hold, settings)
+        if normalisation is not None:
+            space = normalisation.place(settings, material, solver, camera)
+            for path in (cameras or {}).values():
+                if isinstance(path, PhysGaussianCamera):
+                    path.frame = space
+            edits = [replace(e, region=e.region and RegionInFrame(e.region, space)) for e in edits]
+        model = SimulatedScene(settings, material, solver.dx, getattr(torch, dtype))
+        self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
+        self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
+        self.wind = as_wind(wind)
+        self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in forces)
+        self.to(target)
+        self.editor = SceneEditor(model, edits)
+        self.recorder = recorder or Recorder()
+        self.config = ""  # the whole configuration as YAML, where there is one
+        self.progress: RunProgress | None = None  # of the run under way
+        self.files: list[Path] = []  # what the last run wrote
+        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
+        self._most_substeps = MAX_SUBSTEPS
+        self._wind_force: list[WindForce] = []  # in a list, as it is no part of the module's state
+        self._wind_parts: tuple[object, ...] = ()
+        self._tearing: TearingGauge | None = None
+
+    # ---- from a YAML file
+
+    @classmethod
+    def parser(cls) -> ArgumentParser:
+        """The parser of ``gaussian-swaying sim``, see :func:`~gaussian_swaying.simulation.config.build_parser`."""
+        return build_parser(cls)
+
+    @classmethod
+    def from_yaml(cls, path: str | os.PathLike[str], **changes: Any) -> Simulation:
+        """The simulation of a configuration file.
+
+        Args:
+            path: The YAML file.
+            changes: Arguments of the constructor that take the place of those of the file.
+
+        Returns:
+            The simulation. :meth:`run` keeps the configuration with the results, and a note of the changes.
+
+        Raises:
+            ValueError: If the file or a value in it is not right; the message names the field.
+            TypeError: If the constructor has no such argument.
+        """
+        parser = cls.parser()
+        return cls.from_settings(parser, parse_file(parser, path), **changes)
+
+    @classmethod
+    def from_settings(cls, parser: ArgumentParser, settings: Namespace, **changes: Any) -> Simulation:
+        """The simulation of parsed settings.
+
+        Args:
+            parser: From :meth:`parser`.
+            settings: What it parsed.
+            changes: As in :meth:`from_yaml`.
+        """
+        check_settings(cls, settings)
+        text, parts = config_text(parser, settings), parser.instantiate(settings)
+        simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)
+        simulation.config = text + "".join(f"# changed in Python: {k} = {v!r}\n" for k, v in changes.items())
+        return simulation
+
+    # ---- parts
+
+    @property
+    def scene(self) -> SimulatedScene:
+        """Gaussians, material points and patches."""
+        return self.painter.scene
+
+    @property
+    def device(self) -> torch.device:
+        """Where the components are."""
+        return self.painter.device
+
+    @property
+    def wind_force(self) -> WindForce:
+        """The wind on the patches of the scene."""
+        parts = (self.aero, self.wind, self.scene.patch_normal, self.scene.patch_area)
+        if not self._wind_force or any(a is not b for a, b in zip(parts, self._wind_parts, strict=True)):
+            self._wind_force, self._wind_parts = [WindForce(*parts)], parts
+            self.__dict__.pop("_still", None)
+        return self._wind_force[0]
+
+    @property
+    def idle(self) -> bool:
+        """Whether the wind has no effect; asked once for each wind, as it makes the host wait."""
+        self.wind_force  # noqa: B018  (a new one forgets what was known of the old)
+        return self._still
+
+    @cached_property
+    def _still(self) -> bool:
+        return self.aero.idle
+
+    @property
+    def forces(self) -> list[Force]:
+        """What pushes the particles besides gravity: the wind, unless it has no effect, and the custom forces."""
+        custom = [force for force in self.custom_forces if isinstance(force, Force)]
+        return custom if self.idle else [self.wind_force, *custom]
+
+    # ---- frames
+
+    def frames(self, count: int) -> Iterator[Frame]:
+        """Simulate from rest, frame by frame. Timed edits act between frames, as in :meth:`run`.
+
+        What was assigned between two frames, such as another ``wind``, holds from the next frame on.
+
+        Args:
+            count: Number of frames, the first at rest.
+
+        Yields:
+            The frames.
+
+        Raises:
+            SimulationDiverged: If a frame does not end well.
+            ValueError: As :meth:`start`.
+        """
+        check_positive("count", count)
+        yield from self.frames_from(self.start(), 0, count)
+
+    def frames_from(self, state: MPMState, first: int, count: int) -> Iterator[Frame]:
+        """The frames from number ``first`` up to ``count``.
+
+        Args:
+            state: The state at rest from :meth:`start` if ``first`` is 0, otherwise that of the frame before.
+            first: Number of the first frame.
+            count: Number of frames of the whole run.
+        """
+        for index in range(first, count):
+            if index == 0:
+                health = diagnose(self.solver, state, 0, 0.0)
+            else:
+                state, health = self.advance(state)
+                state = self.edit_due(state)
+            yield Frame(self, index, state, health)
+
+    def start(self) -> MPMState:
+        """The state at rest, time zero, with the edits of that time.
+
+        Raises:
+            ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long, now or after one
+                of the edits.
+        """
+        editor, frame = self.editor, self.scene.frame
+        editor.reset()
+        for later in (moment for moment in editor.times if moment > 0):  # what they make impossible is refused now
+            self._edit(editor.due(0.0))
+            self._edit(editor.due(later), flowed=True)
+            rehearsed = self.solver.init_state(self.scene.points, frame=frame)
+            self.solver.fused()
+            self.solver.substeps(rehearsed, self.frame_dt)
+        editor.reset()
+        self._edit(editor.due(0.0))
+        state = self.solver.init_state(self.scene.points, frame=frame)
+        self.__dict__.pop("_still", None)  # coefficients may have changed
+        check_spacing(self.solver)
+        self.solver.fused()  # what its kernels refuse is refused here
+        at_rest = self.solver.substeps(state, self.frame_dt)
+        if at_rest > MAX_SUBSTEPS:
+            remedy = "soften it (`material.E`, `material.nu`), raise its density or `solver.dx`, or shorten `frame_dt`"
+            if self.solver.substep is not None:
+                remedy = "raise `solver.substep`, set it to null for the longest that is stable, or shorten `frame_dt`"
+            raise ValueError(
+                f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
+                f"than the {MAX_SUBSTEPS:,} that are of use: {remedy}."
+            )
+        self._most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
+        self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
+        return state
+
+    def edit(self, state: MPMState, *edits: Edit) -> MPMState:
+        """Change material or colour now, between two frames; the time of the edits is not looked at.
+
+        The solver takes the material anew, and with it its kernels and CUDA graphs. Positions, velocities and
+        deformations stay, so momentum changes with the mass and elastic energy with the stiffness.
+
+        Args:
+            state: The state now.
+            edits: What to change, in this order.
+
+        Returns:
+            The state with which the run goes on.
+
+        Raises:
+            ValueError: If a region holds nothing, or a law flows in the ``total`` formulation.
+        """
+        return self._take(state, self._edit(edits, flowed=True))
+
+    def _edit(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
+        """Change the scene; which particles (P,) have another law then, None if the material is the same."""
+        changed = [self.editor.apply(edit, flowed) for edit in edits]
+        changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
+        return torch.stack(changed).any(0) if changed else None
+
+    def _take(self, state: MPMState, changed: Tensor | None) -> MPMState:
+        """Bind the solver to the material of the scene; ``changed`` as of :meth:`_edit`."""
+        if changed is None:
+            return state
+        start = self.solver.init_state(self.scene.points, frame=self.scene.frame).internal
+        if start is not None and state.internal is not None:
+            start = torch.where(changed, start, state.internal)
+        state = state.replace(internal=start)
+        self.solver.fused()
+        self._most_substeps = max(
+            self._most_substeps, min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
+        )
+        if self._tearing is not None:
+            elastic = self.solver.laws.elastic_particles()
+            if elastic is not None:  # what has flowed apart before is no tear
+                self._tearing.elastic = elastic if self._tearing.elastic is None else elastic & self._tearing.elastic
+        return state
+
+    def edit_due(self, state: MPMState, resumed: bool = False) -> MPMState:
+        """The state after the edits up to its time; a resumed state has seen them already."""
+        edits = self.editor.due(float(state.time) + 1e-3 * self.frame_dt)
+        edited = self._take(state, self._edit(edits, flowed=True))
+        return state if resumed else edited
+
+    def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
+        """Advance by one frame.
+
+        A frame whose material stiffened so much that its substep was too long is thrown away and done again with a
+        shorter one; so is one in which a particle outran the grid of the ``updated`` formulation, on a larger grid.
+
+        Args:
+            state: The state at the start of the frame.
+
+        Returns:
+            The state at its end, and its diagnostics.
+
+        Raises:
+            SimulationDiverged: If the frame does not end well.
+        """
+        margin = 0
+        try:
+            steps = self._substeps(state)
+            for retry in range(MAX_RETRIES + 1):
+                if steps > self._most_substeps:
+                    cause = f"a frame would take {steps:,} substeps, and {self._most_substeps:,} are the most"
+                    self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
+                end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
+                work = (end.work - state.work).sum()
+                # everything is under way before the host waits for the first time
+                health = measure(self.solver, end, steps, courant, work, self._tearing)
+                outran = (end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any()
+                cfl, outrun = torch.stack([courant.double(), outran.double()]).tolist()
+                too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
+                if retry == MAX_RETRIES or not (outrun or too_long):
+                    break
+                if outrun:
+                    margin = 4 * max(margin, 4)
+                if too_long:
+                    growth = cfl / self.solver.cfl if math.isfinite(cfl) else 4.0
+                    steps = int(steps * min(growth * 1.1, 4.0)) + 1
+        except (FloatingPointError, ValueError) as error:
+            # a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN
+            self._give_up(state, str(error).rstrip("."))
+        measured = health.read(check=True)
+        if not cfl <= MAX_CFL:
+            self._give_up(
+                end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
+            )
+        return end, measured
+
+    def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
+        """Raise SimulationDiverged, blaming the particle with the largest deformation."""
+        particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
+        if remedy is None:
+            field = "solver.cfl" if self.solver.substep is None else "solver.substep"
+            remedy = f"lower `{field}`, or weaken the wind or the boundary that drives it"
+        raise SimulationDiverged(float(state.time), particle, cause, remedy)
+
+    def _substeps(self, state: MPMState) -> int:
+        return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
+
+    def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
+        """The state some substeps later, and the largest Courant number on the way."""
+        progress = self.progress
+        watch = None if progress is None else lambda done: progress.substep(done, steps)
+        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch)
+
+    def _drag_substeps(self, state: MPMState) -> int:
+        """Substeps that keep explicit drag on light patches stable."""
+        if self.idle:
+            return 1
+        winds = self.wind_force.samples(state, self.frame_dt / 4, 5)
+        wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
+        speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
+        fastest = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
+        rate, blowing = torch.stack([fastest.double(), wind.double()]).tolist()
+        if not (math.isfinite(rate) and blowing < MAX_WIND):
+            cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
+            self._give_up(state, cause, "check the flow and the modulations of the wind")
+        return 1 if self.aero.drag_step == "semi_implicit" else int(rate * self.frame_dt) + 1
+
+    # ---- what is measured
+
+    def wind_pressure(self, state: MPMState) -> Tensor:
+        """Force of the wind per area of the patches as they are now [Pa], shape (P,); 0 for what feels no wind."""
+        area = self.scene.patch_area
+        if self.idle:
+            return torch.zeros_like(area)
+        normal, _ = deform_patch(state.F_total, self.scene.patch_normal, area)
+        wind = self.wind_force.air(state.time, state.position)
+        force = self.aero(wind, state.velocity, normal, torch.ones_like(area))
+        return torch.where(area > 0, torch.linalg.vector_norm(force, dim=-1), 0.0)
+
+    def force_scale(self) -> float:
+        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
+        speed = float(torch.linalg.vector_norm(self.flows(), dim=-1).amax())
+        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).abs().sum())
+        return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
+
+    def flows(self) -> Tensor:
+        """Flows of the wind without gusts [m/s], shape (K, 3); of one that depends on the place, at the particles."""
+        if isinstance(self.wind, WindField):
+            return self.wind.flows
+        position = self.scene.points.position
+        return self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
+
+    def health(self, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+        """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
+
+        Args:
+            log: Diagnostics of its frames.
+        """
+        scene, points = self.scene, self.scene.points
+        where = scene.frame.point_to_scene(points.position.double().cpu())
+        elastic = self.solver.laws.elastic_particles()
+        size = scene.size * scene.frame.metres_per_unit
+        found = extremes(log, where, size, None if elastic is None else elastic.cpu())
+        return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+
+    # ---- the run
+
+    def run(
+        self,
+        output: str | os.PathLike[str],
+        frames: int = 250,
+        resume: bool = False,
+        settings: Mapping[str, Any] | None = None,
+        progress: bool = True,
+        recorder: Recorder | None = None,
+    ) -> dict[str, Any]:
+        """Simulate, render and record, as ``gaussian-swaying sim`` does.
+
+        Args:
+            output: Folder of the results.
+            frames: Number of frames, the first one the state at rest.
+            resume: Continue the run found in ``output`` after its last complete frame.
+            settings: Further entries for the summary.
+            progress: Show a progress bar.
+            recorder: What to write, from now on; that of the constructor if None.
+
+        Returns:
+            The summary, as in ``summary.json``.
+
+        Raises:
+            SimulationDiverged: After everything recorded so far was saved.
+            ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
+        """
+        self.recorder = recorder or self.recorder
+        return run(self, Path(output), frames, resume, dict(settings or {}), progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame of a simulation.
+
+    Attributes:
+        simulation: Where it comes from.
+        index: Its number; 0 is at rest.
+        state: The state at its end.
+        health: Energies, momenta, stretch and what else was measured.
+    """
+
+    simulation: Simulation
+    index: int
+    state: MPMState
+    health: FrameDiagnostics
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.health.time
+
+    @cached_property
+    def gaussians(self) -> DeformedGaussians:
+        """All Gaussians in scene units: means, covariances, normals, and colours as the camera sees them."""
+        painter = self.simulation.painter
+        return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
+
+    def render(self, camera: str = "") -> RenderOutput:
+        """The picture of the frame.
+
+        Args:
+            camera: Which of ``cameras``; empty for ``camera``.
+
+        Returns:
+            Colour, opacity and depth.
+        """
+        painter, gaussians = self.simulation.painter, self.gaussians
+        if camera:
+            gaussians = painter.shade(gaussians, painter.camera_at(self.index, camera))
+        assert gaussians.colors is not None
+        return painter.draw(gaussians, gaussians.colors, painter.camera_at(self.index, camera))
