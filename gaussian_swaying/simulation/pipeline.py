@@ -46,7 +46,8 @@ from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.recording.checkpoint import check_state, unreadable
-from gaussian_swaying.simulation.recording.recorder import Recorder, check_camera_name, frame_folder
+from gaussian_swaying.simulation.recording.layout import check_camera_name, frame_folder
+from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_RETRIES = 4
