@@ -9,11 +9,12 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.cli.preview import main, splat_name
+from gaussian_swaying.cli.preview import main
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import config
+from gaussian_swaying.simulation.preview.results import splat_name
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
