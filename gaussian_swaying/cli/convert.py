@@ -8,8 +8,7 @@ from pathlib import Path
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic
 from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.simulation.physgaussian.convert import convert
-from gaussian_swaying.simulation.physgaussian.fields import read_config
+from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
 from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 
 

@@ -22,8 +22,7 @@ from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
-from gaussian_swaying.simulation.physgaussian.convert import convert
-from gaussian_swaying.simulation.physgaussian.fields import read_config
+from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
 from gaussian_swaying.simulation.physgaussian.space import Normalisation
 from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 from gaussian_swaying.simulation.pipeline import SimulationPipeline

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying._inputs import read_json
 from gaussian_swaying.simulation.physgaussian.boundaries import Turned, boundary_settings
 from gaussian_swaying.simulation.physgaussian.camera_settings import camera_settings
 from gaussian_swaying.simulation.physgaussian.fields import Fields, Notes
@@ -21,6 +23,14 @@ from gaussian_swaying.simulation.physgaussian.filling import filling_settings
 from gaussian_swaying.simulation.physgaussian.materials import material_settings
 from gaussian_swaying.simulation.physgaussian.parts import box
 from gaussian_swaying.simulation.physgaussian.space import Normalisation, heading, tidy, up_direction
+
+
+def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a PhysGaussian configuration; ValueError if it is missing or no JSON object."""
+    config = read_json(path, "PhysGaussian configuration")
+    if not isinstance(config, dict):
+        raise ValueError(f"The PhysGaussian configuration `{path}` is no JSON object: give one of its config/*.json.")
+    return config
 
 
 def convert(
@@ -130,4 +140,4 @@ def _damping(take: Fields, substep: float, notes: Notes) -> float:
     return 0.0 if factor >= 1 else -math.log(factor) / substep
 
 
-__all__ = ["convert"]
+__all__ = ["convert", "read_config"]

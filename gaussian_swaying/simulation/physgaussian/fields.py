@@ -3,20 +3,10 @@
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying._inputs import read_json
-
-
-def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a PhysGaussian configuration; ValueError if it is missing or no JSON object."""
-    config = read_json(path, "PhysGaussian configuration")
-    if not isinstance(config, dict):
-        raise ValueError(f"The PhysGaussian configuration `{path}` is no JSON object: give one of its config/*.json.")
-    return config
 
 
 class Notes:
@@ -106,4 +96,4 @@ class Fields:
                 raise ValueError(f"Unknown key `{name}` in {self._where}: {hint}")
 
 
-__all__ = ["Fields", "Notes", "read_config"]
+__all__ = ["Fields", "Notes"]
