@@ -9,7 +9,7 @@ import yaml
 from gaussian_swaying._yaml_limits import check_config_files, check_yaml
 from gaussian_swaying.cli.simulate import main
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").rglob("*.yaml"))
 
 
 def laughs(levels):

@@ -8,7 +8,8 @@ from pathlib import Path
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import atomic
 from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.simulation.physgaussian.convert import convert, read_config, to_yaml
+from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
+from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -3,61 +3,45 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import sys
 import time
 from argparse import ArgumentError
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.simulation.preview.as_data import cost_dict, run_dict, suggestion_dict
 from gaussian_swaying.simulation.preview.calibration import (
     SWAY,
-    Setting,
-    apply_setting,
-    calibrate,
+    calibrated_suggestion,
     check_sway,
-    measure_motion,
 )
-from gaussian_swaying.simulation.preview.cost import Cost, Stopwatch, estimate_cost
+from gaussian_swaying.simulation.preview.cost import Stopwatch, estimate_cost
 from gaussian_swaying.simulation.preview.doubts import doubts
 from gaussian_swaying.simulation.preview.photos import captured_from
-from gaussian_swaying.simulation.preview.picture import classify, conditions, mean_flow, preview_picture
+from gaussian_swaying.simulation.preview.picture import preview_picture
+from gaussian_swaying.simulation.preview.report import (
+    cost_lines,
+    run_lines,
+    splat_lines,
+    suggestion_lines,
+    video_length,
+)
+from gaussian_swaying.simulation.preview.results import Preview, splat_name, write
 from gaussian_swaying.simulation.preview.shape import DIRECTIONS, bounds
-from gaussian_swaying.simulation.preview.starter import draft_yaml, region_dict, starter_yaml
-from gaussian_swaying.simulation.preview.suggest import Suggestion, gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.simulation.preview.suggest import gaussian_statistics, suggest
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
 LOADED = time.process_time()  # s; the interpreter and the imports so far, which a run takes too
-
-
-@dataclass(frozen=True)
-class Preview:
-    """Everything that is found before anything is written.
-
-    Attributes:
-        report: Text for people.
-        data: The same as plain numbers, for preview.json.
-        picture: 8-bit RGB, shape (H, W, 3).
-        configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
-    """
-
-    report: str
-    data: dict[str, Any]
-    picture: np.ndarray
-    configurations: dict[str, str]
 
 
 def build_options() -> argparse.ArgumentParser:
@@ -120,7 +104,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     startup = LOADED + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
-    found = _calibrated(found, draft, options.sway)
+    found = calibrated_suggestion(found, draft, options.sway)
     texts = {
         "draft": draft_yaml(found, options.scene),
         "starter": starter_yaml(found, options.scene, options.frames),
@@ -136,38 +120,22 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "gaussians": gaussian_statistics(cloud),
         "suggestion": suggestion_dict(found),
         "run": run_dict(simulation),
-        "cost": _cost_dict(costs["starter"]),
-        "draft_cost": _cost_dict(costs["draft"]),
+        "cost": cost_dict(costs["starter"]),
+        "draft_cost": cost_dict(costs["draft"]),
     }
-    report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found)]
+    report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found)]
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
-    report += _cost_lines(costs["starter"])
+    report += cost_lines(costs["starter"])
     output, stem = Path("outputs"), splat_name(options.scene)
     report.append("")
     for name, what, where in (
         ("draft", "a first look", output / f"{stem}_draft"),
         ("starter", "the starter", output / stem),
     ):
-        pictures = f"{_seconds_of(texts[name])}, {duration(costs[name].total_seconds)} here"
+        pictures = f"{video_length(texts[name])}, {duration(costs[name].total_seconds)} here"
         report.append(f"{what} ({pictures}):")
         report.append(f"  {shlex.join(program.words('sim'))} --config {folder / name}.yaml --output {where}")
     return Preview("\n".join(report), data, preview_picture(simulation, options.height, whole=found.whole), texts)
-
-
-def _calibrated(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:
-    """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
-    if found.pin is None or not any(found.flow):
-        return found
-    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
-    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
-    apply_setting(draft, best.setting, start)
-    return replace(
-        found,
-        youngs_modulus=best.setting.E,
-        thickness=best.setting.thickness,
-        flow=tuple(round(c * best.setting.wind, 2) for c in found.flow),
-        stiffness_reason=best.reason,
-    )
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
@@ -196,12 +164,12 @@ def preview_config(options: argparse.Namespace) -> Preview:
         "bounds": bounds(cloud.means),
         "gaussians": gaussian_statistics(cloud),
         "run": run_dict(simulation),
-        "cost": _cost_dict(cost),
+        "cost": cost_dict(cost),
     }
     report = [
-        *_splat_lines(options.scene or options.config[-1], cloud, data),
-        *_run_lines(data["run"]),
-        *_cost_lines(cost),
+        *splat_lines(options.scene or options.config[-1], cloud, data),
+        *run_lines(data["run"]),
+        *cost_lines(cost),
     ]
     return Preview("\n".join(report), data, preview_picture(simulation, options.height), {})
 
@@ -228,19 +196,6 @@ def _parse_text(parser: Any, arguments: list[str], text: str) -> Any:
         return parser.parse_args(["--config", str(path), *arguments])
 
 
-def splat_name(path: str | Path) -> str:
-    """What a splat is called: its file, or the folder of a ``point_cloud.ply``, as trainings write it.
-
-    A folder ``iteration_30000`` and one called ``point_cloud``, as 3DGS makes them, are passed over.
-    """
-    file = Path(path)
-    if file.stem != "point_cloud":
-        return file.stem
-    folders = [part.name for part in file.resolve().parents]
-    passed = ("point_cloud", "iteration_")
-    return next((name for name in folders if name and not name.startswith(passed)), file.stem)
-
-
 def _up(values: Sequence[str]) -> list[float] | str:
     """An up direction from the command line."""
     if len(values) == 1:
@@ -260,180 +215,6 @@ def _joined(arguments: Sequence[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
-
-
-# ---- as plain numbers
-
-
-def suggestion_dict(found: Suggestion) -> dict[str, Any]:
-    """A suggestion without its masks."""
-    region = found.region.region()
-    return {
-        "up": {
-            "direction": list(found.up.direction),
-            "confidence": found.up.confidence,
-            "scores": found.up.scores,
-            "reasons": found.up.reasons,
-            "floor_gaussians": int(found.up.ground.sum()),
-        },
-        "region": {
-            "region": None if region is None else region_dict(region),
-            "simulated": int(found.region.simulated.sum()),
-            "opacity_threshold": found.region.opacity_threshold,
-            "specks": found.region.specks,
-            "loose": found.region.loose,
-            "reason": found.region.reason,
-        },
-        "hold": asdict(found.hold) | {"region": None if found.pin is None else region_dict(found.pin)},
-        "longest_side_m": found.longest_side,
-        "metres_per_unit": found.metres_per_unit,
-        "size_m": list(found.size),
-        "spacing_m": found.spacing,
-        "dx_m": found.dx,
-        "sheet": found.sheet,
-        "azimuth": found.azimuth,
-        "flow": list(found.flow),
-        "youngs_modulus_Pa": found.youngs_modulus,
-        "thickness_m": found.thickness,
-        "stiffness_reason": found.stiffness_reason,
-    }
-
-
-def run_dict(simulation: Simulation) -> dict[str, Any]:
-    """What a run simulates, holds and blows at."""
-    parts, scene = classify(simulation), simulation.scene
-    return {
-        "gaussians": len(scene.model.means),
-        "simulated": int(parts.simulated.sum()),
-        "carried": int(parts.carried.sum()),
-        "held": int(parts.pinned.sum()),
-        "conditions": parts.names,
-        "regions": [repr(b.region) for b in conditions(simulation) if hasattr(b, "region")],
-        "frame": scene.frame.describe(),
-        "box_min": [float(v) for v in scene.bounds[0]],
-        "box_max": [float(v) for v in scene.bounds[1]],
-        "mass_kg": float(scene.points.mass.sum()),
-        "area_m2": float(scene.patch_area.sum()),
-        "filled": scene.filled,
-        "points": scene.points.count,
-        "further": scene.on_surface - len(scene.simulated),
-        "dx_m": simulation.solver.dx,
-        "formulation": simulation.solver.formulation,
-        "flow": mean_flow(simulation).tolist(),
-    }
-
-
-# ---- for people
-
-
-def _splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[str]:
-    corner, own = data["bounds"], data["gaussians"]
-    below = ", ".join(f"{share:.0%} below {t}" for t, share in own["opacity_below"].items())
-    normals = "with normals" if own["normals"] else "without normals (the smallest axes are taken)"
-    return [
-        f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
-        f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
-        f"  without 1 %   {_numbers(corner['robust_min'])} to {_numbers(corner['robust_max'])}",
-        "  5, 50 and 95 % of the Gaussians have at most",
-        f"    opacity     {_numbers(own['opacity'])}; {below}",
-        f"    S1 / S2     {_numbers(own['S1_over_S2'])}   (needles are above 10)",
-        f"    S2 / S3     {_numbers(own['S2_over_S3'])}   (surface patches are above 3)",
-        f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
-    ]
-
-
-def _suggestion_lines(found: Suggestion) -> list[str]:
-    region = "all of space"
-    if found.region.box is not None:
-        region = json.dumps(dict(zip(("min", "max"), found.region.box, strict=True)))
-    count = int(found.region.simulated.sum())
-    lines = [
-        f"up              {_numbers(found.up.direction)}, {_why(found.up.confidence, '; '.join(found.up.reasons))}",
-        f"region          {region}: {found.region.reason}",
-        f"opacity         {found.region.opacity_threshold:g} and above is simulated: {count:,} particles",
-        f"held            at the {found.hold.end}, {_why(found.hold.confidence, found.hold.reason)}"
-        if found.pin is not None
-        else "held            nowhere: it will fall",
-    ]
-    if found.pin is not None:
-        lines.append(f"  pin           {_short(region_dict(found.pin))}")
-    lines += [
-        f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
-        f"{found.metres_per_unit:.4g} m, as the longest side is taken as {found.longest_side:g} m",
-        f"grid            dx = {found.dx:g} m: {found.longest_side / found.dx:.0f} cells along the longest side, "
-        f"{found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of {found.spacing:.3g} m",
-        "further points  "
-        + ("none needed" if found.fill_spacing is None else f"every {found.fill_spacing:g} m on large Gaussians"),
-        f"material        {_material(found)}",
-        f"wind            {_numbers(found.flow)} m/s, z up",
-    ]
-    return ["", "guesses (each can be given instead, see --help)", *(f"  {line}" for line in lines)]
-
-
-def _run_lines(run: dict[str, Any]) -> list[str]:
-    return [
-        "",
-        "this configuration",
-        f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
-        f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
-        f"  follow them     {run['carried']:,} faint ones",
-        f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
-        f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
-        *(f"                  {region}" for region in run["regions"]),
-        f"  frame           {run['frame']}",
-        f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
-        f"  wind            {_numbers(run['flow'])} m/s, z up, before modulations",
-    ]
-
-
-def _cost_lines(cost: Cost) -> list[str]:
-    frame = cost.substeps * cost.substep_seconds
-    picture = ""
-    if cost.picture_seconds is not None:
-        picture = f" + {duration(cost.picture_seconds)} for its pictures"
-    return [
-        "",
-        f"cost on this machine ({cost.device})",
-        f"  substep         {cost.substep:.3g} s, {cost.substeps} a frame (stable up to {cost.stable_substep:.3g} s; "
-        f"waves of {cost.wave_speed:.3g} m/s)",
-        f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
-        f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
-        f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
-    ]
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
-
-
-def _material(found: Suggestion) -> str:
-    what = "cloth" if found.sheet else "rubber"
-    return f"{what}, E = {found.youngs_modulus:.1e} Pa, {found.thickness:.2g} m thick: {found.stiffness_reason}"
-
-
-def _seconds_of(text: str) -> str:
-    """Length and picture of the video of a configuration, in words."""
-    import yaml
-
-    given = yaml.safe_load(text)
-    size = given["camera"]["init_args"]
-    return f"{given['frames'] * given['frame_dt']:.3g} s at {size['width']} x {size['height']}"
-
-
-def _cost_dict(cost: Cost) -> dict[str, Any]:
-    return asdict(cost) | {"total_seconds": cost.total_seconds}
-
-
-def _why(confidence: str, reason: str) -> str:
-    return "given" if confidence == "given" else f"confidence {confidence}: {reason}"
-
-
-def _short(region: dict[str, Any]) -> str:
-    return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)
-
-
-# ---- the command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -471,30 +252,3 @@ def _preview(options: argparse.Namespace) -> None:
     print(found.report)
     for path in write(found, folder):
         print(f"wrote {path}")
-
-
-def write(found: Preview, folder: Path) -> list[Path]:
-    """Write preview.json, preview.png and, if they were guessed, draft.yaml and starter.yaml.
-
-    A configuration that is there and differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ...: someone may
-    have edited it.
-
-    Returns:
-        The files.
-    """
-    import imageio.v3 as iio
-
-    folder.mkdir(parents=True, exist_ok=True)
-    files = [folder / "preview.json", folder / "preview.png"]
-    files[0].write_text(json.dumps(found.data, indent=1) + "\n", encoding="utf-8")
-    iio.imwrite(files[1], found.picture)
-    for name, text in found.configurations.items():
-        path = folder / f"{name}.yaml"
-        if path.exists() and path.read_text(encoding="utf-8") != text:
-            number = 1
-            while (folder / f"{name}.{number}.yaml").exists():
-                number += 1
-            path.rename(folder / f"{name}.{number}.yaml")
-        path.write_text(text, encoding="utf-8")
-        files.append(path)
-    return files

@@ -31,7 +31,8 @@ from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.training.checkpoints import SealedCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.csv_log import CsvLog
-from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
+from gaussian_swaying.training.finite import TrainingDiverged
+from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.quiet import silence_advertisements, silence_warnings
 from gaussian_swaying.training.run_folder import RunFolder
 

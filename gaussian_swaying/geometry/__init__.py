@@ -1,1 +1,1 @@
-"""The ground floor: 3x3 algebra, rotations, regions, neighbours, patches and the frame of a simulation."""
+"""Geometry that all other folders use: 3x3 algebra, rotations, regions, neighbours, patches, the simulation's frame."""

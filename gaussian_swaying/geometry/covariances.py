@@ -32,7 +32,7 @@ def covariance_to_quat_scale(covariances: Tensor) -> tuple[Tensor, Tensor]:
     """Quaternions and scales of covariances, to store deformed Gaussians in a .ply file.
 
     Computed in float64. The axes are right-handed, sorted from the smallest, and their signs depend on the matrix
-    alone. A standard deviation below 1e-7 times the largest is raised to that, so that singular matrices pass.
+    alone. A standard deviation below 1e-7 times the largest is raised to that value, so singular matrices are allowed.
 
     Args:
         covariances: Symmetric positive semi-definite matrices [scene units^2], shape (N, 3, 3).
@@ -73,7 +73,7 @@ def deform_covariance(deformation_gradient: Tensor, covariances: Tensor) -> Tens
 
 
 def limit_stretch(covariances: Tensor, rest: Tensor, max_stretch: float, shape: Tensor | None = None) -> Tensor:
-    r"""Covariances of Gaussians that are drawn out too far, drawn smaller and more in a shape of their own.
+    r"""Limit the size of Gaussians that are stretched too far, and blend them towards a given shape.
 
     The size of a Gaussian is :math:`\sqrt{\operatorname{tr} a}`. Where it is :math:`r` times that at rest and
     :math:`r > r_{max}`, the covariance becomes
@@ -81,15 +81,15 @@ def limit_stretch(covariances: Tensor, rest: Tensor, max_stretch: float, shape: 
     .. math::
         w\, a + (1 - w)\, B, \qquad w = \frac{r_{max}^2 - 1}{r^2 - 1},
 
-    whose size is :math:`r_{max}` times that at rest: the shape B, drawn out a little, in place of a streak. Others stay
-    as they are, and nothing jumps where the limit is reached.
+    whose size is :math:`r_{max}` times that at rest: a slightly stretched B instead of a streak. Gaussians below the
+    limit do not change, and the result is continuous at the limit.
 
     Args:
         covariances: Covariances a [scene units^2], shape (..., 3, 3).
         rest: Covariances A at rest [scene units^2], shape (..., 3, 3).
         max_stretch: Largest ratio of the sizes, above 1.
-        shape: Covariances B [scene units^2] with the trace of A, shape (..., 3, 3); if None a ball, a grain that has
-            lost its shape.
+        shape: Covariances B [scene units^2] with the trace of A, shape (..., 3, 3); None for a ball, as for a grain
+            that has lost its shape.
 
     Returns:
         Shape (..., 3, 3).
@@ -118,17 +118,18 @@ def limit_deformed(
     solid: Tensor,
     rotations: Tensor | None = None,
 ) -> Tensor:
-    """:func:`limit_stretch` with the shape that suits the material: its own where that still means something.
+    """:func:`limit_stretch` with the shape that suits the material: the shape at rest for solids, else a ball.
 
-    A Gaussian of a solid goes back towards its shape at rest, turned with the material; one of a material that flows
-    towards a ball. On a CPU only those beyond the limit are computed; elsewhere all are, so that no host waits.
+    A Gaussian of a solid returns towards its shape at rest, rotated with the material. A Gaussian of a plastic material
+    becomes rounder. On a CPU only Gaussians beyond the limit are computed. On a GPU all are, so that the host does not
+    have to wait.
 
     Args:
         deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
         covariances: Covariances F A F^T [scene units^2], shape (N, 3, 3).
         rest: Covariances A at rest [scene units^2], shape (N, 3, 3).
         max_stretch: Largest ratio of the sizes, above 1.
-        solid: Which keep their shape, bool, shape (N,).
+        solid: Which Gaussians are solid, bool, shape (N,).
         rotations: Polar factors of F, shape (N, 3, 3), if they are known.
 
     Returns:
@@ -153,7 +154,7 @@ def limit_deformed(
 
 
 def _own(rest: Tensor, turn: Tensor, solid: Tensor) -> Tensor:
-    """The shape at rest turned, and for what is not solid the ball with its trace."""
+    """The rotated shape at rest for solids, else the ball with the same trace."""
     ball = torch.eye(3, dtype=rest.dtype, device=rest.device) * (_trace(rest)[:, None, None] / 3)
     return torch.where(solid[:, None, None], matmul3(matmul3(turn, rest), turn.mT), ball)
 

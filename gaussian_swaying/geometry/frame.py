@@ -1,4 +1,4 @@
-"""Scene units to metres with z up, and back: the only place that scales."""
+"""Conversion between scene units and metres with z up. No other file converts between them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SimFrame:
     _turns: list[bool] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def _on(self, device: torch.device, dtype: torch.dtype = torch.float64) -> tuple[Tensor, ...]:
-        """Origin, rotation R, R ⊗ R and I on a device; kept, so that a later call copies nothing to a GPU."""
+        """Origin, rotation R, R ⊗ R and I on a device; cached, so that later calls copy nothing to a GPU."""
         key = (dtype, device)
         if key not in self._known:
             with torch.inference_mode(False):
@@ -42,7 +42,7 @@ class SimFrame:
 
     @property
     def turns(self) -> bool:
-        """Whether the axes differ from the scene's, as they do unless z is up in it."""
+        """Whether the axes differ from those of the scene; they do unless z is up in the scene."""
         if not self._turns:
             self._turns.append(not torch.equal(self.rotation, torch.eye(3).to(self.rotation)))
         return self._turns[0]
@@ -68,7 +68,7 @@ class SimFrame:
             The frame, its origin at the centre of the box.
 
         Raises:
-            ValueError: If both or an impossible size is given, or the object has no extent.
+            ValueError: If both sizes or an impossible one are given, or if the object has no extent.
         """
         check_shape("points", points, "N", 3)
         if longest_side is not None and metres_per_unit is not None:
@@ -85,7 +85,7 @@ class SimFrame:
             extent = float((high - low).amax())
             if extent <= 0:
                 raise ValueError(
-                    "The object has no extent that `longest_side` could scale: give `metres_per_unit` instead."
+                    "`longest_side` cannot scale an object without extent: give `metres_per_unit` instead."
                 )
             scale = float(longest_side) / extent
         return cls((0.5 * (low + high)) @ rotation, rotation, scale)
@@ -95,20 +95,20 @@ class SimFrame:
         """The frame of a run, from its ``summary.json``.
 
         Raises:
-            ValueError: If the summary does not hold it.
+            ValueError: If the summary does not contain it.
         """
         try:
             found = summary["sim_frame"]
             origin, rotation = (torch.tensor(found[name], dtype=torch.float64) for name in ("origin", "rotation"))
             metres = float(found["metres_per_unit"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError("it does not say where the scene lies (`sim_frame`): run the simulation again") from error
+            raise ValueError("it has no `sim_frame`: run the simulation again") from error
         if origin.shape != (3,) or rotation.shape != (3, 3) or not metres > 0:
             raise ValueError("its `sim_frame` is damaged: run the simulation again")
         return cls(origin, rotation, metres)
 
     def point_to_sim(self, points: Tensor) -> Tensor:
-        """Scene points (..., 3) to metres, z up. Computed in float64, so far-away scenes keep their detail."""
+        """Scene points (..., 3) to metres, z up. Computed in float64, so distant scenes keep their detail."""
         origin, rotation, *_ = self._on(points.device)
         return ((points.double() - origin) * self.metres_per_unit @ rotation.T).to(points.dtype)
 
@@ -152,7 +152,7 @@ class SimFrame:
         return eye + ((F - eye).flatten(-2) @ both).unflatten(-1, (3, 3))  # one product, not two of small matrices
 
     def describe(self) -> str:
-        """One line for people who place boxes and cameras."""
+        """One line of text that helps to place boxes and cameras."""
         origin = [round(v, 4) for v in self.origin.tolist()]
         up = [round(v, 3) for v in self.rotation[2].tolist()]
         return f"1 scene unit = {self.metres_per_unit:.6g} m; origin {origin}; up {up} (scene units)"

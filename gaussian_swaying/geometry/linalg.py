@@ -23,12 +23,12 @@ def cofactor(matrix: Tensor) -> Tensor:
 
 
 def matmul3(a: Tensor, b: Tensor) -> Tensor:
-    """Product of 3x3 matrices (..., 3, 3); on a GPU by hand, as the library is slow for small ones."""
+    """Product of 3x3 matrices (..., 3, 3); on a GPU written out, as the library is slow for small matrices."""
     return a @ b if a.device.type == "cpu" else (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
 def determinant(matrix: Tensor, cofactors: Tensor | None = None) -> Tensor:
-    """Determinant of 3x3 matrices (..., 3, 3), from the cofactors if they are at hand; shape (...)."""
+    """Determinant of 3x3 matrices (..., 3, 3), from the cofactors if they are given; shape (...)."""
     cofactors = cofactor(matrix) if cofactors is None else cofactors
     return (matrix[..., 0, :] * cofactors[..., 0, :]).sum(-1)
 
@@ -36,11 +36,10 @@ def determinant(matrix: Tensor, cofactors: Tensor | None = None) -> Tensor:
 def polar_rotation(matrix: Tensor, iterations: int | None = None) -> Tensor:
     r"""The rotation nearest to F: the factor R of the polar decomposition F = R S, by the scaled Newton iteration.
 
-    :math:`X_{k+1} = \tfrac12 (\zeta_k X_k + \zeta_k^{-1} X_k^{-T})` with
-    :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F / \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar
-    decomposition - with applications"). It converges quadratically to the nearest orthogonal matrix. Where that is a
-    reflection (an inverted element), its axis of smallest stretch is turned round, which gives the nearest rotation
-    (Irving, Teran & Fedkiw 2004).
+    :math:`X_{k+1} = \tfrac12 (\zeta_k X_k + \zeta_k^{-1} X_k^{-T})` with :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F /
+    \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar decomposition - with applications"). It converges
+    quadratically to the nearest orthogonal matrix. Where that is a reflection (an inverted element), its axis of
+    smallest stretch is reversed, which gives the nearest rotation (Irving, Teran & Fedkiw 2004).
 
     The first derivative is the exact one of the limit, :math:`dR = R \Omega` with
     :math:`\Omega S + S \Omega = R^T dF - dF^T R`, not that of the iteration: it is finite for every F, while that of an
@@ -92,7 +91,7 @@ def _nearest_rotation(matrix: Tensor, iterations: int) -> Tensor:
         zeta = ratio.clamp(min=torch.finfo(x.dtype).tiny).pow(0.25)
         x = 0.5 * (zeta * x + inverse_transpose / zeta)
     reflected = (determinant(x) < 0)[..., None, None]
-    # asking a GPU would make the host wait, and a compiled graph cannot ask
+    # a check on a GPU would make the host wait, and a compiled graph cannot branch on it
     if x.device.type == "cpu" and not torch.compiler.is_compiling() and not bool(reflected.any()):
         return x
     stretch = matmul3(x.mT, matrix)
@@ -158,7 +157,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 def _jacobi_angle(app: Tensor, aqq: Tensor, apq: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Tangent, cosine and sine of the smaller rotation that annihilates ``apq`` (Golub & Van Loan, section 8.5)."""
     gap, twice = aqq - app, 2 * apq
-    # the squares may underflow: the root is at least either side, and the tangent at most one
+    # the squares may underflow; the root is at least as long as either side, and the tangent at most one
     root = torch.maximum((gap.square() + twice.square()).sqrt(), twice.abs()) + torch.finfo(app.dtype).tiny
     tangent = torch.where(gap < 0, -twice, twice) / (gap.abs() + root)
     cosine = (1 + tangent.square()).rsqrt()
@@ -170,7 +169,7 @@ def _jacobi(entries: dict[tuple[int, int], Tensor]) -> tuple[list[Tensor], list[
     a = entries
     one, zero = torch.ones_like(a[0, 0]), torch.zeros_like(a[0, 0])
     v = [torch.stack([one if row == column else zero for row in range(3)]) for column in range(3)]
-    # convergence is quadratic; of 1e5 matrices of all condition numbers none needed more than one sweep fewer
+    # convergence is quadratic; of 1e5 matrices of all condition numbers, all converged at least one sweep earlier
     for _ in range(5 if one.dtype == torch.float64 else 4):
         for p, q, r in _PAIRS:
             rp, rq = (min(r, p), max(r, p)), (min(r, q), max(r, q))
@@ -183,7 +182,7 @@ def _jacobi(entries: dict[tuple[int, int], Tensor]) -> tuple[list[Tensor], list[
 
 
 def _sort(keys: list[Tensor], *columns: list[Tensor]) -> None:
-    """Sort in place, largest key (N,) first; a swap of two columns (3, N) turns one round, which keeps determinants."""
+    """Sort in place, largest key (N,) first; swapping two columns (3, N) negates one, to keep determinants."""
     for p, q in ((0, 1), (0, 2), (1, 2)):
         swap = keys[p] < keys[q]
         keys[p], keys[q] = torch.maximum(keys[p], keys[q]), torch.minimum(keys[p], keys[q])
@@ -229,9 +228,10 @@ class Spectrum(NamedTuple):
             inverted F.
         left: Rotation U of the axes after the deformation, shape (..., 3, 3); constant in the gradient.
         axes: Rotation V, the principal axes as columns, shape (..., 3, 3); constant in the gradient.
-        strain: Symmetric, zero on the diagonal; its value is zero and its derivative that of V^T S V off the diagonal,
-            S being the symmetric polar factor. Shape (..., 3, 3); None without a gradient.
-        spin: Skew; its value is zero and its derivative that of V^T R^T R(F) V. Shape (..., 3, 3); None likewise.
+        strain: Symmetric, zero on the diagonal. Its value is zero; its derivative is that of V^T S V off the diagonal,
+            where S is the symmetric polar factor. Shape (..., 3, 3); None without a gradient.
+        spin: Skew. Its value is zero; its derivative is that of V^T R^T R(F) V. Shape (..., 3, 3); None without a
+            gradient.
     """
 
     stretch: Tensor
@@ -255,9 +255,9 @@ def spectrum(F: Tensor) -> Spectrum:
     elementary floating point operations"). U and V are rotations for any F, singular or inverted.
 
     For the derivatives write :math:`B = U^T \, dF \, V`. Then :math:`da_i = B_{ii}`, and off the diagonal the spin of R
-    and the change of the symmetric factor are :math:`W_{ij} = (B_{ij} - B_{ji}) / (a_i + a_j)` and
-    :math:`\tfrac12 (B_{ij} + B_{ji}) + \tfrac12 (a_i - a_j) W_{ij}`: both free of the differences of stretches by
-    which an SVD divides. Only at :math:`a_i = -a_j`, where R jumps, is the derivative limited.
+    and the change of the symmetric factor are :math:`W_{ij} = (B_{ij} - B_{ji}) / (a_i + a_j)` and :math:`\tfrac12
+    (B_{ij} + B_{ji}) + \tfrac12 (a_i - a_j) W_{ij}`: neither divides by differences of stretches, as an SVD does. Only
+    at :math:`a_i = -a_j`, where R jumps, is the derivative limited.
 
     Args:
         F: Shape (..., 3, 3).
@@ -303,7 +303,7 @@ def _singular_vectors(F: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _unit(vector: Tensor, fallback: Tensor) -> Tensor:
-    """Vectors (3, N) of length one; where one vanishes, the fallback."""
+    """Vectors (3, N) of length one; the fallback where a vector is zero."""
     squared = _dot(vector, vector)
     tiny = torch.finfo(vector.dtype).tiny * 1e6
     return torch.where(squared > tiny, vector * squared.clamp(min=tiny).rsqrt(), fallback)
@@ -312,8 +312,8 @@ def _unit(vector: Tensor, fallback: Tensor) -> Tensor:
 def divided_differences(stretch: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
     r""":math:`\Gamma_{ij} = (y_i - y_j) / (a_i - a_j)` of an isotropic tensor function, without gradient.
 
-    Stretches closer than about the cube root of the round-off are drawn apart symmetrically, which gives the limit to
-    that root squared.
+    Stretches closer than about the cube root of the round-off are moved apart symmetrically, which gives the limit with
+    an error of that root squared.
 
     Args:
         stretch: Principal stretches a, shape (..., 3), largest first.
@@ -353,9 +353,9 @@ def from_principal(
 
     Args:
         parts: From :func:`spectrum`.
-        function: Principal values y (..., 3) from stretches (..., 3). It may couple the three, and must treat them
-            alike: permuted stretches give permuted values. Other tensors that it uses get their gradient too.
-        values: ``function(parts.stretch)``, if it is at hand.
+        function: Principal values y (..., 3) from stretches (..., 3). It may couple the three, but must be symmetric in
+            them: permuted stretches give permuted values. Other tensors that it uses get gradients too.
+        values: ``function(parts.stretch)``, if already computed.
         rotated: Return R V diag(y) V^T = U diag(y) V^T instead.
 
     Returns:

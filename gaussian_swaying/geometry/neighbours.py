@@ -1,4 +1,4 @@
-"""Nearest neighbours in plain torch, on grids that coarsen."""
+"""Nearest neighbours in plain torch, on grids that get coarser and coarser."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ _CROWD = 16  # points in the cell of a point, on average, on the first grid; 8 t
 def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Distances and indices of the nearest points, exact and deterministic, computed on the CPU.
 
-    A query is settled on the first grid whose 27 cells around it hold enough points within one cell size; only those
-    not settled yet go on to the grid of twice the cell size. Memory is bounded by chunks of candidate pairs.
+    A query is answered on the first grid whose 27 cells around it hold enough points within one cell size. Only the
+    remaining queries go on to the grid with twice the cell size. Memory is bounded by chunks of candidate pairs.
 
     Args:
         points: Points to find, shape (N, 3).
         count: How many to find for each query, at most N (N - 1 without ``queries``).
-        queries: Where to search from, shape (M, 3); None for the points themselves, each without itself.
+        queries: Where to search from, shape (M, 3); None for the points themselves, where no point is its own
+            neighbour.
 
     Returns:
         Distances, ascending, and indices, each of shape (M, count).
@@ -63,7 +64,7 @@ def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None
 
 
 def _first_level(points: Tensor, low: Tensor, extent: float) -> int:
-    """The coarsest grid, as halvings of the extent, that keeps pairs few; none is finer than 2^-40.
+    """The coarsest grid with few enough pairs, as a number of halvings of the extent, at most 40.
 
     A point shares its cell with at most :data:`_CROWD` others on average, which bounds the pairs to look at.
     """
@@ -76,7 +77,7 @@ def _first_level(points: Tensor, low: Tensor, extent: float) -> int:
 
 
 def _cell_key(cells: Tensor) -> Tensor:
-    """One number per cell (..., 3); cells 2^20 apart share it, which only adds candidates that are too far away."""
+    """One number per cell (..., 3); cells 2^20 apart share one, which only adds candidates that are too far away."""
     x, y, z = (cells & (2**20 - 1)).unbind(-1)
     return (x << 40) | (y << 20) | z
 

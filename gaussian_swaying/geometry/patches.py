@@ -20,7 +20,7 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 def smallest_axis_normal(quats: Tensor, log_scales: Tensor) -> Tensor:
     """Unit normals along the smallest axis of each Gaussian (Guedon & Lepetit 2024, "SuGaR").
 
-    The sign is that of the axis in the rotation matrix, so it carries no meaning of inside or outside.
+    The sign is that of the axis in the rotation matrix, so it does not tell inside from outside.
 
     Args:
         quats: Quaternions wxyz of any length above zero, shape (..., 4).
@@ -120,15 +120,15 @@ def deform_all(
     max_stretch: float | None = None,
     solid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Covariances, normals and rotations after a deformation, on a GPU in one kernel if triton is there.
+    """Covariances, normals and rotations after a deformation; on a GPU in one kernel if triton is installed.
 
     Args:
         deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
         covariances: Covariances A at rest [scene units^2], shape (N, 3, 3).
         normals: Unit normals N at rest, shape (N, 3).
-        rotations: Whether the rotations are asked for.
+        rotations: Whether to compute the rotations.
         max_stretch: Limit of :func:`limit_deformed`, above 1; None for none.
-        solid: Which keep their shape beyond that limit, bool, shape (N,); with ``max_stretch``.
+        solid: Which Gaussians are solid, bool, shape (N,); needed with ``max_stretch``.
 
     Returns:
         :func:`deform_covariance` within the limit, :func:`deform_normal` and
@@ -156,7 +156,7 @@ def deform_all(
 
 @functools.cache
 def _kernels() -> ModuleType | None:
-    """The kernels, if triton is there and finds a compiler; tried on one patch."""
+    """The kernels, if triton is installed and finds a compiler; tested on one patch."""
     if importlib.util.find_spec("triton") is None:
         return None
     try:
@@ -166,7 +166,7 @@ def _kernels() -> ModuleType | None:
         for rotations in (False, True):
             for limit in (None, 2.0):
                 kernels.deform_all(matrix, matrix, matrix[:, 0], rotations, limit, solid)
-    except Exception as error:  # whatever it is, the definition does the same
-        warnings.warn(f"triton cannot compile its kernels here ({error}): pictures take longer.", stacklevel=2)
+    except Exception as error:  # for any error the torch functions give the same result
+        warnings.warn(f"triton cannot compile its kernels here ({error}): drawing takes longer.", stacklevel=2)
         return None
     return kernels

@@ -1,4 +1,4 @@
-"""Which Gaussians move: regions of space, in scene units, and a threshold on opacity."""
+"""Regions of space, in scene units, which choose the Gaussians that move."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Region(ABC):
     """A part of space. Subclasses can be named in a configuration.
 
     Attributes:
-        recordable: Whether :meth:`contains` copies nothing from or to the host after a first call (see :meth:`on`), so
-            that a CUDA graph may record it. A class with a ``contains`` of its own has to say so itself.
-        axes: In which axes the region is given, in words; empty for those of the points that it is asked about.
+        recordable: Whether a CUDA graph may record :meth:`contains`. That is so if it copies nothing from or to the
+            host after the first call (see :meth:`on`). A class that overrides ``contains`` must set this itself.
+        axes: The axes in which the region is given, in words; empty for those of the points passed to it.
     """
 
     recordable: bool = False
@@ -29,14 +29,14 @@ class Region(ABC):
             cls.recordable = False
 
     def __getstate__(self) -> dict[str, object]:
-        """Without what is kept on devices, which another machine may not have."""
+        """The state without tensors cached on devices, which another machine may not have."""
         return {name: value for name, value in vars(self).items() if name != "_known"}
 
     def on(self, points: Tensor, values: Sequence[float]) -> Tensor:
-        """Numbers of the region with the type and device of some points.
+        """Numbers of the region as a tensor with the type and device of some points.
 
-        They are kept as long as the region, so that a later call copies nothing to a GPU and a recorded CUDA graph
-        never reads what was freed.
+        They are cached as long as the region lives, so that later calls copy nothing to a GPU and a recorded CUDA graph
+        never reads freed memory.
         """
         known: dict[tuple[object, ...], Tensor] = self.__dict__.setdefault("_known", {})
         key = (tuple(values), points.dtype, points.device)
@@ -47,10 +47,10 @@ class Region(ABC):
 
     @abstractmethod
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
 
     def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
-        """Least and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
+        """Smallest and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
         flat = points.detach().reshape(-1, 3).double()
         low, high = ([round(v, 4) for v in corner.tolist()] for corner in (flat.amin(0), flat.amax(0)))
         return low, high
@@ -65,7 +65,7 @@ class Everything(Region):
         return "Everything()"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
         check_shape("points", points, 3)
         return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
 
@@ -78,7 +78,7 @@ class Box(Region):
         max: Upper corner [scene units], 3 numbers; null leaves that side open.
 
     Raises:
-        ValueError: If a corner has not 3 finite numbers, or ``min`` is not below ``max`` along an axis.
+        ValueError: If a corner does not have 3 finite numbers, or ``min`` is not below ``max`` along an axis.
         TypeError: If a corner is not a list.
     """
 
@@ -95,7 +95,7 @@ class Box(Region):
         return f"Box(min={list(self.min)}, max={list(self.max)})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
         check_shape("points", points, 3)
         return ((points >= self.on(points, self.min)) & (points <= self.on(points, self.max))).all(-1)
 
@@ -108,7 +108,7 @@ class Sphere(Region):
         radius: Radius [scene units], above zero.
 
     Raises:
-        ValueError: If ``center`` has not 3 finite numbers or ``radius`` is not positive.
+        ValueError: If ``center`` does not have 3 finite numbers or ``radius`` is not positive.
         TypeError: If ``center`` is not a list.
     """
 
@@ -123,7 +123,7 @@ class Sphere(Region):
         return f"Sphere(center={list(self.center)}, radius={self.radius})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
         check_shape("points", points, 3)
         return (points - self.on(points, self.center)).square().sum(-1) <= self.radius**2
 
@@ -135,10 +135,10 @@ class Cylinder(Region):
         center: Middle of its axis [scene units], 3 numbers.
         axis: Direction of its axis, 3 numbers of any length above zero.
         radius: Radius [scene units], above zero.
-        height: Length along the axis [scene units], above zero; half of it lies on each side of ``center``.
+        height: Length along the axis [scene units], above zero; half of it is on each side of ``center``.
 
     Raises:
-        ValueError: If a vector has not 3 finite numbers, ``axis`` is zero, or a size is not positive.
+        ValueError: If a vector does not have 3 finite numbers, ``axis`` is zero, or a size is not positive.
         TypeError: If a vector is not a list.
     """
 
@@ -161,7 +161,7 @@ class Cylinder(Region):
         )
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
         check_shape("points", points, 3)
         axis = self.on(points, self.axis)
         offset = points - self.on(points, self.center)
@@ -171,7 +171,7 @@ class Cylinder(Region):
 
 
 class Union(Region):
-    """What lies in at least one of several regions.
+    """All points in at least one of several regions.
 
     Args:
         regions: Regions to join, at least one.
@@ -195,7 +195,7 @@ class Union(Region):
         return f"Union(regions={self.regions})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
         inside = self.regions[0].contains(points)
         for region in self.regions[1:]:
             inside = inside | region.contains(points)
@@ -220,7 +220,7 @@ class Not(Region):
         return f"Not(region={self.region})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) lie inside, as booleans (...)."""
+        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
         return ~self.region.contains(points)
 
 

@@ -66,7 +66,7 @@ def rotation_to_quat(rotation: Tensor) -> Tensor:
 def rotation_from_z(up: Sequence[float] | Tensor) -> Tensor:
     """Minimal rotation that takes +z to ``up``; its transpose takes ``up`` to +z.
 
-    For the one direction where the minimal rotation is not unique, (0, 0, -1), it is the half turn about x.
+    For (0, 0, -1), where the minimal rotation is not unique, it is the half turn about x.
 
     Args:
         up: Direction of any length, shape (3,).

@@ -1,1 +1,1 @@
-"""How far a run is from a reference: Chamfer distance, Fréchet video distance; PSNR and SSIM are torchmetrics' own."""
+"""How far a run is from a reference: Chamfer and Fréchet video distance. PSNR and SSIM come from torchmetrics."""

@@ -1,4 +1,4 @@
-"""Chamfer distance between point sets, in chunks, so that its memory does not grow with the product of their sizes."""
+"""Chamfer distance between point sets, in chunks, so that memory does not grow with the product of their sizes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gaussian_swaying._checks import check_choice, check_positive, check_shape
 
 DIRECTIONS = ("both", "average", "forward", "backward")
 REDUCTIONS = ("mean", "sum")
-_PAIRS = 2**20  # on a CPU a chunk of distances should stay in its cache
+_PAIRS = 2**20  # on a CPU a chunk of distances should fit in the cache
 _PAIRS_CUDA = 2**24
-_SLABS_FROM = 2**22  # pairs from which looking at slabs pays, on a CPU
+_SLABS_FROM = 2**22  # number of pairs from which slabs are faster, on a CPU
 _GROUP = 128  # points that share a slab
 
 
@@ -20,14 +20,14 @@ _GROUP = 128  # points that share a slab
 def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) -> tuple[Tensor, Tensor]:
     """Distance of every point to the nearest one of the other set, both ways.
 
-    Exact on any device: a GPU looks at all pairs, a CPU at those that can be nearest. Distances are those of the
-    differences of the coordinates, not of expanded squares, so they keep their precision far from the origin. No
+    Exact on any device: a GPU looks at all pairs, a CPU only at those that can be nearest. Distances are computed from
+    differences of coordinates, not from expanded squares, so they stay precise far from the origin. There is no
     gradient.
 
     Args:
         source: Points [m], shape (P, D).
         target: Points [m], shape (Q, D).
-        pairs: Largest number of distances held at a time, but at least Q; by default what suits the device.
+        pairs: Largest number of distances in memory at a time, but at least Q; the default suits the device.
 
     Returns:
         Distances from ``source`` to ``target`` [m], shape (P,), and from ``target`` to ``source`` [m], shape (Q,).
@@ -50,7 +50,7 @@ def nearest_distances(source: Tensor, target: Tensor, pairs: int | None = None) 
 
 
 def _by_chunks(source: Tensor, target: Tensor, pairs: int) -> tuple[Tensor, Tensor]:
-    """All pairs, so many at a time."""
+    """Distances from all pairs, ``pairs`` at a time."""
     forward = source.new_empty(len(source))
     backward = target.new_full((len(target),), torch.inf)
     rows = max(1, int(pairs) // len(target))
@@ -65,7 +65,8 @@ def _by_chunks(source: Tensor, target: Tensor, pairs: int) -> tuple[Tensor, Tens
 def _by_slabs(source: Tensor, target: Tensor, pairs: int) -> Tensor:
     """Distances to the target, shape (P,); a group of sources looks only at targets that are near along one axis.
 
-    A few targets around the group bound how far its nearest ones can be, and so the slab that holds them all.
+    A few targets around the group give a bound on the nearest distances, and so the slab that contains all nearest
+    targets.
     """
     axis = int((target.amax(0) - target.amin(0)).argmax())
     target = target[target[:, axis].argsort()]
@@ -101,9 +102,9 @@ def chamfer_distance(
         d(S, T) = \frac{1}{\lvert S \rvert} \sum_{x \in S} \min_{y \in T} \lvert x - y \rvert^k
                 + \frac{1}{\lvert T \rvert} \sum_{y \in T} \min_{x \in S} \lvert x - y \rvert^k
 
-    with k = 1, or k = 2 if ``squared``; ``reduction="sum"`` leaves out the two divisions. The two directions are added
-    unless told otherwise: two equal sheets at a distance h have d = 2 h. Papers differ in all of this: Fan et al. add
-    squares, PyTorch3D takes the mean of squares by default, and others plain distances, as here.
+    with k = 1, or k = 2 if ``squared``; ``reduction="sum"`` leaves out the two divisions. By default the two directions
+    are added: two equal sheets at a distance h have d = 2 h. Papers use different definitions: Fan et al. add squares,
+    PyTorch3D takes the mean of squares by default, and others use plain distances, as here.
 
     Args:
         source: Points [m], shape (..., P, 3), or any other number of coordinates.
@@ -112,7 +113,7 @@ def chamfer_distance(
         reduction: ``mean`` or ``sum`` over the points of each set.
         direction: ``both`` terms added, ``average`` of the two (half of that), or one term only: ``forward``, from each
             source point to the target, or ``backward``.
-        pairs: Largest number of distances held at a time, see :func:`nearest_distances`.
+        pairs: Largest number of distances in memory at a time, see :func:`nearest_distances`.
 
     Returns:
         The distance [m], or [m²] if ``squared``, shape (...). It has no gradient.
@@ -152,14 +153,14 @@ def _combine(forward: Tensor, backward: Tensor, squared: bool, reduction: str, d
 class ChamferDistance(Metric):
     """Mean over frames of :func:`chamfer_distance`.
 
-    Every pair of sets weighs the same, whatever its number of points. Frames whose sets differ in size are given one
-    by one.
+    Every pair of sets has the same weight, whatever its number of points. Pass frames whose sets differ in size one by
+    one.
 
     Args:
         squared: Add squared distances.
         reduction: ``mean`` or ``sum`` over the points of each set.
         direction: ``both`` (added), ``average``, ``forward`` or ``backward``.
-        pairs: Largest number of distances held at a time.
+        pairs: Largest number of distances in memory at a time.
         kwargs: Options of :class:`torchmetrics.Metric`.
 
     Raises:

@@ -1,7 +1,7 @@
 """Fréchet distance between Gaussians, and between the features of videos.
 
-The features come from a network that the user brings as a TorchScript file; nothing is downloaded. The number depends
-on that network, on how clips are cut and on how frames are resized, so it is always given together with
+The features come from a network that the user provides as a TorchScript file; nothing is downloaded. The number depends
+on that network, on how clips are cut and on how frames are resized. So it is always given together with
 :meth:`FrechetVideoDistance.protocol`.
 """
 
@@ -21,7 +21,7 @@ from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, impor
 
 from gaussian_swaying._checks import check_positive, check_shape
 
-# what the TorchScript I3D of StyleGAN-V takes beside the clips: we resize and rescale ourselves
+# arguments of the TorchScript I3D of StyleGAN-V besides the clips: we resize and rescale ourselves
 _OPTIONS = {"rescale": False, "resize": False, "return_features": True}
 
 
@@ -32,10 +32,9 @@ def frechet_distance(mean1: Tensor, cov1: Tensor, mean2: Tensor, cov2: Tensor) -
         d^2 = \lvert \mu_1 - \mu_2 \rvert^2 + \operatorname{tr} \Sigma_1 + \operatorname{tr} \Sigma_2
               - 2 \sum_i \sqrt{\lambda_i}
 
-    with the eigenvalues :math:`\lambda_i` of the symmetric matrix
-    :math:`\Sigma_1^{1/2} \Sigma_2 \Sigma_1^{1/2}`, which has the same trace of the square root as
-    :math:`\Sigma_1 \Sigma_2`. They are never negative but for rounding, which is cut off, so singular covariances
-    (fewer samples than dimensions) are no special case. Computed in float64.
+    with the eigenvalues :math:`\lambda_i` of the symmetric matrix :math:`\Sigma_1^{1/2} \Sigma_2 \Sigma_1^{1/2}`, which
+    has the same trace of the square root as :math:`\Sigma_1 \Sigma_2`. They are negative only by rounding and are then
+    set to zero, so singular covariances (fewer samples than dimensions) need no special case. Computed in float64.
 
     Args:
         mean1: Mean of the first, shape (D,).
@@ -68,12 +67,12 @@ def frechet_distance(mean1: Tensor, cov1: Tensor, mean2: Tensor, cov2: Tensor) -
 
 
 def cut_clips(video: Tensor, length: int, stride: int) -> Tensor:
-    """All clips of ``length`` consecutive frames that begin every ``stride`` frames; what is left at the end is unused.
+    """All clips of ``length`` consecutive frames that begin every ``stride`` frames; left-over frames are not used.
 
     Args:
         video: Frames, shape (T, 3, H, W).
         length: Frames in a clip.
-        stride: Frames from the begin of one clip to that of the next.
+        stride: Frames from the start of one clip to the start of the next.
 
     Returns:
         A view of the video, shape (clips, length, 3, H, W).
@@ -83,7 +82,7 @@ def cut_clips(video: Tensor, length: int, stride: int) -> Tensor:
     """
     if len(video) < length:
         raise ValueError(
-            f"A video has {len(video)} frames, but a clip {length}: give a longer video, or lower `clip_length`."
+            f"A video has {len(video)} frames, but a clip needs {length}: give a longer video, or lower `clip_length`."
         )
     return video.unfold(0, length, stride).movedim(-1, 1)
 
@@ -96,16 +95,17 @@ class FrechetVideoDistance(Metric):
     TorchScript version of I3D that FVD is commonly computed with is called with ``rescale=False, resize=False,
     return_features=True``; networks without these arguments are called with the clips alone.
 
-    Covariances are unbiased. With at most D clips they are singular: the number is still defined, but depends on how
-    many clips there are, so only numbers of the same protocol compare.
+    Covariances are unbiased. With at most D clips they are singular. The number is still defined then, but it depends
+    on how many clips there are, so compare only numbers with the same protocol.
 
     Args:
-        weights: The network as TorchScript file.
+        weights: The network as a TorchScript file.
         clip_length: Frames in a clip; I3D needs at least 10.
-        stride: Frames from the begin of one clip to that of the next.
-        resize: Height and width of what the network sees [pixels], or one number for both; None leaves the size alone.
-        value_range: What is black and what is white in the videos.
-        batch_size: Clips that the network sees at a time.
+        stride: Frames from the start of one clip to the start of the next.
+        resize: Height and width of the frames given to the network [pixels], or one number for both; None keeps the
+            size.
+        value_range: Values of black and white in the videos.
+        batch_size: Clips per call of the network.
         kwargs: Options of :class:`torchmetrics.Metric`.
 
     Raises:
@@ -152,10 +152,10 @@ class FrechetVideoDistance(Metric):
         self.add_state("fake_features", [], dist_reduce_fx="cat")
 
     def prepare(self, frames: Tensor) -> Tensor:
-        """Resize frames (..., 3, H, W) as :meth:`update` does, which leaves them alone then.
+        """Resize frames (..., 3, H, W) as :meth:`update` does; it does not resize them again.
 
-        A long video need not be held at its full size: give its frames to this method one by one, and what it returns
-        to :meth:`update`.
+        With it a long video need not be in memory at its full size: pass its frames to this method one by one, and the
+        results to :meth:`update`.
         """
         check_shape("video", frames, 3, None, None)
         frames = frames.to(self.device)
@@ -173,7 +173,7 @@ class FrechetVideoDistance(Metric):
 
         Args:
             video: Frames with values in ``value_range``, shape (T, 3, H, W) or (B, T, 3, H, W).
-            real: Whether these are the reference.
+            real: Whether these videos are the reference.
 
         Raises:
             ValueError: If the shape or a value is wrong, a video is shorter than a clip, or the network does not return
@@ -188,7 +188,7 @@ class FrechetVideoDistance(Metric):
         smallest, largest = (float(value) for value in video.aminmax())
         if not (low <= smallest and largest <= high):
             raise ValueError(
-                f"Expected `video` to have values from {low:g} to {high:g}, but they are from {smallest:g} to "
+                f"Expected `video` to have values from {low:g} to {high:g}, but they range from {smallest:g} to "
                 f"{largest:g}: set `value_range`."
             )
         features = []
@@ -199,13 +199,13 @@ class FrechetVideoDistance(Metric):
         (self.real_features if real else self.fake_features).extend(features)
 
     def _features(self, clips: Tensor) -> Tensor:
-        self.network.eval()  # also within a module that is in training
+        self.network.eval()  # also inside a module in training mode
         features = self.network(clips.transpose(1, 2).contiguous(), **self.options)
         if not isinstance(features, Tensor) or features.dim() != 2 or len(features) != len(clips):
             shape = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
             raise ValueError(
                 f"Expected the network {self.weights} to return features of shape ({len(clips)}, D) for {len(clips)} "
-                f"clips, but got {shape}: export it so that it returns one row a clip."
+                f"clips, but got {shape}: export it so that it returns one row for each clip."
             )
         return features.double()
 
@@ -257,7 +257,7 @@ def _joined(features: list[Tensor] | Tensor) -> Tensor:
 def _load_network(path: Path) -> tuple[str, Any]:
     if not path.is_file():
         raise ValueError(
-            f"There is no file {path}: give `weights` the path of an I3D network in TorchScript; none is downloaded."
+            f"There is no file {path}: set `weights` to the path of an I3D network in TorchScript; none is downloaded."
         )
     content = path.read_bytes()
     try:

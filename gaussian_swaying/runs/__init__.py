@@ -1,1 +1,1 @@
-"""The folder of a run: held by one process, its files sealed, ended in order by signals."""
+"""The folder of a run: locked by one process, files with checksums, and signals that end a run in order."""

@@ -1,4 +1,4 @@
-"""The folder that a run writes to: held by this process alone, an earlier run in it moved aside, never overwritten."""
+"""The output folder of a run. This process locks it; an earlier run in it is moved aside and never overwritten."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ MARKER = "run.json"
 
 
 def mark(folder: Path) -> None:
-    """Write down that a run made the folder."""
+    """Mark the folder as made by a run."""
     write_json(folder / MARKER, {"made_by": "gaussian_swaying", "format": 1})
 
 
 def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterable[Path] = ()) -> FolderLock:
-    """Make a folder for a new run and hold it; an earlier run found there is moved aside.
+    """Make and lock a folder for a new run; an earlier run in it is moved aside.
 
-    A symbolic link is followed: what it points to is moved and made anew, and the link stays as it is.
+    A symbolic link is followed: its target is moved and made again, and the link does not change.
 
     Args:
         folder: The folder.
-        ours: Names in it that a run writes to, and that nobody else may have made.
-        remedy: What to choose instead, for the messages, such as "choose another with --output".
+        ours: Names in it that a run writes. The folder is refused if something else made one of them.
+        remedy: What the user can do, for the messages, such as "choose another with --output".
         in_use: Files and folders that the new run reads, which must not be moved.
 
     Returns:
@@ -34,11 +34,11 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
 
     Raises:
         FolderLocked: If another run writes there.
-        ValueError: If the folder cannot be written or moved, or holds something else of a name in ``ours``.
+        ValueError: If the folder cannot be written or moved, or contains something else with a name in ``ours``.
     """
     try:
         real = _resolve(folder)
-        for _ in range(10):  # another run may move the folder aside in between
+        for _ in range(10):  # another run may move the folder aside at the same time
             real.mkdir(parents=True, exist_ok=True)
             try:
                 lock = FolderLock(real)
@@ -64,7 +64,7 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
 
 
 def hold_folder(folder: Path, remedy: str) -> FolderLock:
-    """Hold a folder in which a run is to be continued; nothing else is changed.
+    """Lock the folder of a run that is to be continued; nothing else changes.
 
     Raises:
         FolderLocked: If another run writes there.
@@ -81,12 +81,12 @@ def hold_folder(folder: Path, remedy: str) -> FolderLock:
 def _resolve(folder: Path) -> Path:
     try:
         return folder.resolve()
-    except RuntimeError as error:  # Python before 3.13, where links go round in a circle
+    except RuntimeError as error:  # Python before 3.13, if the links form a cycle
         raise OSError(str(error)) from error
 
 
 def _as_named(folder: Path, aside: Path) -> Path:
-    """Where an earlier run is now, relative if the folder was named so."""
+    """Where an earlier run is now, as a relative path if the folder was given as one."""
     beside = not folder.is_symlink() and folder.name == aside.name.rpartition(".")[0]
     return folder.with_name(aside.name) if beside else aside
 
@@ -95,7 +95,7 @@ def _check_free(folder: Path, real: Path, ours: Iterable[str], remedy: str) -> N
     foreign = [name for name in ours if os.path.lexists(real / name)]
     if foreign:
         raise ValueError(
-            f"The output folder {folder} holds {', '.join(foreign)} of something else, which would be "
+            f"The output folder {folder} contains {', '.join(foreign)}, not made by a run, which would be "
             f"overwritten: {remedy}."
         )
 
@@ -128,12 +128,12 @@ _FRAME = re.compile(r"\d{5,}(\.[a-z]+)+")
 
 
 def check_names(folder: Path, files: Iterable[str], folders: Iterable[str]) -> None:
-    """Raise ValueError if something of another kind bears the name of a file or folder that the run will write.
+    """Raise ValueError if a name that the run will write belongs to something of another kind.
 
     Args:
         folder: The folder of the run.
-        files: Names of files in it.
-        folders: Names of folders in it, whose entries are files.
+        files: Names of its files.
+        folders: Names of its folders; their entries are files.
     """
     for name in folders:
         kind = kind_of(folder / name)

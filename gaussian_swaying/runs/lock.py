@@ -1,8 +1,8 @@
-"""One writer per folder: a lock file that names the process and the host that write there.
+"""One writer per folder: a lock file with the process and the host that write to it.
 
-The file appears with its content in one step, so of two processes that start at the same moment one gets it. One whose
-process is gone is taken over; whether a process of another host lives cannot be known, so its lock has to be removed by
-hand.
+The file appears with its content in one step, so if two processes start at the same moment, only one gets the lock. A
+lock whose process has ended is taken over. Whether a process on another host is still running cannot be known, so its
+lock must be removed by hand.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ class FolderLocked(ValueError):  # noqa: N818
 
 
 class FolderLock:
-    """Holds a folder for this process until :meth:`release`, its end, or until nobody refers to the object.
+    """Locks a folder for this process until :meth:`release`, the end of the process, or garbage collection of the lock.
 
     Args:
         folder: The folder, which must exist.
 
     Raises:
-        FolderLocked: If another run, of this process or another one, holds it.
+        FolderLocked: If another run, in this process or another one, has locked it.
         OSError: If the lock cannot be written.
     """
 
@@ -41,21 +41,21 @@ class FolderLock:
         self._end = weakref.finalize(self, _release, self._place, mine, os.getpid())
 
     def moved(self, folder: Path) -> None:
-        """Say that the folder has another name now."""
+        """Tell the lock that the folder has been renamed."""
         self._place[0] = folder
 
     def release(self) -> None:
-        """Let the folder go; once more does nothing."""
+        """Unlock the folder; a second call does nothing."""
         self._end()
 
 
 def _describe() -> bytes:
-    """This process, as the content of a lock."""
+    """A description of this process, the content of a lock."""
     return json.dumps({"pid": os.getpid(), "begun": _begun(os.getpid()), **_here()}).encode()
 
 
 def _here() -> dict[str, str]:
-    """Where process numbers have one meaning: the host, and on Linux the container."""
+    """The host, and on Linux the container, within which process numbers are unique."""
     try:
         space = os.readlink("/proc/self/ns/pid")
     except OSError:
@@ -64,18 +64,18 @@ def _here() -> dict[str, str]:
 
 
 def _begun(pid: int) -> str:
-    """When a process began, on Linux, so that a number given to another process is seen; "" elsewhere or if gone."""
+    """When a process started, on Linux, to notice a reused process number; "" on other systems or if it has ended."""
     try:
         state, *rest = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except (OSError, ValueError):
         return ""
-    return "" if state in "ZX" else f"{boot} {rest[18]}"  # ended, but its parent has not asked yet
+    return "" if state in "ZX" else f"{boot} {rest[18]}"  # ended, but not yet reaped by its parent
 
 
 def _alive(pid: int, begun: str) -> bool:
-    """Whether a process of this host still runs; True where that cannot be known."""
-    if os.name == "nt":  # where signal 0 would end it
+    """Whether a process of this host is still running; True if that cannot be known."""
+    if os.name == "nt":  # signal 0 would end it there
         return True
     try:
         os.kill(pid, 0)
@@ -88,7 +88,7 @@ def _alive(pid: int, begun: str) -> bool:
 
 def _acquire(folder: Path, mine: bytes) -> None:
     lock = folder / LOCK
-    for _ in range(10):  # a lock that is released meanwhile is tried for again
+    for _ in range(10):  # try again if the lock is released meanwhile
         if _create(lock, mine):
             return
         check_regular(lock)
@@ -97,7 +97,7 @@ def _acquire(folder: Path, mine: bytes) -> None:
         except FileNotFoundError:
             continue
         _check_stale(folder, theirs)
-        # only one of those who found the same stale lock may replace it, and only if it is that one still
+        # of several processes that find the same stale lock only one may replace it, and only if it has not changed
         guard = lock.with_name(f"{LOCK}.taken")
         if not _create(guard, mine):
             break
@@ -109,13 +109,13 @@ def _acquire(folder: Path, mine: bytes) -> None:
         finally:
             guard.unlink(missing_ok=True)
     raise FolderLocked(
-        f"Another run is just starting in {folder}: choose another folder, or wait; if there is none, remove "
+        f"Another run is just starting in {folder}: choose another folder, or wait; if no run is starting, remove "
         f"{lock} and {LOCK}.taken."
     )
 
 
 def _create(path: Path, content: bytes) -> bool:
-    """Make a file with its content in one step; False if there is one."""
+    """Make a file with its content in one step; False if it exists."""
     temporary = temporary_name(path)
     try:
         temporary.write_bytes(content)
@@ -144,22 +144,22 @@ def _check_stale(folder: Path, content: bytes) -> None:
     except (ValueError, TypeError, KeyError, RecursionError):
         raise FolderLocked(
             f"{lock} cannot be read, so another run may be writing to {folder}: choose another folder, or remove that "
-            "file if none does."
+            "file if no run does."
         ) from None
     if not here:
         raise FolderLocked(
-            f"A run on the host {host} (process {pid}) is writing to {folder}, or was stopped by force: choose another "
-            f"folder, or remove {lock} if it runs no more."
+            f"A run on the host {host} (process {pid}) is writing to {folder}, or was killed: choose another "
+            f"folder, or remove {lock} if it is not running any more."
         )
     if _alive(pid, begun):
         raise FolderLocked(
-            f"Another run (process {pid} on this host) is writing to {folder}: wait for its end, stop it, or choose "
+            f"Another run (process {pid} on this host) is writing to {folder}: wait until it ends, stop it, or choose "
             "another folder."
         )
 
 
 def _release(place: list[Path], mine: bytes, owner: int) -> None:
-    if os.getpid() != owner:  # a copy of the process, which does not end the run
+    if os.getpid() != owner:  # a forked copy, whose end does not end the run
         return
     lock = place[0] / LOCK
     with suppress(OSError):

@@ -1,4 +1,4 @@
-"""A checksum at the end of a file, so that a file of which a single bit has changed is not taken for whole."""
+"""A checksum at the end of a file, so that a file with even one changed bit is noticed."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def sha256(path: Path, size: int | None = None) -> str:
 
 
 def seal(path: Path) -> None:
-    """Add the checksum of a file to its end; ``torch.load`` reads a sealed file as it did before."""
+    """Append the checksum of a file to it; ``torch.load`` still reads the file."""
     digest = sha256(path)
     with path.open("ab") as file:
         file.write(b"\ngaussian_swaying sha256 " + digest.encode() + b"\n")
 
 
 def check_seal(path: Path) -> None:
-    """Raise ValueError unless a file ends with the checksum of all that comes before.
+    """Raise ValueError unless a file ends with the checksum of everything before it.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no regular file, has no checksum, or its content is not the one that was sealed.
+        ValueError: If it is not a regular file, has no checksum, or its content has changed.
     """
     check_regular(path)
     size = max(os.path.getsize(path) - _LENGTH, 0)
@@ -45,6 +45,6 @@ def check_seal(path: Path) -> None:
         file.seek(size)
         found = _TRAILER.fullmatch(file.read())
     if found is None:
-        raise ValueError("it has no checksum at its end, so it is not whole or not ours")
+        raise ValueError("it has no checksum at its end, so it is incomplete or was not written by this package")
     if sha256(path, size).encode() != found[1]:
-        raise ValueError("its checksum does not fit its content, so it is damaged")
+        raise ValueError("its checksum does not match its content, so it is damaged")

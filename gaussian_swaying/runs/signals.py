@@ -1,4 +1,4 @@
-"""SIGTERM and SIGHUP end a run as Ctrl-C does: in order, with everything recorded so far kept."""
+"""SIGTERM and SIGHUP end a run as Ctrl-C does: in order, keeping everything recorded so far."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class StoppedBySignal(KeyboardInterrupt):
     """A signal other than Ctrl-C asked the program to end.
 
     Args:
-        number: Of the signal.
+        number: Number of the signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -23,10 +23,10 @@ class StoppedBySignal(KeyboardInterrupt):
 
 @contextmanager
 def stop_signals() -> Iterator[None]:
-    """Within the block SIGTERM and SIGHUP raise :class:`StoppedBySignal` in the main thread.
+    """Inside the block, SIGTERM and SIGHUP raise :class:`StoppedBySignal` in the main thread.
 
-    Only the first does, so that a second one does not disturb what is being saved (Ctrl-C still does). A signal that is
-    ignored or has a handler already, as under nohup, keeps it; so does everything outside the main thread.
+    Only the first signal raises, so that a second one does not interrupt saving (Ctrl-C still does). A signal that is
+    ignored or already has a handler, as under nohup, is left alone. Outside the main thread nothing changes.
     """
     changed: list[int] = []
     stopping = False
@@ -51,7 +51,7 @@ def stop_signals() -> Iterator[None]:
 
 
 def exit_code(stop: BaseException) -> int:
-    """128 and the number of the signal: 130 for Ctrl-C."""
+    """128 plus the number of the signal: 130 for Ctrl-C."""
     return 128 + (stop.number if isinstance(stop, StoppedBySignal) else int(signal.SIGINT))
 
 

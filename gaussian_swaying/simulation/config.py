@@ -14,7 +14,8 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
-from gaussian_swaying.simulation.physgaussian.convert import convert, read_config, to_yaml
+from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
+from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

@@ -21,7 +21,7 @@ from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCame
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.recording.recorder import check_camera_name
+from gaussian_swaying.simulation.recording.layout import check_camera_name
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_PIXELS = 1 << 26  # of a picture: twice those of 8K

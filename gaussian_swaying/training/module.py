@@ -7,7 +7,6 @@ import os
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,106 +24,13 @@ from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
+from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
 from gaussian_swaying.training.losses import SSIM_TAPS, LossInputs, LossTerm, TotalLoss
 from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
-
-
-class TrainingDiverged(RuntimeError):  # noqa: N818
-    """A loss or a Gaussian is not finite any more; the message names the step and the last good checkpoint.
-
-    Args:
-        step: Number of images trained on before the one that failed.
-        what: What is not finite.
-        checkpoint: Last checkpoint written before, if any.
-    """
-
-    def __init__(self, step: int, what: str, checkpoint: str | None = None) -> None:
-        self.step, self.checkpoint = step, checkpoint
-        kept = f"the last good checkpoint is {checkpoint}" if checkpoint else "there is no checkpoint yet"
-        super().__init__(
-            f"Training diverged at step {step}: {what} is not finite; {kept}. Remedy: lower the learning rates "
-            "(`model.rates`) or the weight of the loss that grew (`model.loss_weights`)."
-        )
-
+from gaussian_swaying.training.random_stream import random_state, set_random_state
+from gaussian_swaying.training.rates import LearningRates, means_rate
 
 _CLOCK_STEP = 20_000_000  # [ns] by which times of files may lag behind the clock
-
-
-class _Pending:
-    """The last loss, on its way to the host, which does not wait for it."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.step: int | None = None
-        on_gpu = device.type == "cuda"
-        self._host = torch.zeros((), pin_memory=on_gpu)
-        self._arrived = torch.cuda.Event() if on_gpu else None
-
-    def send(self, step: int, loss: Tensor) -> None:
-        self.step = step
-        self._host.copy_(loss, non_blocking=True)
-        if self._arrived is not None:
-            self._arrived.record()
-
-    def take(self) -> float:
-        """Wait for the loss and forget it."""
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        self.step = None
-        return float(self._host)
-
-
-def _random_state(device: torch.device) -> dict[str, Tensor]:
-    state = {"cpu": torch.get_rng_state()}
-    return state | {"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else state
-
-
-def _set_random_state(state: Mapping[str, Tensor], device: torch.device) -> None:
-    torch.set_rng_state(state["cpu"])
-    if device.type == "cuda" and "cuda" in state:
-        torch.cuda.set_rng_state(state["cuda"], device)
-
-
-@dataclass(frozen=True)
-class LearningRates:
-    """Learning rates of Adam, one for each parameter, with the values of gsplat's example trainer.
-
-    Attributes:
-        means: Centres, as a share of the scene's extent; decays exponentially.
-        means_final: Share of ``means`` that is left after the last step.
-        scales: Logarithms of the scales.
-        quats: Quaternions.
-        opacities: Logits of the opacities.
-        sh0: Constant harmonics.
-        shN: The other harmonics.
-    """
-
-    means: float = 1.6e-4
-    means_final: float = 0.01
-    scales: float = 5e-3
-    quats: float = 1e-3
-    opacities: float = 5e-2
-    sh0: float = 2.5e-3
-    shN: float = 2.5e-3 / 20  # noqa: N815
-
-    def __post_init__(self) -> None:
-        for name in (*PARAMETERS, "means_final"):
-            check_positive(f"rates.{name}", getattr(self, name), allow_zero=name != "means_final")
-
-
-def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: int) -> float:
-    """Learning rate of the centres at a step: from ``rates.means`` times the scene's extent, exponentially downwards.
-
-    Args:
-        rates: The rates.
-        scene_scale: Extent of the scene [scene units].
-        step: Number of images trained on before.
-        max_steps: Number of images in all.
-
-    Returns:
-        The rate [scene units].
-    """
-    share = min(step / max_steps, 1.0) if max_steps > 0 else 0.0
-    return rates.means * scene_scale * rates.means_final**share
 
 
 class SplatTrainer(lightning.LightningModule):
@@ -212,7 +118,7 @@ class SplatTrainer(lightning.LightningModule):
         self._lpips: list[Any] = []  # in a list, so that its weights stay out of the checkpoints
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
-        self._pending: _Pending | None = None
+        self._pending: PendingLoss | None = None
         self._seen = 0  # images that a checkpoint was trained on
         self._begun = 0  # [ns] when the training did
         self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
@@ -321,16 +227,16 @@ class SplatTrainer(lightning.LightningModule):
 
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
         """One image: picture, losses, gradients, six optimisers, densification."""
-        outside = _random_state(self.device)
+        outside = random_state(self.device)
         if self._random:
-            _set_random_state(self._random, self.device)
+            set_random_state(self._random, self.device)
         else:
             torch.manual_seed(self.seed)
         try:
             return self._train_on(batch, self.global_step)
         finally:
-            self._random = _random_state(self.device)
-            _set_random_state(outside, self.device)
+            self._random = random_state(self.device)
+            set_random_state(outside, self.device)
 
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
         optimizers = self._raw_optimizers()
@@ -351,7 +257,7 @@ class SplatTrainer(lightning.LightningModule):
         self.densification.before_backward(step, output.screen)
         self.manual_backward(loss)
         if self._pending is None:
-            self._pending = _Pending(self.device)
+            self._pending = PendingLoss(self.device)
         self._pending.send(step, loss.detach())
         if self.device.type != "cuda":
             self._check_pending()

@@ -138,7 +138,7 @@ def test_the_line_for_people_is_understood(make_run, make_reference):
     line = SimFrame.fit(points, metres_per_unit=1.0).describe()
     found = compare_run(make_run(frame=line), make_reference(), points=POINTS)
     assert found["mean"]["chamfer_m"] < 0.02
-    with pytest.raises(ValueError, match="does not say where the scene lies"):
+    with pytest.raises(ValueError, match="it has no `sim_frame`"):
         compare_run(make_run("other", frame="somewhere"), make_reference("another"))
 
 

@@ -173,3 +173,30 @@ def test_coverage_rejects_bad_values():
     points[3, 1] = torch.nan
     with pytest.raises(ValueError, match="Expected `means` to be finite"):
         _sum_on_plane(points)
+
+
+def test_patch_area_takes_the_two_larger_scales(device, dtype):
+    scales = torch.tensor(
+        [[2.0, 3.0, 0.1], [0.1, 2.0, 3.0], [3.0, 0.1, 2.0], [1.0, 1.0, 1.0]], device=device, dtype=dtype
+    )
+    expected = math.pi * torch.tensor([6.0, 6.0, 6.0, 1.0], device=device, dtype=dtype)
+    torch.testing.assert_close(patch_area(scales.log()), expected)
+
+
+def test_gradcheck_of_patch_area(device):
+    log_scales = torch.randn(4, 3, device=device, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(patch_area, (log_scales,))
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda z: patch_area(z(2, 2)), "log_scales"),
+        (lambda z: coverage_area(z(2, 2), z(2, 3), z(2, 3)), "means"),
+        (lambda z: coverage_area(z(2, 3), z(3, 3), z(2, 3)), "normals"),
+        (lambda z: coverage_area(z(2, 3), z(2, 3), z(2, 3), z(3)), "opacity"),
+    ],
+)
+def test_wrong_shapes_are_named(call, name):
+    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
+        call(torch.zeros)

@@ -99,13 +99,14 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
     # the same program, slowed down so that the kill surely comes in the middle
     code = (
         "import sys, time\n"
-        "from gaussian_swaying.simulation import config, simulation\n"
+        "from gaussian_swaying.cli import simulate\n"
+        "from gaussian_swaying.simulation import simulation\n"
         "advance = simulation.Simulation.advance\n"
         "def slow(self, state):\n"
         "    time.sleep(60 if float(state.time) > 0.1 else 0)\n"
         "    return advance(self, state)\n"
         "simulation.Simulation.advance = slow\n"
-        "sys.exit(config.main(sys.argv[1:]))\n"
+        "sys.exit(simulate.main(sys.argv[1:]))\n"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code, *_arguments(folder)], env=environment, stdout=subprocess.DEVNULL
@@ -140,7 +141,8 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     code = (
         "import pathlib, signal, sys, time\n"
-        "from gaussian_swaying.simulation import config, simulation\n"
+        "from gaussian_swaying.cli import simulate\n"
+        "from gaussian_swaying.simulation import simulation\n"
         f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
         "advance = simulation.Simulation.advance\n"
         "def slow(self, state):\n"
@@ -149,7 +151,7 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
         "        while True: time.sleep(0.05)\n"
         "    return advance(self, state)\n"
         "simulation.Simulation.advance = slow\n"
-        "sys.exit(config.main(sys.argv[1:]))\n"
+        "sys.exit(simulate.main(sys.argv[1:]))\n"
     )
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     process = subprocess.Popen([sys.executable, "-c", code, *_arguments(folder)], env=environment, **pipes)
@@ -192,7 +194,8 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
         # ignored where a script starts the tests in the background
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import imageio.v3 as iio\n"
-        "from gaussian_swaying.simulation import config, recorder\n"
+        "from gaussian_swaying.cli import simulate\n"
+        "from gaussian_swaying.simulation.recording import recorder\n"
         f"full, go_on = pathlib.Path({str(full)!r}), pathlib.Path({str(go_on)!r})\n"
         "class Writer(recorder.FrameWriter):\n"
         "    def submit(self, *arguments, **settings):\n"
@@ -204,7 +207,7 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
         "    while not go_on.exists(): time.sleep(0.01)\n"
         "    write(path, *arguments, **settings)\n"
         "iio.imwrite = hang\n"
-        "sys.exit(config.main(sys.argv[1:]))\n"
+        "sys.exit(simulate.main(sys.argv[1:]))\n"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code, *_arguments(folder)], env=environment, stdout=subprocess.DEVNULL

@@ -17,7 +17,8 @@ from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
 
 TOOLS = Path(__file__).parents[2] / "tools" / "datasets"
-NAMES = ("blender_cloth", "blender_checks", "blender_images", "flag_reference", "make_flag_dataset")
+NAMES = ("blender_cloth", "blender_checks", "blender_images", "make_flag_dataset")
+NAMES += ("flag_reference", "flag_pictures", "flag_motion", "flag_difference")
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,22 @@ def tool():
 
 @pytest.fixture(scope="module")
 def reference(tool):
-    return tool.reference
+    return sys.modules["flag_reference"]
+
+
+@pytest.fixture(scope="module")
+def flag_pictures(tool):
+    return sys.modules["flag_pictures"]
+
+
+@pytest.fixture(scope="module")
+def flag_motion(tool):
+    return sys.modules["flag_motion"]
+
+
+@pytest.fixture(scope="module")
+def flag_difference(tool):
+    return sys.modules["flag_difference"]
 
 
 @pytest.fixture(scope="module")
@@ -209,33 +225,33 @@ def test_cells_must_be_squares(reference):
 # ---- files
 
 
-def _motion(reference, pattern, shape):
+def _motion(flag_motion, pattern, shape):
     """A motion of which ``shape`` gives the points (V, 3) of a frame, as it would be read."""
     grid = pattern.grid()
     rest = pattern.rest(grid.uv())[0]
     positions = np.stack([shape(rest, frame) for frame in range(pattern.frames)]).astype(np.float32)
     settings = json.loads(json.dumps(pattern.cloth_settings()))
-    return reference.Cloth(positions, grid.faces(), grid.uv(), grid.columns, grid.rows, settings)
+    return flag_motion.Cloth(positions, grid.faces(), grid.uv(), grid.columns, grid.rows, settings)
 
 
-def _fake_solver(monkeypatch, reference, calls):
+def _fake_solver(monkeypatch, flag_motion, calls):
     def solve(grid, vertices, pins, material, run, report=None):
         calls.append(run.quality)
         drift = np.linspace(0, 0.5, run.frames, dtype=np.float32)
         return vertices.astype(np.float32) + drift[:, None, None] * np.float32([0, 1, 0])
 
-    monkeypatch.setattr(reference, "solve_cloth", solve)
+    monkeypatch.setattr(flag_motion, "solve_cloth", solve)
 
 
-def test_motion_is_solved_once_and_says_what_changed(reference, monkeypatch, tmp_path):
+def test_motion_is_solved_once_and_says_what_changed(reference, flag_motion, monkeypatch, tmp_path):
     calls = []
-    _fake_solver(monkeypatch, reference, calls)
+    _fake_solver(monkeypatch, flag_motion, calls)
     pattern, path = replace(reference.PATTERNS[2], cells=30, quality=8, frames=4), tmp_path / "flag/cloth.npz"
-    assert reference.solve_pattern(pattern, path)
-    assert not reference.solve_pattern(pattern, path)
+    assert flag_motion.solve_pattern(pattern, path)
+    assert not flag_motion.solve_pattern(pattern, path)
     assert calls == [8]
     assert [item.name for item in path.parent.iterdir()] == ["cloth.npz"]  # nothing half-written stays
-    motion = reference.read_cloth(path)
+    motion = flag_motion.read_cloth(path)
     assert motion.positions.shape == (4, 30 * 20, 3)
     with np.load(path) as data:
         assert data["areal_density"] == pytest.approx(0.3)
@@ -244,30 +260,30 @@ def test_motion_is_solved_once_and_says_what_changed(reference, monkeypatch, tmp
         np.testing.assert_allclose(data["gravity"], [0, 0, -9.8])
         np.testing.assert_allclose(data["flow"], [2.5, 0.5, 0])
         assert set(json.loads(str(data["units"]))) <= set(data.files)
-        assert str(data["hash"]) == reference.settings_hash(motion.settings)
+        assert str(data["hash"]) == flag_motion.settings_hash(motion.settings)
         np.testing.assert_array_equal(data["pins"], pattern.pins(motion.uv))
     changed = replace(pattern, quality=16, drag=1.0)
     with pytest.raises(ValueError, match=r"`drag` was 0.8 and is now 1.0; `quality` was 8 and is now 16"):
-        reference.solve_pattern(changed, path)
+        flag_motion.solve_pattern(changed, path)
     assert calls == [8]
 
 
-def test_what_is_no_motion_is_an_error(reference, tmp_path):
+def test_what_is_no_motion_is_an_error(flag_motion, tmp_path):
     np.savez(tmp_path / "other.npz", x=1)
     for name in ("other.npz", "missing.npz"):
         with pytest.raises(ValueError, match="not the motion of a flag"):
-            reference.read_cloth(tmp_path / name)
+            flag_motion.read_cloth(tmp_path / name)
 
 
-def test_hash_does_not_depend_on_order(reference):
-    assert reference.settings_hash({"a": 1, "b": 2}) == reference.settings_hash({"b": 2, "a": 1})
-    assert reference.settings_hash({"a": 1}) != reference.settings_hash({"a": 2})
+def test_hash_does_not_depend_on_order(flag_motion):
+    assert flag_motion.settings_hash({"a": 1, "b": 2}) == flag_motion.settings_hash({"b": 2, "a": 1})
+    assert flag_motion.settings_hash({"a": 1}) != flag_motion.settings_hash({"a": 2})
 
 
 # ---- comparing solutions
 
 
-def test_sampling_is_exact_on_every_mesh(reference):
+def test_sampling_is_exact_on_every_mesh(reference, flag_difference, flag_motion):
     """Bilinear functions of the place on the flag are reproduced, so two meshes of one surface are 0 apart."""
     pattern = replace(reference.PATTERNS[2], frames=2)
 
@@ -275,45 +291,46 @@ def test_sampling_is_exact_on_every_mesh(reference):
         x, _, z = rest.T
         return np.stack([x, frame * x * z, z + 0.1 * frame * x], -1)
 
-    coarse, fine = (_motion(reference, replace(pattern, cells=cells), bent) for cells in (6, 30))
-    uv = reference.even_uv(pattern, along=12)
+    coarse, fine = (_motion(flag_motion, replace(pattern, cells=cells), bent) for cells in (6, 30))
+    uv = flag_difference.even_uv(pattern, along=12)
     assert len(uv) == 12 * 8
     x, z = uv.T * np.array([[1.2], [0.8]])
     # a bilinear function is linear along each side of a square: exact on both, to float32
     np.testing.assert_allclose(coarse.sample(uv)[1], np.stack([x, x * z, z + 0.1 * x], -1), atol=1e-6)
-    found = reference.difference(pattern, coarse, fine, along=12)
+    found = flag_difference.difference(pattern, coarse, fine, along=12)
     assert found["chamfer"] < 1e-6
     assert found["corresponding"] < 1e-6
 
 
-def test_chamfer_distance_of_shifted_lattices(reference):
+def test_chamfer_distance_of_shifted_lattices(flag_difference):
     """Across the sheet by d it is d; along it by less than half the spacing too; order does not matter."""
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(7.0), [0.0], indexing="ij"), -1).reshape(-1, 3)
     for shift in ([0, 0, 0.7], [0.3, 0, 0]):
         moved = (grid + shift)[::-1]
-        assert reference.chamfer_distance(grid, moved) == pytest.approx(np.linalg.norm(shift))
+        assert flag_difference.chamfer_distance(grid, moved) == pytest.approx(np.linalg.norm(shift))
     # one point against two: mean of 1 and (1 + 3) / 2
-    assert reference.chamfer_distance(np.zeros((1, 3)), np.array([[1.0, 0, 0], [0, 3.0, 0]])) == pytest.approx(1.5)
+    one, two = np.zeros((1, 3)), np.array([[1.0, 0, 0], [0, 3.0, 0]])
+    assert flag_difference.chamfer_distance(one, two) == pytest.approx(1.5)
 
 
-def test_difference_is_a_share_of_the_longer_side(reference):
+def test_difference_is_a_share_of_the_longer_side(reference, flag_difference, flag_motion):
     pattern = replace(reference.PATTERNS[3], cells=20, frames=3)
-    still = _motion(reference, pattern, lambda rest, frame: rest)
-    moving = _motion(reference, pattern, lambda rest, frame: rest + frame * 0.01 * pattern.normal())
-    found = reference.difference(pattern, still, moving, along=20)
+    still = _motion(flag_motion, pattern, lambda rest, frame: rest)
+    moving = _motion(flag_motion, pattern, lambda rest, frame: rest + frame * 0.01 * pattern.normal())
+    found = flag_difference.difference(pattern, still, moving, along=20)
     np.testing.assert_allclose(found["chamfer_per_frame"], [0, 0.005, 0.01], atol=1e-6)  # over 2 m
     assert found["chamfer"] == pytest.approx(0.005, abs=1e-6)
     assert found["corresponding"] == pytest.approx(0.005, abs=1e-6)
     with pytest.raises(ValueError, match="as many frames"):
-        reference.difference(pattern, still, replace(moving, positions=moving.positions[:2]))
+        flag_difference.difference(pattern, still, replace(moving, positions=moving.positions[:2]))
 
 
-def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, tmp_path):
+def test_uncertainty_is_written_for_each_variant(tool, reference, flag_difference, flag_motion, monkeypatch, tmp_path):
     calls = []
-    _fake_solver(monkeypatch, reference, calls)
+    _fake_solver(monkeypatch, flag_motion, calls)
     pattern = replace(reference.PATTERNS[1], cells=30, quality=8, frames=3)
     lines = []
-    tool.make_uncertainty(pattern, tmp_path, list(reference.VARIANTS), lines.append, every=1, along=20)
+    tool.make_uncertainty(pattern, tmp_path, list(flag_difference.VARIANTS), lines.append, every=1, along=20)
     written = json.loads((tmp_path / "uncertainty.json").read_text())
     assert {name: (row["cells"], row["quality"]) for name, row in written["variants"].items()} == {
         "steps doubled": (30, 16),
@@ -332,12 +349,12 @@ def test_uncertainty_is_written_for_each_variant(tool, reference, monkeypatch, t
     assert len(calls) == 7
 
 
-def test_bending_is_that_of_a_plate_unless_given(reference):
+def test_bending_is_that_of_a_plate_unless_given(reference, flag_difference):
     pattern = reference.PATTERNS[3]
     assert pattern.material().bending == pytest.approx(3e3 * 0.01**3 / 12 / (1 - 0.3**2))
-    slack = reference.variants(pattern, ["hardly bending"])["hardly bending"]
+    slack = flag_difference.variants(pattern, ["hardly bending"])["hardly bending"]
     assert slack.material().bending == pytest.approx(0.02 * pattern.material().bending)
-    apart = reference.variants(pattern, ["self-contact"])["self-contact"]
+    apart = flag_difference.variants(pattern, ["self-contact"])["self-contact"]
     assert apart.run().self_collision
     assert not pattern.run().self_collision
     assert pattern.cloth_settings()["bending"] == 1.0
@@ -355,12 +372,12 @@ def _seen(fields_path, frame, points):
     return image[:, :2] / image[:, 2:], local[:, 2]
 
 
-def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, tmp_path):
+def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, flag_pictures, tmp_path):
     """All corners are in every image, at the pixels that the camera in transforms.json gives."""
     pattern = reference.PATTERNS[3]
-    views = reference.sphere_views(pattern, 40, 100)
+    views = flag_pictures.sphere_views(pattern, 40, 100)
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(reference.transforms_fields(views, [f"{i}.png" for i in range(40)])))
+    path.write_text(json.dumps(flag_pictures.transforms_fields(views, [f"{i}.png" for i in range(40)])))
     corners = pattern.rest(np.array([[0.0, 0], [0, 1], [1, 0], [1, 1]]))[0]
     rays = []
     for index, view in enumerate(views):
@@ -376,12 +393,12 @@ def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, tmp_path
     assert np.linalg.eigvalsh(rays.T @ rays / 40) == pytest.approx([1 / 3] * 3, abs=0.03)
 
 
-def test_reference_camera_looks_along_the_normal_and_holds_the_motion(reference, tmp_path):
+def test_reference_camera_looks_along_the_normal_and_holds_the_motion(reference, flag_pictures, flag_motion, tmp_path):
     pattern = replace(reference.PATTERNS[3], cells=20, frames=5)
-    motion = _motion(reference, pattern, lambda rest, t: rest + t * np.array([0.3, -0.2, -0.4]))
-    view = reference.reference_view(pattern, motion.positions, 320, 180)
+    motion = _motion(flag_motion, pattern, lambda rest, t: rest + t * np.array([0.3, -0.2, -0.4]))
+    view = flag_pictures.reference_view(pattern, motion.positions, 320, 180)
     np.testing.assert_allclose(view.pose[:3, 2], pattern.normal(), atol=1e-12)
-    (tmp_path / "camera.json").write_text(json.dumps(reference.transforms_fields([view], ["x.png"])))
+    (tmp_path / "camera.json").write_text(json.dumps(flag_pictures.transforms_fields([view], ["x.png"])))
     pixels, depth = _seen(tmp_path / "camera.json", 0, motion.positions.reshape(-1, 3).astype(np.float64))
     assert (depth > 0).all()
     margin = np.minimum(pixels.min(0), [320, 180] - pixels.max(0))
@@ -389,27 +406,27 @@ def test_reference_camera_looks_along_the_normal_and_holds_the_motion(reference,
     assert margin.min() < 0.1 * 180  # and no further away than it needs to be
 
 
-def test_frames_come_every_tenth_first(reference):
-    order = reference.frame_order(25)
+def test_frames_come_every_tenth_first(flag_pictures):
+    order = flag_pictures.frame_order(25)
     assert order[:5] == [0, 10, 20, 1, 2]
     assert sorted(order) == list(range(25))
 
 
-def test_textures_are_the_same_every_time_and_the_right_way_up(reference, tmp_path):
+def test_textures_are_the_same_every_time_and_the_right_way_up(reference, flag_pictures, tmp_path):
     flag = reference.PATTERNS[2]
-    drawn = reference.draw_texture(flag, width=60)
+    drawn = flag_pictures.draw_texture(flag, width=60)
     assert drawn.shape == (40, 60, 3)
     np.testing.assert_allclose(drawn[0, 0], [0.83, 0.30, 0.18], atol=1e-6)  # the upper band
     np.testing.assert_allclose(drawn[20, 30], [0.93, 0.68, 0.20], atol=1e-6)  # the disc
-    np.testing.assert_array_equal(drawn, reference.draw_texture(flag, width=60))
-    assert np.ptp(reference.draw_texture(reference.PATTERNS[1])) == 0
+    np.testing.assert_array_equal(drawn, flag_pictures.draw_texture(flag, width=60))
+    assert np.ptp(flag_pictures.draw_texture(reference.PATTERNS[1])) == 0
     from imageio.v3 import imwrite
 
     imwrite(tmp_path / "own.png", np.full((3, 5, 3), 51, dtype=np.uint8))
-    own = reference.draw_texture(replace(flag, texture=str(tmp_path / "own.png")))
+    own = flag_pictures.draw_texture(replace(flag, texture=str(tmp_path / "own.png")))
     np.testing.assert_allclose(own, 0.2, atol=1e-6)
     with pytest.raises(ValueError, match="Cannot read the texture"):
-        reference.draw_texture(replace(flag, texture=str(tmp_path / "none.png")))
+        flag_pictures.draw_texture(replace(flag, texture=str(tmp_path / "none.png")))
 
 
 # ---- pictures and resuming
@@ -436,13 +453,13 @@ class _FakeStudio:
 
 
 @pytest.fixture
-def small(tool, reference, monkeypatch, tmp_path):
+def small(tool, reference, flag_motion, monkeypatch, tmp_path):
     """Everything at its smallest, without Blender: pattern, folder and pictures."""
-    _fake_solver(monkeypatch, reference, [])
+    _fake_solver(monkeypatch, flag_motion, [])
     monkeypatch.setattr(tool, "Studio", _FakeStudio)
     monkeypatch.setattr(_FakeStudio, "left", 1000)
     pattern = replace(reference.PATTERNS[2], cells=12, quality=8, frames=12)
-    reference.solve_pattern(pattern, tmp_path / "cloth.npz")
+    flag_motion.solve_pattern(pattern, tmp_path / "cloth.npz")
     return pattern, tmp_path, tool.Pictures(size=(32, 18), samples=1, views=9, view_size=16)
 
 
@@ -557,7 +574,7 @@ def test_relations_hold_on_panels(tool):
         assert ratio == pytest.approx(1.0, abs=1e-3 if name.startswith("gravity") else 0.08), name
 
 
-def test_photograph_shows_the_flag_where_the_camera_says(tool, reference, tmp_path):
+def test_photograph_shows_the_flag_where_the_camera_says(tool, reference, flag_pictures, tmp_path):
     """White cloth across the light has its own value; alpha ends where the corners are projected to."""
     pytest.importorskip("bpy", reason="needs the extra [blender]")
     from imageio.v3 import imread
@@ -565,8 +582,8 @@ def test_photograph_shows_the_flag_where_the_camera_says(tool, reference, tmp_pa
     images = sys.modules["blender_images"]
     pattern = replace(reference.PATTERNS[1], cells=12, quality=8, frames=2)
     pictures = tool.Pictures(samples=4, views=1, view_size=120)
-    lamps = np.stack([reference.lamp_position(pattern, side) for side in (1, -1)])
-    studio = tool._studio(pattern, reference.draw_texture(pattern), lamps, pictures, True)
+    lamps = np.stack([flag_pictures.lamp_position(pattern, side) for side in (1, -1)])
+    studio = tool._studio(pattern, flag_pictures.draw_texture(pattern), lamps, pictures, True)
     studio.move(pattern.rest(pattern.grid().uv())[0])
     for side in (1, -1):
         eye = pattern.center() + side * 2.3 * pattern.normal() + [0.2, 0, 0.3]

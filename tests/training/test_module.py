@@ -15,9 +15,11 @@ from gaussian_swaying.training.densification import (
     MCMCDensification,
     NoDensification,
 )
+from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.initial import gaussians_from_points
 from gaussian_swaying.training.losses import LossTerm, MeanOpacityLoss, MeanScaleLoss
-from gaussian_swaying.training.module import LearningRates, SplatTrainer, TrainingDiverged, means_rate
+from gaussian_swaying.training.module import SplatTrainer
+from gaussian_swaying.training.rates import LearningRates, means_rate
 
 
 def _often():

@@ -7,7 +7,7 @@
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 
-For each pattern the folder ``pattern1`` to ``pattern3`` holds ``cloth.npz`` (the motion, see ``flag_reference.py``),
+For each pattern the folder ``pattern1`` to ``pattern3`` holds ``cloth.npz`` (the motion, see ``flag_motion.py``),
 ``mesh.ply`` and ``truth.npz`` (the rest shape with its normals), ``train/`` (photographs of the rest shape from all
 around, with ``transforms.json``) and ``video/`` (``frames/``, ``camera.json``, ``reference.mp4``). The same settings
 give the same files. What is there is not made again, so an interrupted run is continued by the same command; where
@@ -26,12 +26,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import flag_reference as reference
 import numpy as np
 from blender_checks import check_relations
 from blender_cloth import require_bpy
 from blender_images import TRANSFERS, Studio
-from flag_reference import PATTERNS, FlagPattern, check_settings, write_json, write_whole
+from flag_difference import VARIANTS, difference, variants
+from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern, write_json, write_whole
+from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
+from flag_reference import PATTERNS, FlagPattern, least_quality
 
 PARTS = ("cloth", "train", "video")
 Report = Callable[[str], None]
@@ -118,20 +120,20 @@ def make_train(pattern: FlagPattern, folder: Path, pictures: Pictures, report: R
     Returns:
         Number of pictures made.
     """
-    texture = reference.draw_texture(pattern)
+    texture = draw_texture(pattern)
     claim(folder, picture_settings(pattern, texture, pictures) | {"views": pictures.views, "size": pictures.view_size})
-    views = reference.sphere_views(pattern, pictures.views, pictures.view_size)
+    views = sphere_views(pattern, pictures.views, pictures.view_size)
     names = [f"images/{index:04d}.png" for index in range(len(views))]
     (folder / "images").mkdir(exist_ok=True)
     wanted = missing_pictures(folder, names)
     if wanted:
-        lamps = np.stack([reference.lamp_position(pattern, side) for side in (1, -1)])
+        lamps = np.stack([lamp_position(pattern, side) for side in (1, -1)])
         studio = _studio(pattern, texture, lamps, pictures, transparent=True)
         studio.move(pattern.rest(pattern.grid().uv())[0])
         for done, name in enumerate(wanted, 1):
             studio.photograph(views[names.index(name)], folder / name)
             report(f"view {done}/{len(wanted)}")
-    write_json(folder / "transforms.json", reference.transforms_fields(views, names))
+    write_json(folder / "transforms.json", transforms_fields(views, names))
     return len(wanted)
 
 
@@ -143,19 +145,19 @@ def make_video(pattern: FlagPattern, cloth: Path, folder: Path, pictures: Pictur
     Returns:
         Number of pictures made.
     """
-    motion = reference.read_cloth(cloth)
-    texture = reference.draw_texture(pattern)
+    motion = read_cloth(cloth)
+    texture = draw_texture(pattern)
     width, height = pictures.size
     settings = picture_settings(pattern, texture, pictures) | {"size": [width, height]}
-    claim(folder, settings | {"cloth": reference.settings_hash(motion.settings)})
-    view = reference.reference_view(pattern, motion.positions, width, height)
-    lamp = reference.lamp_position(pattern)
+    claim(folder, settings | {"cloth": settings_hash(motion.settings)})
+    view = reference_view(pattern, motion.positions, width, height)
+    lamp = lamp_position(pattern)
     (folder / "frames").mkdir(exist_ok=True)
-    fields = reference.transforms_fields([view], ["frames/0000.png"])
+    fields = transforms_fields([view], ["frames/0000.png"])
     light = {"position": lamp.tolist(), "direction": pattern.normal().tolist(), "size": _lamp_size(pattern)}
     write_json(folder / "camera.json", fields | {"fps": pattern.fps, "light": light})
     count = len(motion.positions)
-    names = {f"frames/{frame:04d}.png": frame for frame in reference.frame_order(count) if frame % pictures.every == 0}
+    names = {f"frames/{frame:04d}.png": frame for frame in frame_order(count) if frame % pictures.every == 0}
     wanted = missing_pictures(folder, list(names))
     if wanted:
         studio = _studio(pattern, texture, lamp[None], pictures, transparent=False)
@@ -192,26 +194,26 @@ def make_uncertainty(
     Args:
         pattern: The flag; its own motion is ``cloth.npz``, solved if it is not there.
         folder: Of the pattern. Motions go to ``uncertainty/``.
-        names: Keys of :func:`flag_reference.variants`.
+        names: Keys of :func:`flag_difference.variants`.
         report: Called with a line of progress.
         every: Compare every how many-th frame.
         along: Points compared along the longer side.
 
     Returns:
-        What is written to ``uncertainty.json``: for each variant the fields of :func:`flag_reference.difference`.
+        What is written to ``uncertainty.json``: for each variant the fields of :func:`flag_difference.difference`.
     """
     own = folder / "cloth.npz"
-    reference.solve_pattern(pattern, own, _every_25th(report, "cloth", pattern.frames))
+    solve_pattern(pattern, own, _every_25th(report, "cloth", pattern.frames))
     result: dict[str, Any] = {
         "settings": pattern.cloth_settings(),
-        "hash": reference.settings_hash(pattern.cloth_settings()),
+        "hash": settings_hash(pattern.cloth_settings()),
         "unit": "shares of the longer side; mean over frames; Chamfer distance is half the sum of both mean distances",
         "variants": {},
     }
-    for name, variant in reference.variants(pattern, names).items():
+    for name, variant in variants(pattern, names).items():
         path = folder / "uncertainty" / f"{name.replace(' ', '_')}.npz"
-        reference.solve_pattern(variant, path, _every_25th(report, name, pattern.frames))
-        numbers = reference.difference(pattern, reference.read_cloth(own), reference.read_cloth(path), every, along)
+        solve_pattern(variant, path, _every_25th(report, name, pattern.frames))
+        numbers = difference(pattern, read_cloth(own), read_cloth(path), every, along)
         result["variants"][name] = {"cells": variant.cells, "quality": variant.quality, **numbers}
     write_json(folder / "uncertainty.json", result)
     return result
@@ -275,7 +277,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--threads", type=int, help="threads to render with; 0 for all (0)")
     add("--check", action="store_true", help="measure the relations between Blender's settings and SI units")
     add("--uncertainty", action="store_true", help="solve the flags otherwise, and compare")
-    add("--variants", nargs="+", choices=sorted(reference.VARIANTS), default=list(reference.VARIANTS), help="how")
+    add("--variants", nargs="+", choices=sorted(VARIANTS), default=list(VARIANTS), help="how")
     add("--json", type=Path, help="where --check writes what it measured (default: check.json in --out)")
     return parser.parse_args(argv)
 
@@ -294,7 +296,7 @@ def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
     if options.preview:
         given = {"cells": pattern.cells // 4} | given
     pattern = replace(pattern, **given)
-    return replace(pattern, quality=options.quality or reference.least_quality(pattern))
+    return replace(pattern, quality=options.quality or least_quality(pattern))
 
 
 def pictures_of(options: argparse.Namespace) -> Pictures:
@@ -327,7 +329,7 @@ def make(number: int, options: argparse.Namespace) -> None:
         return
     started = time.time()
     if "cloth" in options.only:
-        reference.solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames))
+        solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames))
         make_truth(pattern, folder)
     if "train" in options.only:
         make_train(pattern, folder / "train", pictures, report)

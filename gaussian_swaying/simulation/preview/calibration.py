@@ -16,6 +16,7 @@ from torch import Tensor
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.preview.suggest import Suggestion
 from gaussian_swaying.simulation.simulation import Simulation
 
 SWAY = 0.10  # largest displacement that is wanted, as a share of the longest side
@@ -257,3 +258,19 @@ def measure_motion(
 
 def _quantile(values: Tensor, share: float) -> float:
     return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
+
+
+def calibrated_suggestion(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:
+    """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
+    if found.pin is None or not any(found.flow):
+        return found
+    start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway
+    best = calibrate(lambda tried: measure_motion(draft, tried, start, wanted), start, found.longest_side, wanted)
+    apply_setting(draft, best.setting, start)
+    return replace(
+        found,
+        youngs_modulus=best.setting.E,
+        thickness=best.setting.thickness,
+        flow=tuple(round(c * best.setting.wind, 2) for c in found.flow),
+        stiffness_reason=best.reason,
+    )

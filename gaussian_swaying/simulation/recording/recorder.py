@@ -7,8 +7,6 @@ deformation gradients end up in one file (:mod:`.trajectory`).
 from __future__ import annotations
 
 import os
-import re
-import shutil
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -23,22 +21,19 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.export import SUFFIXES, UsdFilm, export_cloud, read_usd_frame, usd_arrays
+from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold_folder, mark
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.simulation.recording.layout import FILES, OURS, frame_folder, raw_folder, video_file
 from gaussian_swaying.simulation.recording.resume import check_frames, check_pictures, check_positions, check_shards
 from gaussian_swaying.simulation.recording.trajectory import pack_trajectory
+from gaussian_swaying.simulation.recording.usd_film import pack_usd, write_usd_frame
 from gaussian_swaying.simulation.recording.video import VideoEncoder, encode_video
 from gaussian_swaying.simulation.recording.writer import FrameWriter, HostCopy
 
-_FILES = ["run.json", "config.yaml", "checkpoint.pt", "trajectory.npz", "summary.json", "diagnostics.csv"]
-_FILES += ["animation.usdc"]
-# what a run writes, and so must not find in a folder that no run made
-_OURS = [*_FILES, "frames", "ply", "trajectory", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
-_OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
 NORMAL_AXES = ("camera", "world")
 
 
@@ -53,34 +48,6 @@ class _Film:
         if self.encoder is not None:
             self.encoder.abort()
             self.encoder = None
-
-
-def frame_folder(render: str = "color", camera: str = "") -> str:
-    """Folder of a render's frames within that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
-
-    Args:
-        render: One of ``color``, ``depth``, ``normal`` and ``force``.
-        camera: Name of a further camera; empty for the one of the run.
-    """
-    own = "frames" if render == "color" else render
-    return f"cameras/{camera}/{own}" if camera else own
-
-
-def raw_folder(place: str) -> str:
-    """Folder of the numbers whose colours are in the folder ``place``."""
-    return f"{place}_raw"
-
-
-def video_file(place: str) -> str:
-    """The video of the frames in the folder ``place``: ``video.mp4`` of ``frames``, ``depth.mp4`` of ``depth`` ..."""
-    folder = Path(place)
-    return folder.with_name("video.mp4" if folder.name == "frames" else f"{folder.name}.mp4").as_posix()
-
-
-def check_camera_name(name: str) -> None:
-    """Raise ValueError unless a camera's name can be that of a folder on every system."""
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
-        raise ValueError(f"Expected a name of `cameras` to have letters, digits, - and _ only, but got {name!r}.")
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:
@@ -222,7 +189,7 @@ class Recorder:
         try:
             checkpoint = self._continue(path, config, check) if resume else None
             if not resume:
-                self._lock = claim_folder(path, _OURS, "choose another with --output")
+                self._lock = claim_folder(path, OURS, "choose another with --output")
             self._folder = path
             try:
                 self._make_folders()
@@ -264,7 +231,7 @@ class Recorder:
         """Sentences about what is missing of the frames so far; ValueError if something is damaged."""
         frames = checkpoint["frame"] + 1
         videos = [video_file(place) for place in self._films] if self.video else []
-        check_names(path, [*_FILES, *videos], self._folders())
+        check_names(path, [*FILES, *videos], self._folders())
         told = []
         for place in self._picture_folders():
             film = video_file(place) if self.video and place in self._films else None
@@ -376,16 +343,10 @@ class Recorder:
             cloud: The Gaussians, in scene units; they must not change.
             frame: Scene units to metres with z up, for USD.
         """
-        if self.export_format != "usd":
-            return self.write_ply(index, lambda path: export_cloud(path, cloud, self.export_format))
-
-        def write(path: Path) -> None:
-            arrays: dict[str, Any] = usd_arrays(cloud)
-            rotation = frame.direction_to_sim(torch.eye(3, dtype=torch.float64)).mT.numpy()
-            with atomic(path) as temporary:
-                np.savez(temporary, **arrays, metres_per_unit=frame.metres_per_unit, rotation=rotation)
-
-        self.write_ply(index, write)
+        if self.export_format == "usd":
+            self.write_ply(index, lambda path: write_usd_frame(path, cloud, frame))
+        else:
+            self.write_ply(index, lambda path: export_cloud(path, cloud, self.export_format))
 
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep what a resumed run needs.
@@ -443,8 +404,12 @@ class Recorder:
                 self.wait()
             except Exception as error:
                 failure = error
-            if self.ply_every and frames:
-                made.append(self._pack_usd(frames) if self.export_format == "usd" else self.folder / self.export_format)
+            if self.ply_every and frames and self.export_format == "usd":
+                made.append(self.folder / "animation.usdc")
+                wanted = range(0, frames, self.ply_every)
+                pack_usd(self.folder / "usd", made[-1], wanted, self.fps or self._real_time_fps)
+            elif self.ply_every and frames:
+                made.append(self.folder / self.export_format)
             if self.trajectory and frames:
                 pack_trajectory(self.folder / "trajectory", self.folder / "trajectory.npz", frames)
                 made.append(self.folder / "trajectory.npz")
@@ -482,23 +447,3 @@ class Recorder:
         write_json(self.folder / "summary.json", summary)
         if summary.get("per_frame"):
             write_table(self.folder / "diagnostics.csv", summary["per_frame"])
-
-    def _pack_usd(self, frames: int) -> Path:
-        """Join the frames into one film, those of an earlier part of a resumed run from the film of that part."""
-        target, shards = self.folder / "animation.usdc", self.folder / "usd"
-        files = {int(file.stem): file for file in shards.glob("[0-9]*.npz")}
-        wanted = range(0, frames, self.ply_every)
-        if not any(index in files for index in wanted):
-            return target
-        with np.load(files[min(files)]) as shard:
-            scale, rotation = float(shard["metres_per_unit"]), torch.from_numpy(shard["rotation"])
-        film = UsdFilm(self.fps or self._real_time_fps, scale, rotation)
-        for index in wanted:
-            if index in files:
-                with np.load(files[index]) as shard:
-                    film.add(index, {k: shard[k] for k in shard.files if k not in ("metres_per_unit", "rotation")})
-            elif target.exists():
-                film.add(index, read_usd_frame(target, index))
-        film.save(target)
-        shutil.rmtree(shards)
-        return target

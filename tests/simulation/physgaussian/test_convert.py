@@ -23,12 +23,12 @@ from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera, read_model_camera
-from gaussian_swaying.simulation.physgaussian.convert import convert, to_yaml
+from gaussian_swaying.simulation.physgaussian.convert import convert
 from gaussian_swaying.simulation.physgaussian.space import Normalisation, heading, rotation_matrix
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 
-TOOL = Path(__file__).parents[2] / "tools/convert_physgaussian.py"
-PAGE = Path(__file__).parents[2] / "docs/physgaussian.md"
+TOOL = Path(__file__).parents[3] / "tools/convert_physgaussian.py"
+PAGE = Path(__file__).parents[3] / "docs/physgaussian.md"
 PARSER = Simulation.parser()
 REST = {"start_time": 0.0, "end_time": 1e3}
 STILL = [0.0, 0.0, 0.0]

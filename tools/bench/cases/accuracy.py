@@ -13,7 +13,10 @@ import torch
 
 from bench import record
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.validation import bars, beams, flags, granular, plates, surfaces, vortex
+from gaussian_swaying.validation import bars, beams, flags, plates, surfaces, vortex
+from gaussian_swaying.validation.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
+from gaussian_swaying.validation.granular.columns import column_collapse
+from gaussian_swaying.validation.granular.layers import angle_of_repose
 from gaussian_swaying.validation.settings import Settings
 
 Row = dict[str, Any]
@@ -39,9 +42,9 @@ def _elements(settings: Settings) -> dict[str, float]:
     del settings  # element tests need no solver
     law = Sand(friction_angle=30.0)
     return {
-        "shear_deg": granular.shear_angle(law),
-        "triaxial_deg": granular.triaxial_angle(law),
-        "plane_strain_deg": granular.plane_strain_angle(law),
+        "shear_deg": shear_angle(law),
+        "triaxial_deg": triaxial_angle(law),
+        "plane_strain_deg": plane_strain_angle(law),
     }
 
 
@@ -92,16 +95,16 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
                     options = {"shape": shape, "law": law, "count": count, "overlap": overlap, "area": area}
                     yield case("surface drag", _surface, "total", **options)
     yield case("sand element", _elements, "updated")
-    yield case("sand slope", granular.angle_of_repose, "updated")
+    yield case("sand slope", angle_of_repose, "updated")
     for cells in (4, 8, 16) if thorough else (4, 8):
-        yield case("sand column", granular.column_collapse, "updated", aspect=1.0, cells=cells)
+        yield case("sand column", column_collapse, "updated", aspect=1.0, cells=cells)
     for aspect in (0.5, 2.0, 3.0):
-        yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=16 if thorough else 8)
+        yield case("sand column", column_collapse, "updated", aspect=aspect, cells=16 if thorough else 8)
     for aspect in (0.5, 1.0, 2.0, 3.0):
-        yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=8, volume_correction=False)
+        yield case("sand column", column_collapse, "updated", aspect=aspect, cells=8, volume_correction=False)
     if thorough:
         for aspect in (0.5, 1.0, 2.0):
-            yield case("sand column", granular.column_collapse, "updated", aspect=aspect, cells=8, planar=False)
+            yield case("sand column", column_collapse, "updated", aspect=aspect, cells=8, planar=False)
         for dx in (0.08, 0.04, 0.02, 0.01) if device == "cuda" else ():  # tens of thousands of particles
             for density in (20.0, 50.0):
                 yield case("soft flag", _soft_flag, "total, float32", dx=dx, density=density)

@@ -25,8 +25,8 @@ from gaussian_swaying.training.data.datamodule import CaptureDataModule, Trainin
 from gaussian_swaying.training.data.generated_datamodule import GeneratedDataModule
 from gaussian_swaying.training.data.order import EndlessShuffle
 from gaussian_swaying.training.losses import photometric_loss
-from gaussian_swaying.training.module import LearningRates, means_rate
 from gaussian_swaying.training.panels import panel
+from gaussian_swaying.training.rates import LearningRates, means_rate
 from gaussian_swaying.validation.surface_quality import surface_quality
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -27,7 +27,8 @@ from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.runs.seal import seal
 from gaussian_swaying.runs.signals import StoppedBySignal
 from gaussian_swaying.training.densification import PARAMETERS
-from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
+from gaussian_swaying.training.finite import TrainingDiverged
+from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.quiet import silence_advertisements
 
 pytestmark = pytest.mark.filterwarnings("ignore:LightningCLI's args", "ignore:skip_none", "ignore:.*LeafSpec")

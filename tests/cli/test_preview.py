@@ -9,11 +9,12 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.cli.preview import main, splat_name
+from gaussian_swaying.cli.preview import main
+from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation import config
+from gaussian_swaying.simulation.preview.results import splat_name
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -59,13 +60,13 @@ def test_starter_runs_unchanged(splat, tmp_path, capsys):
         assert words in report
     assert "a floor" not in report
     small = ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--recorder.video", "false"]
-    assert config.main(["--config", str(out / "starter.yaml"), "--output", str(tmp_path / "run"), *small]) == 0
+    assert simulate(["--config", str(out / "starter.yaml"), "--output", str(tmp_path / "run"), *small]) == 0
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert summary["frames"] == 3
     assert summary["lost_particles"] == 0
     assert summary["displacement_mean_max_m"] > 1e-4
     short = [*small, "--frames", "2"]
-    assert config.main(["--config", str(out / "draft.yaml"), "--output", str(tmp_path / "draft"), *short]) == 0
+    assert simulate(["--config", str(out / "draft.yaml"), "--output", str(tmp_path / "draft"), *short]) == 0
 
 
 def test_more_sway_is_softer(tmp_path):

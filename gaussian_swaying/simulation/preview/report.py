@@ -1,0 +1,120 @@
+"""What the preview finds, as text for people."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.simulation.preview.cost import Cost
+from gaussian_swaying.simulation.preview.starter import region_dict
+from gaussian_swaying.simulation.preview.suggest import Suggestion
+from gaussian_swaying.simulation.progress import duration
+
+
+def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[str]:
+    """Bounds, opacities and shapes of the Gaussians."""
+    corner, own = data["bounds"], data["gaussians"]
+    below = ", ".join(f"{share:.0%} below {t}" for t, share in own["opacity_below"].items())
+    normals = "with normals" if own["normals"] else "without normals (the smallest axes are taken)"
+    return [
+        f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
+        f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
+        f"  without 1 %   {_numbers(corner['robust_min'])} to {_numbers(corner['robust_max'])}",
+        "  5, 50 and 95 % of the Gaussians have at most",
+        f"    opacity     {_numbers(own['opacity'])}; {below}",
+        f"    S1 / S2     {_numbers(own['S1_over_S2'])}   (needles are above 10)",
+        f"    S2 / S3     {_numbers(own['S2_over_S3'])}   (surface patches are above 3)",
+        f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
+    ]
+
+
+def suggestion_lines(found: Suggestion) -> list[str]:
+    """The guesses."""
+    region = "all of space"
+    if found.region.box is not None:
+        region = json.dumps(dict(zip(("min", "max"), found.region.box, strict=True)))
+    count = int(found.region.simulated.sum())
+    lines = [
+        f"up              {_numbers(found.up.direction)}, {_why(found.up.confidence, '; '.join(found.up.reasons))}",
+        f"region          {region}: {found.region.reason}",
+        f"opacity         {found.region.opacity_threshold:g} and above is simulated: {count:,} particles",
+        f"held            at the {found.hold.end}, {_why(found.hold.confidence, found.hold.reason)}"
+        if found.pin is not None
+        else "held            nowhere: it will fall",
+    ]
+    if found.pin is not None:
+        lines.append(f"  pin           {_short(region_dict(found.pin))}")
+    lines += [
+        f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
+        f"{found.metres_per_unit:.4g} m, as the longest side is taken as {found.longest_side:g} m",
+        f"grid            dx = {found.dx:g} m: {found.longest_side / found.dx:.0f} cells along the longest side, "
+        f"{found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of {found.spacing:.3g} m",
+        "further points  "
+        + ("none needed" if found.fill_spacing is None else f"every {found.fill_spacing:g} m on large Gaussians"),
+        f"material        {_material(found)}",
+        f"wind            {_numbers(found.flow)} m/s, z up",
+    ]
+    return ["", "guesses (each can be given instead, see --help)", *(f"  {line}" for line in lines)]
+
+
+def run_lines(run: dict[str, Any]) -> list[str]:
+    """What a given configuration simulates."""
+    return [
+        "",
+        "this configuration",
+        f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
+        f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
+        f"  follow them     {run['carried']:,} faint ones",
+        f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
+        f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
+        *(f"                  {region}" for region in run["regions"]),
+        f"  frame           {run['frame']}",
+        f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
+        f"  wind            {_numbers(run['flow'])} m/s, z up, before modulations",
+    ]
+
+
+def cost_lines(cost: Cost) -> list[str]:
+    """The cost of a run."""
+    frame = cost.substeps * cost.substep_seconds
+    picture = ""
+    if cost.picture_seconds is not None:
+        picture = f" + {duration(cost.picture_seconds)} for its pictures"
+    return [
+        "",
+        f"cost on this machine ({cost.device})",
+        f"  substep         {cost.substep:.3g} s, {cost.substeps} a frame (stable up to {cost.stable_substep:.3g} s; "
+        f"waves of {cost.wave_speed:.3g} m/s)",
+        f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
+        f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
+        f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
+    ]
+
+
+def video_length(text: str) -> str:
+    """Length and picture of the video of a configuration, in words."""
+    import yaml
+
+    given = yaml.safe_load(text)
+    size = given["camera"]["init_args"]
+    return f"{given['frames'] * given['frame_dt']:.3g} s at {size['width']} x {size['height']}"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
+
+
+def _material(found: Suggestion) -> str:
+    what = "cloth" if found.sheet else "rubber"
+    return f"{what}, E = {found.youngs_modulus:.1e} Pa, {found.thickness:.2g} m thick: {found.stiffness_reason}"
+
+
+def _why(confidence: str, reason: str) -> str:
+    return "given" if confidence == "given" else f"confidence {confidence}: {reason}"
+
+
+def _short(region: dict[str, Any]) -> str:
+    return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)

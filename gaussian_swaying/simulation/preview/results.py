@@ -1,0 +1,67 @@
+"""The result of a preview, and its files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Everything that is found before anything is written.
+
+    Attributes:
+        report: Text for people.
+        data: The same as plain numbers, for preview.json.
+        picture: 8-bit RGB, shape (H, W, 3).
+        configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
+    """
+
+    report: str
+    data: dict[str, Any]
+    picture: np.ndarray
+    configurations: dict[str, str]
+
+
+def splat_name(path: str | Path) -> str:
+    """What a splat is called: its file, or the folder of a ``point_cloud.ply``, as trainings write it.
+
+    A folder ``iteration_30000`` and one called ``point_cloud``, as 3DGS makes them, are passed over.
+    """
+    file = Path(path)
+    if file.stem != "point_cloud":
+        return file.stem
+    folders = [part.name for part in file.resolve().parents]
+    passed = ("point_cloud", "iteration_")
+    return next((name for name in folders if name and not name.startswith(passed)), file.stem)
+
+
+def write(found: Preview, folder: Path) -> list[Path]:
+    """Write preview.json, preview.png and, if they were guessed, draft.yaml and starter.yaml.
+
+    A configuration that is there and differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ...: someone may
+    have edited it.
+
+    Returns:
+        The files.
+    """
+    import imageio.v3 as iio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [folder / "preview.json", folder / "preview.png"]
+    files[0].write_text(json.dumps(found.data, indent=1) + "\n", encoding="utf-8")
+    iio.imwrite(files[1], found.picture)
+    for name, text in found.configurations.items():
+        path = folder / f"{name}.yaml"
+        if path.exists() and path.read_text(encoding="utf-8") != text:
+            number = 1
+            while (folder / f"{name}.{number}.yaml").exists():
+                number += 1
+            path.rename(folder / f"{name}.{number}.yaml")
+        path.write_text(text, encoding="utf-8")
+        files.append(path)
+    return files

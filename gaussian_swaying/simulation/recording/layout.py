@@ -1,0 +1,49 @@
+"""Names of the files and folders of a run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from gaussian_swaying.gaussians.export import SUFFIXES
+
+FILES = [
+    "run.json",
+    "config.yaml",
+    "checkpoint.pt",
+    "trajectory.npz",
+    "summary.json",
+    "diagnostics.csv",
+    "animation.usdc",
+]
+# what a run writes, and so must not find in a folder that no run made
+OURS = [*FILES, "frames", "ply", "trajectory", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
+
+
+def frame_folder(render: str = "color", camera: str = "") -> str:
+    """Folder of a render's frames within that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
+
+    Args:
+        render: One of ``color``, ``depth``, ``normal`` and ``force``.
+        camera: Name of a further camera; empty for the one of the run.
+    """
+    own = "frames" if render == "color" else render
+    return f"cameras/{camera}/{own}" if camera else own
+
+
+def raw_folder(place: str) -> str:
+    """Folder of the numbers whose colours are in the folder ``place``."""
+    return f"{place}_raw"
+
+
+def video_file(place: str) -> str:
+    """The video of the frames in the folder ``place``: ``video.mp4`` of ``frames``, ``depth.mp4`` of ``depth`` ..."""
+    folder = Path(place)
+    return folder.with_name("video.mp4" if folder.name == "frames" else f"{folder.name}.mp4").as_posix()
+
+
+def check_camera_name(name: str) -> None:
+    """Raise ValueError unless a camera's name can be that of a folder on every system."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
+        raise ValueError(f"Expected a name of `cameras` to have letters, digits, - and _ only, but got {name!r}.")

@@ -1,0 +1,48 @@
+"""The check that the loss stays finite: a copy that nothing waits for, and the error."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class TrainingDiverged(RuntimeError):  # noqa: N818
+    """A loss or a Gaussian is not finite any more; the message names the step and the last good checkpoint.
+
+    Args:
+        step: Number of images trained on before the one that failed.
+        what: What is not finite.
+        checkpoint: Last checkpoint written before, if any.
+    """
+
+    def __init__(self, step: int, what: str, checkpoint: str | None = None) -> None:
+        self.step, self.checkpoint = step, checkpoint
+        kept = f"the last good checkpoint is {checkpoint}" if checkpoint else "there is no checkpoint yet"
+        super().__init__(
+            f"Training diverged at step {step}: {what} is not finite; {kept}. Remedy: lower the learning rates "
+            "(`model.rates`) or the weight of the loss that grew (`model.loss_weights`)."
+        )
+
+
+class PendingLoss:
+    """The last loss, on its way to the host, which does not wait for it."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.step: int | None = None
+        on_gpu = device.type == "cuda"
+        self._host = torch.zeros((), pin_memory=on_gpu)
+        self._arrived = torch.cuda.Event() if on_gpu else None
+
+    def send(self, step: int, loss: Tensor) -> None:
+        """Start the copy of the loss of a step to the host."""
+        self.step = step
+        self._host.copy_(loss, non_blocking=True)
+        if self._arrived is not None:
+            self._arrived.record()
+
+    def take(self) -> float:
+        """Wait for the loss and forget it."""
+        if self._arrived is not None:
+            self._arrived.synchronize()
+        self.step = None
+        return float(self._host)

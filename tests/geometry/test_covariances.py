@@ -1,0 +1,152 @@
+"""Covariances: from scales and quaternions and back, deformed, and limited in stretch."""
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.covariances import (
+    covariance,
+    covariance_to_quat_scale,
+    deform_covariance,
+    limit_deformed,
+    limit_stretch,
+)
+from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+
+
+def _unit(*shape, device="cpu", dtype=torch.float64):
+    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
+
+
+def _gradients(count, device="cpu", dtype=torch.float64):
+    """Deformation gradients of both orientations, none of them near singular."""
+    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
+    f = f[torch.linalg.det(f).abs() > 0.2]
+    assert len(f) > 4
+    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+    return f.to(device, dtype)
+
+
+def test_covariance_has_the_axes_and_scales(device, dtype):
+    quats, log_scales = torch.randn(9, 4, device=device, dtype=dtype), torch.randn(9, 3, device=device, dtype=dtype)
+    a, rotation = covariance(quats, log_scales), quat_to_rotation(quats)
+    torch.testing.assert_close(a, a.mT)
+    torch.testing.assert_close(a @ rotation, rotation * (2 * log_scales).exp()[:, None])
+
+
+def test_covariance_to_quat_scale_round_trip(device, dtype):
+    quats, log_scales = (
+        torch.randn(50, 4, device=device, dtype=dtype),
+        torch.randn(50, 3, device=device, dtype=dtype) - 3,
+    )
+    a = deform_covariance(_gradients(1000, device, dtype)[:50], covariance(quats, log_scales))
+    q, s = covariance_to_quat_scale(a)
+    assert (q.dtype, s.dtype) == (dtype, dtype)
+    torch.testing.assert_close(torch.linalg.det(quat_to_rotation(q)), torch.ones(50, device=device, dtype=dtype))
+    torch.testing.assert_close(covariance(q, s), a, rtol=1e-4, atol=1e-6)
+    assert (s.diff(dim=-1) >= 0).all()
+
+
+def test_covariance_to_quat_scale_of_singular_and_equal_axes():
+    singular = torch.diag_embed(torch.tensor([[0.0, 1.0, 4.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]))
+    q, s = covariance_to_quat_scale(singular)
+    assert torch.isfinite(q).all()
+    assert torch.isfinite(s).all()
+    assert (s.exp() > 0).all()
+    torch.testing.assert_close(covariance(q, s), singular)
+    again, _ = covariance_to_quat_scale(singular * (1 + 1e-6))
+    torch.testing.assert_close(again, q)
+
+
+def test_covariance_to_quat_scale_signs_follow_the_matrix():
+    """A small change of the matrix may not flip an axis: frames of an animation would flicker."""
+    a = covariance(_unit(100, 4), torch.tensor([0.0, -1.0, -2.0], dtype=torch.float64).expand(100, 3))
+    q0, _ = covariance_to_quat_scale(a)
+    q1, _ = covariance_to_quat_scale(a + 1e-9 * torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(q1, q0, rtol=0, atol=1e-6)
+
+
+def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
+    f, scales = _gradients(20, device, dtype)[:5], torch.randn(5, 3, device=device, dtype=dtype)
+    quats = torch.randn(5, 4, device=device, dtype=dtype)
+    axes = quat_to_rotation(quats) * scales.exp()[:, None]
+    mapped = f @ axes
+    torch.testing.assert_close(deform_covariance(f, covariance(quats, scales)), mapped @ mapped.mT)
+
+
+def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
+    """Those below it keep their bits; those above have that size, and stay proper covariances."""
+    rest = torch.diag(torch.tensor([4.0, 1.0, 0.01])).expand(6, 3, 3).to(device, dtype)
+    f = torch.eye(3).repeat(6, 1, 1).to(device, dtype)
+    f[1, 0, 0] = 1.5
+    f[2, 1, 0] = 3.0
+    f[3, 1, 0] = 1e4
+    f[4] = 50 * torch.eye(3)
+    f[5] = 0.0
+    covariances = deform_covariance(f, rest)
+    limited = limit_stretch(covariances, rest, 2.0)
+    assert torch.equal(limited[[0, 1, 5]], covariances[[0, 1, 5]])
+    size = limited.diagonal(dim1=-2, dim2=-1).sum(-1)
+    torch.testing.assert_close(size[2:5], 4 * rest.diagonal(dim1=-2, dim2=-1).sum(-1)[2:5])
+    torch.testing.assert_close(limited, limited.mT)
+    values = torch.linalg.eigvalsh(limited[2:5])
+    assert float(values.min()) > 0.5  # of a rest size of 5.01, shared by three directions: no needle
+    assert float(values[1, 2]) == pytest.approx(3 * 5.01 + 5.01 / 3, rel=1e-2)  # what is drawn out points as before
+    axis = torch.linalg.eigh(limited[3])[1][:, 2]
+    assert float(axis[1].abs()) > 0.999
+
+
+def test_the_limit_on_stretch_is_reached_without_a_jump():
+    rest = torch.eye(3, dtype=torch.float64)
+    close = [
+        limit_stretch(torch.diag(torch.tensor([a, 1.0, 1.0], dtype=torch.float64)), rest, 2.0)
+        for a in (10.0 - 1e-9, 10.0 + 1e-9)
+    ]
+    torch.testing.assert_close(close[0], close[1], rtol=0, atol=1e-7)
+
+
+def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
+    """A needle torn out a thousandfold stays a needle, turned with the material, where a grain becomes a ball."""
+    rest = torch.diag(torch.tensor([4.0, 1.0, 0.01])).expand(4, 3, 3).to(device, dtype)
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], device=device, dtype=dtype)
+    stretch = torch.tensor([[1.9, 1.0, 1.0], [1.0, 1e3, 1.0], [1.0, 1e3, 1.0], [3.0, 3.0, 3.0]]).to(rest)
+    f = turn * stretch[:, None, :]
+    drawn = deform_covariance(f, rest)
+    solid = torch.tensor([True, True, False, True], device=device)
+    kept = limit_deformed(f, drawn, rest, 2.0, solid)
+    assert torch.equal(kept[0], drawn[0])
+    assert torch.equal(limit_deformed(f, drawn, rest, 2.0, ~solid)[2], kept[1])
+    torch.testing.assert_close(limit_deformed(f, drawn, rest, 2.0, solid, polar_rotation(f)), kept)
+    size, size_at_rest = kept.diagonal(dim1=-2, dim2=-1).sum(-1), rest.diagonal(dim1=-2, dim2=-1).sum(-1)
+    torch.testing.assert_close(size[1:], 4 * size_at_rest[1:])
+    # turned, x and y change places; the thin axis stays thin, and what was torn out is 3 sizes long, not a thousand
+    own, grain = (kept[k].diagonal().cpu().double() for k in (1, 2))
+    torch.testing.assert_close(own, torch.tensor([3 * 5.01 + 1.0, 4.0, 0.01]).double(), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(grain, torch.tensor([3 * 5.01 + 1.67, 1.67, 1.67]).double(), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(kept[3], 4 * turn @ rest[3] @ turn.T, rtol=1e-5, atol=1e-6)
+    assert torch.equal(limit_deformed(f[:0], drawn[:0], rest[:0], 2.0, solid[:0]), drawn[:0])
+
+
+def test_gradcheck(device):
+    f = _gradients(20, device)[:4].requires_grad_()
+    a = covariance(_unit(4, 4, device=device), torch.randn(4, 3, device=device, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(deform_covariance, (f, a))
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda z: covariance(z(2, 4), z(2, 4)), "log_scales"),
+        (lambda z: covariance_to_quat_scale(z(2, 3)), "covariances"),
+        (lambda z: deform_covariance(z(2, 9), z(2, 3, 3)), "deformation_gradient"),
+        (lambda z: deform_covariance(z(2, 3, 3), z(2, 6)), "covariances"),
+        (lambda z: limit_stretch(z(2, 6), z(2, 3, 3), 2.0), "covariances"),
+        (lambda z: limit_stretch(z(2, 3, 3), z(2, 6), 2.0), "rest"),
+        (lambda z: limit_stretch(z(2, 3, 3), z(2, 3, 3), 2.0, z(2, 6)), "shape"),
+        (lambda z: limit_deformed(z(2, 3, 3), z(3, 3, 3), z(2, 3, 3), 2.0, z(2)), "covariances"),
+        (lambda z: limit_deformed(z(2, 3, 3), z(2, 3, 3), z(2, 3, 3), 2.0, z(3)), "solid"),
+    ],
+)
+def test_wrong_shapes_are_named(call, name):
+    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
+        call(torch.zeros)

@@ -1,0 +1,172 @@
+"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel."""
+
+import os
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry import patches
+from gaussian_swaying.geometry.covariances import deform_covariance
+from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.patches import deform_all, deform_area, deform_normal, deform_patch, smallest_axis_normal
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def _unit(*shape, device="cpu", dtype=torch.float64):
+    return torch.nn.functional.normalize(torch.randn(*shape, device=device, dtype=dtype), dim=-1)
+
+
+def _gradients(count, device="cpu", dtype=torch.float64):
+    """Deformation gradients of both orientations, none of them near singular."""
+    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
+    f = f[torch.linalg.det(f).abs() > 0.2]
+    assert len(f) > 4
+    f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+    return f.to(device, dtype)
+
+
+def test_deformed_normal_and_area_match_a_mapped_plane():
+    """Finite differences of x(u, v) on a curved map: the normal and the area of the image of the plane."""
+
+    def curved(x):
+        a, b, c = x.unbind(-1)
+        return torch.stack([a + 0.3 * torch.sin(2 * b) + 0.2 * c, b + 0.4 * a * a, c + 0.5 * torch.cos(a + b)], dim=-1)
+
+    points, step = torch.rand(30, 3, dtype=torch.float64), 1e-5
+    tangents = torch.linalg.qr(torch.randn(30, 3, 3, dtype=torch.float64))[0]
+    first, second = tangents[..., 0], tangents[..., 1]
+    normal = torch.linalg.cross(first, second)
+    shift = step * torch.eye(3, dtype=torch.float64)
+    f = torch.stack([(curved(points + e) - curved(points - e)) / (2 * step) for e in shift], dim=-1)
+    assert (torch.linalg.det(f) > 0).all()
+    mapped = [(curved(points + step * t) - curved(points - step * t)) / (2 * step) for t in (first, second)]
+    cross = torch.linalg.cross(*mapped)
+    torch.testing.assert_close(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), rtol=0, atol=1e-8)
+    area = torch.rand(30, dtype=torch.float64)
+    torch.testing.assert_close(deform_area(f, normal, area), cross.norm(dim=-1) * area, rtol=1e-7, atol=0)
+    both = deform_patch(f, normal, area)
+    assert torch.equal(both[0], deform_normal(f, normal))
+    assert torch.equal(both[1], deform_area(f, normal, area))
+
+
+def test_deformed_normal_matches_the_inverse(device, dtype):
+    """Reflections included: the sign is that of F^-T N."""
+    f = _gradients(40, device, dtype)
+    normal = _unit(len(f), 3, device=device, dtype=dtype)
+    expected = (torch.linalg.inv(f).mT @ normal[..., None]).squeeze(-1)
+    assert (torch.linalg.det(f) < 0).any()
+    torch.testing.assert_close(
+        deform_normal(f, normal), expected / expected.norm(dim=-1, keepdim=True), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_deformed_normal_of_singular_gradients(device, dtype):
+    up = UP.to(device, dtype)
+    flat = torch.diag(torch.tensor([2.0, 3.0, 0.0], device=device, dtype=dtype))  # the plane keeps its normal
+    line = torch.diag(torch.tensor([2.0, 0.0, 1.0], device=device, dtype=dtype))  # the plane becomes a line
+    tiny = 1e-12 * torch.eye(3, device=device, dtype=dtype)  # squares of cofactors underflow in float32
+    f = torch.stack([flat, line, torch.zeros_like(flat), tiny]).requires_grad_()
+    normal = deform_normal(f, up.expand(4, 3))
+    torch.testing.assert_close(normal.detach(), up.expand(4, 3))
+    normal.sum().backward()
+    assert torch.isfinite(f.grad).all()
+    assert deform_area(f.detach(), up.expand(4, 3), torch.ones(4, device=device, dtype=dtype))[:3].tolist() == [6, 0, 0]
+
+
+def test_everything_at_once_is_each_by_itself(device, dtype):
+    """On a GPU in one kernel, if triton is there: turned over, flattened and undeformed patches included."""
+    f = _gradients(60, device, dtype)
+    f[1] = torch.diag(torch.tensor([2.0, 3.0, 0.0]))
+    f[2] = 1e-12 * torch.eye(3)
+    f[3] = torch.eye(3)
+    f = f.mT.contiguous().mT  # any strides
+    factor = torch.randn(len(f), 3, 3, device=device, dtype=dtype)
+    rest, normal = factor @ factor.mT, _unit(len(f), 3, device=device, dtype=dtype)
+    normal[1] = UP.to(normal)
+    covariances, normals, rotations = deform_all(f, rest, normal)
+    torch.testing.assert_close(covariances, deform_covariance(f, rest))
+    torch.testing.assert_close(normals, deform_normal(f, normal), rtol=1e-4, atol=1e-5)
+    stretched = [k for k in range(len(f)) if k not in (1, 2)]
+    torch.testing.assert_close(rotations[stretched], polar_rotation(f)[stretched], rtol=0, atol=1e-5)
+    assert torch.isfinite(rotations).all()
+    assert torch.equal(covariances[3], rest[3])
+    *same, none = deform_all(f, rest, normal, rotations=False)
+    assert none is None
+    assert torch.equal(same[0], covariances)
+    assert torch.equal(same[1], normals)
+
+
+def test_the_kernel_keeps_to_the_limit_as_torch_does(device):
+    """In the interpreter too: far beyond the limit, a little, below, flat, empty, solids and grains."""
+    kernels = pytest.importorskip("gaussian_swaying.geometry.patches_triton")
+    if device.type == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
+        pytest.skip("on this machine the kernels are compiled")
+    count = 40
+    f = torch.eye(3).repeat(count, 1, 1) + 0.2 * torch.randn(count, 3, 3)
+    f[:20, 0, 1] += torch.logspace(-1, 2, 20)
+    f[20] = torch.diag(torch.tensor([9.0, 3.0, 0.0]))
+    f[21] = 0.0
+    factor = torch.randn(count, 3, 3)
+    rest = factor @ factor.mT
+    rest[22] = 0.0
+    normal, solid = _unit(count, 3, dtype=torch.float32), torch.arange(count) % 2 == 0
+    given = [part.to(device) for part in (f, rest, normal)]
+    for rotations in (True, False):
+        made = kernels.deform_all(*given, rotations, 1.5, solid.to(device))
+        drawn, _, turns = deform_all(*(part.double() for part in given), rotations, 1.5, solid.to(device))
+        torch.testing.assert_close(made[0].double(), drawn, rtol=1e-4, atol=1e-4)
+        assert (made[2] is None) == (turns is None)
+    free = kernels.deform_all(*given, False)[0]
+    torch.testing.assert_close(free, deform_covariance(*given[:2]))
+    changed = (free != made[0]).any(-1).any(-1)
+    assert 5 < int(changed.sum()) < 35
+
+
+@pytest.mark.gpu
+def test_the_kernel_is_the_one_that_is_asked(monkeypatch):
+    """Not with a gradient, nor in float64."""
+    pytest.importorskip("triton")
+    kernels, calls = patches._kernels(), []
+    assert kernels is not None
+    deform = kernels.deform_all
+    monkeypatch.setattr(kernels, "deform_all", lambda *a: calls.append(1) or deform(*a))
+    f = torch.eye(3, device="cuda").expand(4, 3, 3)
+    normal = torch.eye(3, device="cuda")[:1].expand(4, 3)
+    deform_all(f.double(), f.double(), normal.double())
+    deform_all(f.clone().requires_grad_(), f, normal)
+    assert calls == []
+    deform_all(f, f, normal)
+    with torch.no_grad():
+        deform_all(f.clone().requires_grad_(), f, normal)
+    assert calls == [1, 1]
+    assert deform_all(f[:0], f[:0], normal[:0])[2].shape == (0, 3, 3)
+
+
+def test_smallest_axis(device, dtype):
+    quats = _unit(3, 4, device=device, dtype=dtype)
+    log_scales = torch.tensor([[-9.0, 0, 1], [0, -9, 1], [1, 0, -9]], device=device, dtype=dtype)
+    rotation = quat_to_rotation(quats)
+    expected = torch.stack([rotation[0, :, 0], rotation[1, :, 1], rotation[2, :, 2]])
+    torch.testing.assert_close(smallest_axis_normal(quats, log_scales), expected)
+
+
+def test_gradcheck(device):
+    f = _gradients(20, device)[:4].requires_grad_()
+    normal = _unit(4, 3, device=device).requires_grad_()
+    area = torch.rand(4, device=device, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(deform_normal, (f, normal))
+    assert torch.autograd.gradcheck(deform_area, (f, normal, area))
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda z: deform_normal(z(2, 3, 3), z(2, 2)), "normals"),
+        (lambda z: deform_area(z(2, 3), z(2, 3), z(2)), "deformation_gradient"),
+    ],
+)
+def test_wrong_shapes_are_named(call, name):
+    with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
+        call(torch.zeros)

@@ -1,0 +1,183 @@
+"""The motion of a flag: settings, solving, and the file that holds it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from blender_cloth import solve_cloth
+from flag_reference import FlagPattern
+
+UNITS = {
+    "positions": "m",
+    "rest_normals": "1",
+    "uv": "1",
+    "pin_uv": "1",
+    "fps": "1/s",
+    "areal_density": "kg/m^2",
+    "membrane_stiffness": "N/m",
+    "bending_stiffness": "N m",
+    "youngs_modulus": "Pa",
+    "density": "kg/m^3",
+    "thickness": "m",
+    "gravity": "m/s^2",
+    "flow": "m/s",
+    "air_density": "kg/m^3",
+    "pressure": "Pa",
+    "damping": "1/s",
+}
+
+
+def settings_hash(settings: dict[str, Any]) -> str:
+    """Hash of settings that does not depend on their order."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
+    """Raise a ValueError that names each setting in which ``found``, of the output ``where``, is not as ``wanted``."""
+    wanted = json.loads(json.dumps(wanted))  # tuples become lists
+    changed = [
+        f"`{name}` was {found.get(name)!r} and is now {wanted.get(name)!r}"
+        for name in sorted(found.keys() | wanted.keys())
+        if found.get(name) != wanted.get(name)
+    ]
+    if changed:
+        raise ValueError(
+            f"{where} was made with other settings: {'; '.join(changed)}. Give another `--out`, the old settings, or "
+            "remove it."
+        )
+
+
+def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
+    """Let ``write`` fill a file beside ``path`` and then give it its name, so that no half-written file is left."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".partial-{path.name}")
+    write(partial)
+    os.replace(partial, path)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON, whole or not at all."""
+    write_whole(path, lambda partial: partial.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8"))
+
+
+@dataclass(frozen=True, eq=False)
+class Cloth:
+    """The motion of a flag.
+
+    Attributes:
+        positions: Vertices at each frame [m], float32, shape (F, V, 3).
+        faces: Squares as indices of vertices, their normals on the camera's side; shape (Q, 4).
+        uv: Place of each vertex on the flag, in 0 to 1, shape (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
+        columns: Faces along u.
+        rows: Faces along v.
+        settings: Fields of the :class:`FlagPattern` that rule the motion.
+    """
+
+    positions: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
+    columns: int
+    rows: int
+    settings: dict[str, Any]
+
+    def sample(self, uv: np.ndarray) -> np.ndarray:
+        """Points on the surface at each frame [m] at places (P, 2) of the flag, shape (F, P, 3); bilinear."""
+        i, s = _between(self.uv[:: self.rows + 1, 0], uv[:, 0])
+        j, t = _between(self.uv[: self.rows + 1, 1], uv[:, 1])
+        at = self.positions.reshape(len(self.positions), self.columns + 1, self.rows + 1, 3)
+        low = (1 - t) * at[:, i, j] + t * at[:, i, j + 1]
+        high = (1 - t) * at[:, i + 1, j] + t * at[:, i + 1, j + 1]
+        return (1 - s) * low + s * high
+
+
+def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The interval of ascending ``nodes`` that each place (P,) is in, and its share of that, float32, shape (P, 1)."""
+    low = np.searchsorted(nodes[1:-1], places, side="right")
+    return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
+
+
+def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
+    """Solve a flag and write its motion, unless the file is there already.
+
+    Args:
+        pattern: The flag.
+        path: The ``.npz`` to write, see :func:`read_cloth`.
+        report: Called after each frame.
+
+    Returns:
+        Whether it was solved.
+
+    Raises:
+        ImportError: If ``bpy`` is not there.
+        ValueError: If the file is there, but of other settings; or if ``quality`` is too low for the mesh.
+    """
+    settings = pattern.cloth_settings()
+    if path.exists():
+        check_settings(path, read_cloth(path).settings, settings)
+        return False
+    grid, material, run = pattern.grid(), pattern.material(), pattern.run()
+    uv = grid.uv()
+    rest, normals = pattern.rest(uv)
+    pins = pattern.pins(uv)
+    positions = solve_cloth(grid, rest, pins, material, run, report)
+    arrays: dict[str, Any] = {
+        "positions": positions,
+        "faces": grid.faces().astype(np.int32),
+        "uv": uv,
+        "columns": grid.columns,
+        "rows": grid.rows,
+        "rest_normals": normals,
+        "pins": pins,
+        "pin_uv": pattern.pin_uv(),
+        "fps": run.fps,
+        "areal_density": material.areal_density,
+        "membrane_stiffness": material.membrane,
+        "bending_stiffness": material.bending,
+        "youngs_modulus": pattern.youngs_modulus,
+        "poisson_ratio": pattern.poisson_ratio,
+        "density": pattern.density,
+        "thickness": pattern.thickness,
+        "gravity": np.array([0.0, 0.0, -pattern.gravity]),
+        "flow": np.array(run.flow),
+        "air_density": pattern.air_density,
+        "drag": pattern.drag,
+        "damping": pattern.damping,
+        "pressure": run.pressure,
+        "units": json.dumps(UNITS),
+        "settings": json.dumps(settings),
+        "hash": settings_hash(settings),
+    }
+
+    def write(partial: Path) -> None:
+        with partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    write_whole(path, write)
+    return True
+
+
+def read_cloth(path: str | os.PathLike[str]) -> Cloth:
+    """Read a motion.
+
+    Args:
+        path: The ``.npz``. Beside the fields of :class:`Cloth` it holds ``rest_normals``, ``pins`` (indices),
+            ``pin_uv`` (boxes), ``areal_density``, ``membrane_stiffness``, ``bending_stiffness``, ``gravity``, ``flow``
+            and more, with their ``units``, and the ``hash`` of ``settings``.
+
+    Raises:
+        ValueError: If it is no such file.
+    """
+    try:
+        with np.load(path) as data:
+            settings = json.loads(str(data["settings"]))
+            positions, faces, uv = (data[name] for name in ("positions", "faces", "uv"))
+            return Cloth(positions, faces, uv, int(data["columns"]), int(data["rows"]), settings)
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is not the motion of a flag ({error}): make it again.") from error

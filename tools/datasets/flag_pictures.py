@@ -1,0 +1,114 @@
+"""Textures, cameras and lamps of the flags."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from blender_images import View, look_at
+from flag_reference import FlagPattern
+
+_BANDS = ((0.83, 0.30, 0.18), (0.95, 0.92, 0.85), (0.13, 0.33, 0.55))
+
+_DISC, _WHITE = (0.93, 0.68, 0.20), 0.9
+
+
+def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
+    """Colours of a flag in 0 to 1, upper row first, shape (H, W, 3), float32.
+
+    ``white`` is plain, ``stripes`` has three bands and a disc, anything else is the path of an image.
+
+    Raises:
+        ValueError: If the image cannot be read.
+    """
+    if pattern.texture == "white":
+        return np.full((2, 2, 3), _WHITE, dtype=np.float32)
+    if pattern.texture != "stripes":
+        import imageio.v3 as iio
+
+        try:
+            image = iio.imread(pattern.texture)
+        except Exception as error:  # the readers of the formats raise what they like
+            raise ValueError(
+                f"Cannot read the texture {pattern.texture} ({error}): give white, stripes or an image."
+            ) from error
+        if image.dtype != np.uint8 or image.ndim != 3:
+            raise ValueError(f"The texture {pattern.texture} is not an image of 8 bits in colour: export it as such.")
+        return (image[..., :3] / 255).astype(np.float32)
+    height = max(2, round(width * pattern.height / pattern.width))
+    x = (np.arange(width) + 0.5) / width * pattern.width
+    z = (1 - (np.arange(height) + 0.5) / height)[:, None] * pattern.height
+    band = ((1 - z / pattern.height) * 3).astype(np.int64).clip(0, 2)
+    colors = np.array(_BANDS)[np.broadcast_to(band, (height, width))]
+    disc = np.hypot(x - 0.5 * pattern.width, z - 0.5 * pattern.height) < 0.2 * pattern.height
+    colors[disc] = _DISC
+    return colors.astype(np.float32)
+
+
+def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = math.radians(40.0)) -> list[View]:
+    """Cameras all around the flag at rest, spread evenly over a sphere on a golden spiral, upright in z.
+
+    Args:
+        pattern: The flag; each image holds all of it.
+        count: Number of cameras.
+        size: Width and height of their images [pixels].
+        angle: Field of view [radians].
+    """
+    radius = 1.1 * 0.5 * math.hypot(pattern.width, pattern.height, 2 * pattern.ripple) / math.sin(0.5 * angle)
+    index = np.arange(count) + 0.5
+    z = 1 - 2 * index / count
+    turn = math.pi * (1 + math.sqrt(5)) * index
+    flat = np.sqrt(1 - z * z)
+    rays = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], -1)
+    center = pattern.center()
+    return [View(look_at(center + radius * ray, center), angle, size, size) for ray in rays]
+
+
+def reference_view(
+    pattern: FlagPattern, positions: np.ndarray, width: int, height: int, angle: float = math.radians(40.0)
+) -> View:
+    """The camera of the reference video: it looks along the initial normal and holds the whole motion.
+
+    Args:
+        pattern: The flag.
+        positions: The motion [m], shape (F, V, 3).
+        width: Of the image [pixels].
+        height: Of the image [pixels].
+        angle: Horizontal field of view [radians].
+    """
+    normal = pattern.normal()
+    frame = look_at(pattern.center() + normal, pattern.center())[:3, :3]
+    seen = positions.reshape(-1, 3).astype(np.float64) @ frame  # right, up, towards the camera
+    middle = 0.5 * (seen.min(0) + seen.max(0))
+    tangent = math.tan(0.5 * angle) * np.array([1.0, height / width]) / 1.08  # 4 % of margin on each side
+    middle[2] = max((np.abs(seen[:, k] - middle[k]) / tangent[k] + seen[:, 2]).max() for k in (0, 1))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = frame, frame @ middle
+    return View(pose, angle, width, height)
+
+
+def lamp_position(pattern: FlagPattern, side: int = 1) -> np.ndarray:
+    """Where the area light stands [m]: on the initial normal, six flag lengths away; ``side`` -1 mirrors it."""
+    return pattern.center() + side * 6.0 * pattern.longer_side * pattern.normal()
+
+
+def frame_order(count: int, stride: int = 10) -> list[int]:
+    """Frames in the order in which they are made: every ``stride``-th first, so that a part shows the whole."""
+    return sorted(range(count), key=lambda frame: (frame % stride != 0, frame))
+
+
+def transforms_fields(views: list[View], names: list[str]) -> dict[str, Any]:
+    """The fields of a ``transforms.json`` for cameras that differ in pose alone."""
+    view = views[0]
+    frames = [{"file_path": name, "transform_matrix": v.pose.tolist()} for v, name in zip(views, names, strict=True)]
+    return {
+        "camera_angle_x": view.angle_x,
+        "fl_x": view.focal,
+        "fl_y": view.focal,
+        "cx": 0.5 * view.width,
+        "cy": 0.5 * view.height,
+        "w": view.width,
+        "h": view.height,
+        "frames": frames,
+    }
