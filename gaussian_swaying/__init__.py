@@ -168,7 +168,6 @@ _HOMES = {
     ),
     "rendering.torch_renderer": ("TorchRenderer",),
     "simulation.diagnostics": (
-        "Simulation",
         "SimulationDiverged",
         "TearingGauge",
     ),

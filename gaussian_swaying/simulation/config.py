@@ -6,6 +6,7 @@ import inspect
 import os
 import sys
 from argparse import SUPPRESS, Action, ArgumentError
+from collections.abc import Mapping
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
@@ -174,3 +175,11 @@ def config_text(parser: ArgumentParser, settings: Namespace) -> str:
     for name in RUN_ONLY:
         kept.pop(name, None)
     return str(parser.dump(kept, skip_validation=True))
+
+
+def note_changes(changes: Mapping[str, Any]) -> str:
+    """What took the place of the settings of a file, as YAML, so that a run in other settings is not continued."""
+    import yaml
+
+    noted = {"changed_in_python": {name: repr(value) for name, value in sorted(changes.items())}}
+    return yaml.safe_dump(noted) if changes else ""

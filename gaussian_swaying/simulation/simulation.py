@@ -27,7 +27,14 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.config import arguments_of, build_parser, check_settings, config_text, parse_file
+from gaussian_swaying.simulation.config import (
+    arguments_of,
+    build_parser,
+    check_settings,
+    config_text,
+    note_changes,
+    parse_file,
+)
 from gaussian_swaying.simulation.defaults import (
     DeviceLike,
     SceneLike,
@@ -199,7 +206,7 @@ class Simulation(nn.Module):
         check_settings(cls, settings)
         text, parts = config_text(parser, settings), parser.instantiate(settings)
         simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)
-        simulation.config = text + "".join(f"# changed in Python: {k} = {v!r}\n" for k, v in changes.items())
+        simulation.config = text + note_changes(changes)
         return simulation
 
     # ---- parts

@@ -10,7 +10,9 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation import progress as progress_module
 from gaussian_swaying.simulation import simulation as simulation_module
+from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.progress import RunProgress
+from gaussian_swaying.simulation.run import MAX_LOOKS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
 SMALL = ["--config", str(FLAG), "--device", "cpu", "--scene.generator.init_args.spacing", "0.1"]
@@ -138,14 +140,14 @@ def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monk
 def test_the_cameras_of_a_billion_frames(tmp_path, monkeypatch):
     """Some of them are looked at, with the first and the last."""
     seen = []
-    monkeypatch.setattr(simulation_module.Simulation, "check_camera", lambda self, frame: seen.append(frame))
+    monkeypatch.setattr(Painter, "check_camera", lambda self, frame: seen.append(frame))
 
     def stop(self):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(simulation_module.Simulation, "start", stop)
     assert main([*SMALL, "--frames", "1000000000", "--output", str(tmp_path / "run")]) == 130
-    assert len(seen) == simulation_module.MAX_LOOKS
+    assert len(seen) == MAX_LOOKS
     assert (seen[0], seen[-1]) == (0, 999_999_999)
     seen.clear()
     assert main([*SMALL, "--frames", "7", "--output", str(tmp_path / "run")]) == 130

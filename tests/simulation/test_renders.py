@@ -102,7 +102,7 @@ def test_the_force_is_that_of_the_wind(make_simulation):
     torch.testing.assert_close(pressure, torch.full_like(pressure, 0.5 * 1.225 * 16 * 0.5))
     assert simulation.force_scale() == pytest.approx(float(pressure[0]))
     camera = simulation.painter.camera_at(0)
-    picture = simulation.draw_force(state, simulation.scene.rest(), camera, 2 * float(pressure[0]))
+    picture = simulation.painter.draw_pressure(pressure, simulation.scene.rest(), camera, 2 * float(pressure[0]))
     covered = picture.any(-1)
     assert bool(covered.any())
     expected = colormap(torch.tensor(0.5)).expand_as(picture[covered])
@@ -145,7 +145,7 @@ def test_bad_names_and_renders(make_cloud, make_simulation):
         make_simulation(make_cloud(), pinned=False), near=OrbitCamera(width=8, height=8, radius=0.01, elevation=0.1)
     )
     with pytest.raises(ValueError, match=r"lies inside the object.*`cameras\.near\.init_args\.radius`"):
-        inside.check_camera(0)
+        inside.painter.check_camera(0)
     for renders, word in ((["colour"], "recorder.renders"), ([], "list of different ones"), ("color", "list")):
         with pytest.raises(ValueError, match=word):
             Recorder(renders=renders)

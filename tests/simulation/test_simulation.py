@@ -264,11 +264,11 @@ def test_a_camera_inside_the_object_is_an_error(make_cloud, make_simulation):
         make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 0.5], target=[2.0, 0.5, 0.5])
     )
     with pytest.raises(ValueError, match=r"camera at \[0.5, 0.5, 0.5\] lies inside the object"):
-        inside.check_camera(0)
+        inside.painter.check_camera(0)
     outside = make_simulation(
         make_cloud(), pinned=False, camera=LookAtCamera(eye=[0.5, 0.5, 3.0], target=[0.5, 0.4, 0.5])
     )
-    outside.check_camera(0)
+    outside.painter.check_camera(0)
 
 
 # ---- colours

@@ -36,7 +36,7 @@ def _scene(gaussians="shell", material=None, dtype=torch.float32, generator=None
 
 
 def _simulation(material=None, solver=None, **scene):
-    settings = {"generator": SolidScene(**SETTINGS), "filling": FILLING, **scene}
+    settings = {"generator": SolidScene(**SETTINGS, gaussians="shell"), "filling": FILLING, **scene}
     return Simulation(
         Scene(**settings),
         material or Material(density=200.0),

@@ -26,6 +26,7 @@ from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera, 
 from gaussian_swaying.simulation.physgaussian.convert import convert
 from gaussian_swaying.simulation.physgaussian.space import Normalisation, heading, rotation_matrix
 from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
+from gaussian_swaying.simulation.simulation import Simulation
 
 TOOL = Path(__file__).parents[3] / "tools/convert_physgaussian.py"
 PAGE = Path(__file__).parents[3] / "docs/physgaussian.md"

@@ -92,7 +92,9 @@ def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, mo
 
 
 def test_files_of_a_run(make_simulation, tmp_path):
-    _run(make_simulation(), tmp_path / "run", recorder=Recorder(ply_every=2), config="frames: 3\n")
+    simulation = make_simulation()
+    simulation.config = "frames: 3\n"
+    _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=2))
     assert _names(tmp_path / "run") == [
         "checkpoint.pt",
         "config.yaml",

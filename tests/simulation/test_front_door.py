@@ -1,0 +1,288 @@
+"""Simulation as users meet it in Python and in a YAML: short forms, frames, what is given twice, custom forces."""
+
+import dataclasses
+import inspect
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying import (
+    AeroForce,
+    Box,
+    Edit,
+    Force,
+    Frame,
+    GaussianCloud,
+    Material,
+    MPMSolver,
+    PinnedRegion,
+    Recorder,
+    Scene,
+    Simulation,
+    SpatialWind,
+    WindField,
+    load_trajectory,
+    write_ply,
+)
+from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.simulation.config import PYTHON_ONLY, arguments_of
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "python.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE, flags=re.DOTALL)
+POLE = Box([None, None, None], [0.11, None, None])
+SMALL = {"hold": POLE, "material": Material(E=3e3, density=30.0), "wind": [6.0, 1.5, 0.0], "device": "cpu"}
+
+
+def _flag(**changes):
+    return Simulation(FlagScene(spacing=0.1), **(SMALL | changes))
+
+
+# ---- Python
+
+
+@pytest.mark.parametrize(("example", "output"), EXAMPLES, ids=["three lines", "by hand", "wind", "forces", "batches"])
+def test_examples_of_the_page_print_what_it_shows(example, output, capsys):
+    exec(compile(example, "docs/python.md", "exec"), {})
+    printed, number = capsys.readouterr().out, r"[+-]?\d+\.\d+"
+    assert re.sub(number, "#", printed) == re.sub(number, "#", output)
+    for found, expected in zip(re.findall(number, printed), re.findall(number, output), strict=True):
+        digit = 10.0 ** -len(expected.split(".")[1])
+        assert float(found) == pytest.approx(float(expected), rel=0.02, abs=1.01 * digit)
+
+
+def test_the_page_has_an_example_for_each_heading():
+    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 5
+
+
+def test_a_file_its_gaussians_and_what_made_them_are_the_same(tmp_path):
+    source = FlagScene(spacing=0.1)
+    write_ply(tmp_path / "flag.ply", source.generate())
+    ends = []
+    for scene in (source, source.generate(), tmp_path / "flag.ply", str(tmp_path / "flag.ply")):
+        *_, last = Simulation(scene, **SMALL).frames(3)
+        ends.append(last.state.position)
+    assert isinstance(source.generate(), GaussianCloud)
+    assert all(torch.equal(end, ends[0]) for end in ends)
+    assert float((ends[0] - _flag().start().position).abs().max()) > 1e-3
+
+
+def test_a_frame_has_what_its_state_says():
+    simulation = _flag()
+    frames = list(simulation.frames(3))
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert [frame.time for frame in frames] == pytest.approx([0.0, 0.04, 0.08])
+    last = frames[-1]
+    assert isinstance(last, Frame)
+    expected = simulation.scene.deformed(last.state)
+    for name in ("means", "covariances", "normals"):
+        assert torch.equal(getattr(last.gaussians, name), getattr(expected, name))
+    camera = simulation.painter.camera_at(2)
+    assert torch.equal(last.gaussians.colors, simulation.painter.colors(expected, camera))
+    assert torch.equal(last.render().color, simulation.painter.render(last.state, 2).color)
+    assert last.health.kinetic > 0
+
+
+def test_nothing_is_drawn_before_it_is_asked_for(monkeypatch):
+    simulation = _flag()
+    monkeypatch.setattr(type(simulation.painter), "colors", lambda *_: pytest.fail("a frame was shaded"))
+    monkeypatch.setattr(type(simulation.painter), "deformed", lambda *_: pytest.fail("a frame was deformed"))
+    assert len(list(simulation.frames(2))) == 2
+
+
+def test_frames_are_those_of_a_run(tmp_path):
+    """Also with an edit between two frames, and a second time from the same object."""
+    edits = [Edit(time=0.08, E=3e4, color=[1.0, 0.0, 0.0]), Edit(time=0.04, density=60.0)]
+    simulation = _flag(edits=edits)
+    simulation.run(tmp_path / "run", 5, progress=False, recorder=Recorder(images=False, video=False))
+    for _ in range(2):
+        for frame in simulation.frames(5):
+            position, F = load_trajectory(tmp_path / "run/trajectory.npz", frame.index)
+            assert torch.equal(frame.state.position, position)
+            torch.testing.assert_close(F.float(), frame.state.F_total, rtol=0, atol=2e-3)  # kept as float16
+        assert float(simulation.solver.points.youngs_modulus[0]) == 3e4
+    *_, plain = _flag().frames(5)
+    assert not torch.equal(plain.state.position, frame.state.position)
+
+
+def test_another_wind_holds_from_the_next_frame_on():
+    """The same as a run in that wind from the state in which it was assigned."""
+    simulation, ends = _flag(), []
+    for frame in simulation.frames(4):
+        if frame.index == 1:
+            simulation.wind, middle = WindField([0.0, -8.0, 0.0]), frame.state
+    other = _flag(wind=[0.0, -8.0, 0.0])
+    other.start()
+    for _ in range(2):
+        middle, _ = other.advance(middle)
+    assert torch.equal(middle.position, frame.state.position)
+    for aero in (AeroForce(C_D=0.0, C_F=0.0, C_L=0.0), AeroForce()):  # without effect, and with it again
+        simulation.aero = aero
+        ends.append(len(simulation.forces))
+    assert ends == [0, 1]
+
+
+class Shear(SpatialWind):
+    def forward(self, time, position):
+        return position * position.new_tensor([0.0, 5.0, 0.0])
+
+
+def test_a_wind_that_depends_on_the_place():
+    simulation = _flag(wind=Shear())
+    assert float(simulation.wind_pressure(simulation.start()).max()) >= 0
+    *_, last = simulation.frames(3)
+    assert float((last.state.position - simulation.scene.points.position).abs().max()) > 1e-4
+
+
+def test_gradients_reach_the_wind():
+    wind = WindField([6.0, 1.5, 0.0])
+    wind.flows.requires_grad_()
+    simulation = _flag(wind=wind)
+    state, _ = simulation.advance(simulation.start())
+    state.position[:, 1].mean().backward()
+    assert float(wind.flows.grad[0, 1]) > 0
+
+
+# ---- nothing is said twice
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"up": [0, 0, 1], "scene": Scene(generator=FlagScene(spacing=0.1))}, r"`up` .*Scene\(\.\.\., up=\.\.\.\)"),
+        ({"hold": POLE, "solver": MPMSolver(dx=0.2)}, r"`hold` .*`boundaries` of the solver"),
+        ({"wind": [1.0, 2.0]}, "`wind`.*3"),
+        ({"up": [0, 1]}, "`up`"),
+        ({"background": [0, 0, 255]}, "`background` within"),
+        ({"device": "cuda:7"}, "cuda"),
+    ],
+)
+def test_what_is_wrong_or_said_twice_is_refused(given, words):
+    if "device" in given and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    kept = {} if "solver" in given or "scene" in given else {"hold": POLE}
+    given = {"scene": FlagScene(spacing=0.1), "device": "cpu"} | kept | given
+    with pytest.raises((ValueError, TypeError), match=words):
+        Simulation(**given)
+
+
+def test_the_grid_is_that_of_the_solver_everywhere():
+    """`dx` decides volumes of cells and points of the grid too: one number."""
+    scene = Scene(generator=FlagScene(spacing=0.05), sampling="grid")
+    counts = []
+    for dx in (0.1, 0.2):
+        solver = MPMSolver(dx=dx, boundaries=[PinnedRegion(POLE)])
+        simulation = Simulation(scene, Material(volume="cell"), solver, device="cpu")
+        counts.append(simulation.scene.points.count)
+        cell = torch.unique(torch.floor(simulation.scene.points.position / dx).long(), dim=0)
+        assert float(simulation.scene.points.volume.sum()) == pytest.approx(len(cell) * dx**3, rel=1e-5)
+    assert counts[0] > counts[1]
+
+
+# ---- the YAML
+
+YAML = """
+scene:
+  generator: {class_path: FlagScene, init_args: {spacing: 0.1}}
+material: {E: 3.0e+3, density: 30.0}
+solver:
+  dx: 0.2
+  boundaries:
+    - class_path: PinnedRegion
+      init_args: {region: {class_path: Box, init_args: {min: [null, null, null], max: [0.11, null, null]}}}
+wind: {flow: [6.0, 1.5, 0.0]}
+device: cpu
+"""
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text(YAML)
+    return path
+
+
+def test_the_constructor_is_the_schema():
+    """Each argument is an option, and there is no option besides those of the command line."""
+    parser = Simulation.parser()
+    options = {name.split(".")[0] for name in parser.get_defaults().keys(branches=True)}
+    names = set(arguments_of(Simulation))
+    assert options - names == {"config", "output", "frames", "resume"}
+    assert names - options == set()
+    assert set(inspect.signature(Simulation).parameters) - names == set(PYTHON_ONLY)
+
+
+def test_a_file_and_what_takes_the_place_of_it(config, tmp_path):
+    plain, changed = Simulation.from_yaml(config), Simulation.from_yaml(config, wind=[0, 9, 0], frame_dt=0.02)
+    assert plain.wind.flows.tolist() == [[6.0, 1.5, 0.0]]
+    assert changed.wind.flows.tolist() == [[0.0, 9.0, 0.0]]
+    assert (plain.frame_dt, changed.frame_dt) == (0.04, 0.02)
+    assert changed.config == plain.config + "changed_in_python:\n  frame_dt: '0.02'\n  wind: '[0, 9, 0]'\n"
+    changed.run(tmp_path / "run", 2, progress=False, recorder=Recorder(images=False, video=False))
+    assert (tmp_path / "run/config.yaml").read_text() == changed.config
+    with pytest.raises(ValueError, match=r"The configuration differs .*changed_in_python"):
+        plain.run(tmp_path / "run", 3, resume=True, progress=False, recorder=Recorder(images=False, video=False))
+    with pytest.raises(TypeError, match="windd"):
+        Simulation.from_yaml(config, windd=[0, 9, 0])
+
+
+@pytest.mark.parametrize(
+    ("line", "words"), [("wind: {flwo: [1, 0, 0]}", "flwo"), ("frames: 0", "`frames`"), ("wind: 3", "wind")]
+)
+def test_a_file_that_is_wrong(config, line, words):
+    config.write_text(re.sub(rf"(?m)^{line.split(':')[0]}:.*\n", "", YAML) + line + "\n")
+    with pytest.raises(ValueError, match=words):
+        Simulation.from_yaml(config)
+
+
+FORCES = '''
+import torch
+from gaussian_swaying import Force
+
+
+class Pull(Force):
+    """Towards a place given in scene units."""
+
+    recordable = True
+
+    def __init__(self, target: list[float], strength: float = 1.0) -> None:
+        super().__init__()
+        self.register_buffer("target", torch.tensor(target))
+        self.strength = strength
+
+    def in_frame(self, frame):
+        return Pull(frame.point_to_sim(self.target.double()).tolist(), self.strength)
+
+    def forward(self, state):
+        return self.strength * (self.target.to(state.position) - state.position)
+'''
+
+
+def test_a_force_of_another_package_by_its_class_path(config, tmp_path, monkeypatch):
+    (tmp_path / "my_forces.py").write_text(FORCES)
+    monkeypatch.syspath_prepend(tmp_path)
+    given = "forces:\n  - class_path: my_forces.Pull\n    init_args: {target: [1.0, 3.0, 0.5], strength: 0.2}\n"
+    config.write_text(YAML.replace("device:", given + "device:"))
+    simulation = Simulation.from_yaml(config, wind=[0, 0, 0], aero=AeroForce(C_D=0.0, C_F=0.0, C_L=0.0))
+    (force,) = simulation.forces
+    assert isinstance(force, Force)
+    place = simulation.scene.frame.point_to_sim(torch.tensor([1.0, 3.0, 0.5], dtype=torch.float64))
+    torch.testing.assert_close(force.target.double(), place, rtol=0, atol=1e-6)
+    *_, last = simulation.frames(4)
+    assert float((last.state.position - simulation.scene.points.position)[:, 1].mean()) > 1e-3
+    *_, still = Simulation.from_yaml(config, forces=[], wind=[0, 0, 0]).frames(4)
+    assert float((still.state.position - simulation.scene.points.position)[:, 1].mean().abs()) < 1e-3
+    # the same list, in Python
+    own = sys.modules["my_forces"].Pull([1.0, 3.0, 0.5], 0.2)
+    *_, same = Simulation.from_yaml(config, forces=[own], wind=[0, 0, 0], aero=simulation.aero).frames(4)
+    assert torch.equal(same.state.position, last.state.position)
+
+
+def test_settings_are_not_changed_by_a_simulation():
+    material, scene = Material(E=3e3), Scene(generator=FlagScene(spacing=0.1))
+    before = dataclasses.asdict(material), vars(scene).copy()
+    Simulation(scene, material, device="cpu").start()
+    assert (dataclasses.asdict(material), vars(scene)) == before
