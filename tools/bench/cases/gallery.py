@@ -31,8 +31,8 @@ SCENES = {
     "flag2": "Flag, pattern 2",
     "flag3": "Flag, pattern 3",
     "solid_surface_wind": "Solid, wind on its surface",
-    "solid_all_wind": "Solid, wind on all of it",
-    "sand_to_foam": "Sand made white foam",
+    "solid_all_wind": "Solid, wind on all Gaussians",
+    "sand_to_foam": "Sand turned into white foam",
 }
 """File below configs/sim, without its ending, and title."""
 
@@ -153,8 +153,8 @@ def page(recorded: list[Row]) -> list[str]:
         stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
         lines += [f"{result['device']}; {stack}; seed {result['seed']}.", ""]
         lines += [
-            "| scene | particles | formulation | frames | substeps a frame | time a frame [ms] | process [s] | "
-            "host memory [GiB] | device memory [GiB] | displacement / size | whole |",
+            "| scene | particles | formulation | frames | substeps per frame | time per frame [ms] | whole process [s] | "
+            "host memory [GiB] | device memory [GiB] | displacement / size | OK |",
             "|" + "---|" * 11,
         ]
         for name, title in SCENES.items():
@@ -178,7 +178,7 @@ def page(recorded: list[Row]) -> list[str]:
         lines += [""]
         if any("failed" not in row and not of_today(name, row) for name, row in result["scenes"].items()):
             lines += [
-                "\\* Recorded before a configuration file of this scene was changed, or before that was noted.",
+                "\\* Recorded before a configuration file of this scene changed, or before the record noted its configuration.",
                 "",
             ]
     return lines

@@ -47,10 +47,10 @@ def _weights(**weights: float) -> list[str]:
 
 FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
     "surface": ("all surface losses, paper's weights", []),
-    "consistent": ("initial points where the photos agree", [*_weights(**_NO_SURFACE), *_CONSISTENT]),
+    "consistent": ("initial points from photo-consistency", [*_weights(**_NO_SURFACE), *_CONSISTENT]),
     "mcmc": ("MCMC, 300,000 Gaussians", [*_weights(**_NO_SURFACE), *_MCMC]),
     "mcmc_consistent": (
-        "MCMC, 300,000 Gaussians, points where the photos agree",
+        "MCMC, 300,000 Gaussians, points from photo-consistency",
         [*_weights(**_NO_SURFACE), *_MCMC, *_CONSISTENT],
     ),
     "absgrad": (
@@ -63,7 +63,7 @@ FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
         ],
     ),
     "schedule": (
-        "densification until step 4,000, a harmonic degree every 500",
+        "densification until step 4,000, one more harmonic degree every 500",
         [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000", "--model.sh_every=500"],
     ),
     "degree_1": ("harmonics of degree 1", [*_weights(**_NO_SURFACE), "--model.sh_degree=1"]),
@@ -73,7 +73,7 @@ FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
 _ALL_SURFACE = {"anisotropy": 10.0, "entropy": 0.01, "size": 0.01}
 
 FLAG_ROWS: dict[str, tuple[str, dict[str, float]]] = {
-    "none": ("photometric alone", _NO_SURFACE),
+    "none": ("photometric only", _NO_SURFACE),
     "anisotropy": ("+ anisotropy", _NO_SURFACE | {"anisotropy": 10.0}),
     "entropy": ("+ entropy", _NO_SURFACE | {"anisotropy": 10.0, "entropy": 0.01}),
     "size": ("+ size (all)", _ALL_SURFACE),

@@ -67,7 +67,7 @@ def _convergence(rows: list[Row], problem: str, columns: dict[str, str], **param
 
 
 _LOSS = {"loss": "amplitude lost per period"}
-_SHIFT = {"end_shift": "the pin seems further out by [cells]"}
+_SHIFT = {"end_shift": "apparent outward shift of the pin [cells]"}
 
 CONVERGENCE: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
     "accuracy.free_bar": ("vibrating bar", _LOSS, {"ends": "free"}),
@@ -87,9 +87,9 @@ for _name, (_problem, _columns, _parameters) in CONVERGENCE.items():
 def free_block(rows: list[Row]) -> list[str]:
     """Energy and momenta of the block that nothing holds."""
     names = {
-        "kept": "energy at the end, of the start",
+        "kept": "final / initial energy",
         "error": "largest change",
-        "growth": "largest rise of a single state",
+        "growth": "largest rise of any single state",
         "linear": "change of linear momentum",
         "angular": "change of angular momentum",
         "substeps": "substeps",
@@ -144,9 +144,9 @@ def cantilever(rows: list[Row]) -> list[str]:
     names = {
         "drop": "drop / L",
         "error": "error of the drop",
-        "shear": "of that, shear",
-        "quadrature": "of that, quadrature",
-        "unexplained": "left over",
+        "shear": "part from shear",
+        "quadrature": "part from quadrature",
+        "unexplained": "unexplained part",
         "shortening_error": "error of the shortening",
     }
     return grid(
@@ -185,7 +185,7 @@ def sand_angles(rows: list[Row]) -> list[str]:
         angles = [f"{result['friction_deg']:.2f}", f"{result['exact']:.2f}"]
         shown += [["a layer that slides down an incline, from its acceleration", *angles]]
         shown += [["a layer on an incline: steepest on which it stands", f"{result['stands']:.0f}", "-"]]
-        shown += [["a layer on an incline: least on which it flows", f"{result['flows']:.0f}", "-"]]
+        shown += [["a layer on an incline: least steep on which it flows", f"{result['flows']:.0f}", "-"]]
     return grid(["test, phi = 30 degrees", "angle [deg]", "theory [deg]"], shown)
 
 
@@ -213,7 +213,7 @@ def sand_columns(rows: list[Row]) -> list[str]:
         "lajeunesse": "Lajeunesse",
         "height": "height / L0",
         "slope_deg": "slope [deg]",
-        "volume_ratio": "volume after / before",
+        "volume_ratio": "final / initial volume",
         "particles": "particles",
     }
     return grid(

@@ -32,9 +32,9 @@ def _psnr(row: Row | None) -> str:
 
 _GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB and share of the distance, against PhysGaussian's way
 _OTHER = {  # variants of the reference that are other flags, or on a mesh too coarse to count
-    "half the cells": "on half as many cells along a side",
+    "half the cells": "with half as many cells along a side",
     "hardly bending": "on that mesh, with a fiftieth of its bending stiffness",
-    "self-contact": "on that mesh, keeping away from itself",
+    "self-contact": "on that mesh, with self-contact",
 }
 _SHARE = 0.03  # of the longer side, that Chamfer distances are to stay within
 
@@ -69,17 +69,17 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
             found.append((goal, f"{ratio:.2f} times", ratio <= factor))
             if "psnr_db" in ours["mean"] and "psnr_db" in other["mean"]:
                 gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
-                goal = f"pattern {pattern}: PSNR {decibels:+g} dB against PhysGaussian's way"
+                goal = f"pattern {pattern}: PSNR {decibels:+g} dB over PhysGaussian's way"
                 found.append((goal, f"{gain:+.2f} dB", gain >= decibels))
         other = _complete(rows, "no_surface", pattern)
         if other is not None:
             ratio = other["chamfer_share"] / share
-            goal = f"pattern {pattern}: without surface modelling at least twice the Chamfer distance"
+            goal = f"pattern {pattern}: Chamfer distance at least twice as large without surface modelling"
             found.append((goal, f"{ratio:.2f} times", ratio >= 2))
         other = _complete(rows, "no_shading", pattern)
         if other is not None and "psnr_db" in ours["mean"]:
             gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
-            found.append((f"pattern {pattern}: without shading a lower PSNR", f"{-gain:+.2f} dB", gain > 0))
+            found.append((f"pattern {pattern}: lower PSNR without shading", f"{-gain:+.2f} dB", gain > 0))
     return found
 
 
@@ -95,7 +95,7 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
     if third:
         parts = [distances[:third], distances[third : 2 * third], distances[2 * third :]]
         told = ", ".join(f"{100 * sum(part) / len(part) / longer:.2f} %" for part in parts)
-        lines.append(f"- pattern {pattern}, distance in the three thirds of the run: {told}")
+        lines.append(f"- pattern {pattern}, distance in each third of the run: {told}")
     changes = {
         VARIANTS[name].title: row["chamfer_share"] - ours["chamfer_share"]
         for name in rows
@@ -104,7 +104,7 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
     if changes:
         order = sorted(changes, key=lambda name: changes[name])
         told = "; ".join(f"{name} {100 * changes[name]:+.2f}" for name in order)
-        lines.append(f"- pattern {pattern}, change of the distance [% of the longer side] by one thing: {told}")
+        lines.append(f"- pattern {pattern}, effect of a single change on the distance [% of the longer side]: {told}")
     return lines
 
 
@@ -112,7 +112,7 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
 def device(result: Row) -> list[str]:
     """What the runs were made with, and what is to be known of them."""
     lines = [f"Splats {result['splats']}; {source(result)}"]
-    lines += [f"Further options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
+    lines += [f"Other options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
     return [*lines, result["note"]] if result.get("note") else lines
 
 
@@ -157,7 +157,7 @@ def costs(result: Row) -> list[str]:
         for pattern, row in sorted(result["rows"].get(name, {}).items())
         if "substeps" in row
     ]
-    return grid(["", "particles", "substeps", "time a frame [ms]", "device memory [GiB]"], shown)
+    return grid(["", "particles", "substeps", "time per frame [ms]", "device memory [GiB]"], shown)
 
 
 @table(PAGE, "flags.reference", "flags_*", together=True)

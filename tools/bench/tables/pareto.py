@@ -29,8 +29,8 @@ def device(result: Row) -> list[str]:
 @table(PAGE, "pareto.cheapest", "pareto_*")
 def cheapest(result: Row) -> list[str]:
     """For each problem and accuracy the cheapest proven setting, and where the default stands."""
-    head = ["problem", "size", "cheapest proven setting that is as accurate as the default", "error"]
-    head += ["default's error", "its time [s/s]", "default's", "default on the front of the proven", "of all"]
+    head = ["problem", "size", "cheapest proven setting at least as accurate as the default", "error"]
+    head += ["default's error", "its time [s/s]", "default's time [s/s]", "default on the front of proven settings", "of all settings"]
     rows = []
     for problem, (_, unit, _) in PROBLEMS.items():
         own = [row for row in result["rows"] if row["problem"] == problem]
@@ -78,8 +78,8 @@ def time_at(result: Row, cfl: str) -> str:
 @table(PAGE, "pareto.adaptive", "pareto_*")
 def adaptive(result: Row) -> list[str]:
     """The adaptive substep against PhysGaussian's fixed one, on the flag."""
-    head = ["flag, dx [m]", "adaptive, CFL 0.4 [s/s]", "fixed 1e-4 s [s/s]", "times cheaper", "error"]
-    head += ["error of the fixed", "difference, share of the side"]
+    head = ["flag, dx [m]", "adaptive, CFL 0.4 [s/s]", "fixed 1e-4 s [s/s]", "speedup", "error"]
+    head += ["error of the fixed substep", "difference (share of the longer side)"]
     flag = [row for row in result["rows"] if row["problem"] == "flag"]
     flag = [row for row in flag if row["variant"] == "total" and row["dtype"] == "float32"]
     rows = []

@@ -52,5 +52,5 @@ def whole(result: Row) -> list[str]:
         for run in result["runs"]
     ]
     if "round_trip_psnr_db" in result:
-        told.append(f"- PSNR of frame 0 against the splat as it was captured: {result['round_trip_psnr_db']:.1f} dB.")
+        told.append(f"- PSNR of frame 0 compared with the captured splat: {result['round_trip_psnr_db']:.1f} dB.")
     return [source(result), "", *grid(head, rows), "", *told]
