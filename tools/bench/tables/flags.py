@@ -30,13 +30,13 @@ def _psnr(row: Row | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-_GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB and share of the distance, against PhysGaussian's way
-_OTHER = {  # variants of the reference that are other flags, or on a mesh too coarse to count
+_GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB, and share of the distance of PhysGaussian's way
+_OTHER = {  # variants of the reference that are different flags, or have a mesh too coarse to count
     "half the cells": "with half as many cells along a side",
     "hardly bending": "on that mesh, with a fiftieth of its bending stiffness",
     "self-contact": "on that mesh, with self-contact",
 }
-_SHARE = 0.03  # of the longer side, that Chamfer distances are to stay within
+_SHARE = 0.03  # goal for Chamfer distances, as a share of the longer side
 
 
 def _complete(rows: Row, name: str, pattern: int) -> Row | None:
@@ -45,7 +45,7 @@ def _complete(rows: Row, name: str, pattern: int) -> Row | None:
 
 
 def goals(result: Row) -> list[tuple[str, str, bool]]:
-    """What was to be reached, what was measured, and whether it is."""
+    """The goals, the measured values, and whether each goal is reached."""
     rows, found = result["rows"], []
     for pattern in PATTERNS:
         ours = _complete(rows, "ours", pattern)
@@ -84,7 +84,7 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
 
 
 def pattern_lines(rows: Row, pattern: int) -> list[str]:
-    """When a flag leaves its reference, and what moves it nearer or farther."""
+    """When a flag leaves its reference, and which changes move it closer or further away."""
     ours = _complete(rows, "ours", pattern)
     if ours is None:
         return []
@@ -110,7 +110,7 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
 
 @table(PAGE, "flags.device", "flags_*")
 def device(result: Row) -> list[str]:
-    """What the runs were made with, and what is to be known of them."""
+    """The devices and versions of the runs, and notes about them."""
     lines = [f"Splats {result['splats']}; {source(result)}"]
     lines += [f"Other options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
     return [*lines, result["note"]] if result.get("note") else lines
@@ -138,7 +138,7 @@ def goal_table(result: Row) -> list[str]:
 
 @table(PAGE, "flags.changes", "flags_*")
 def changes(result: Row) -> list[str]:
-    """When each flag leaves its reference, and what one change at a time does."""
+    """When each flag leaves its reference, and the effects of single changes."""
     return [line for pattern in PATTERNS for line in pattern_lines(result["rows"], pattern)]
 
 
@@ -162,7 +162,7 @@ def costs(result: Row) -> list[str]:
 
 @table(PAGE, "flags.reference", "flags_*", together=True)
 def reference(results: list[Row]) -> list[str]:
-    """How far the reference is from itself, from the first record that says so."""
+    """Uncertainty of the reference, from the first record that has it."""
     lines = []
     for pattern, found in sorted(_uncertainty(results).items()):
         shown = [
@@ -189,7 +189,7 @@ def distance(result: Row, name: str, pattern: str) -> str:
 
 @value("flags.reference_distance", "flags_*", together=True)
 def reference_distance(results: list[Row], name: str, pattern: str) -> str:
-    """How far the reference is from itself, solved otherwise; the name has ``_`` for its spaces."""
+    """Distance between the reference and a variant of it; ``_`` in the name stands for a space."""
     return f"{100 * _uncertainty(results)[pattern][name.replace('_', ' ')]['chamfer']:.2f} %"
 
 
@@ -213,5 +213,5 @@ def incidence(_: list[Row], pattern: str) -> str:
 
 @value("flags.per_degree", "flags_*", together=True)
 def per_degree(_: list[Row], pattern: str) -> str:
-    """Change of the pressure, which goes with the sine of the incidence, by a degree."""
+    """Change of the pressure (proportional to the sine of the incidence) for one degree."""
     return f"{100 * math.radians(1) / math.tan(_incidence(pattern)):.0f} %"

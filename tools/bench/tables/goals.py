@@ -1,4 +1,4 @@
-"""The goals of docs/benchmarks.md: what was wanted, what was measured, and whether it is reached."""
+"""The goals of docs/benchmarks.md: what was wanted, what was measured, and whether the goal is reached."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench.tables.markdown import gib, grid, yes_no
 
 Row = dict[str, Any]
 Goal = tuple[str, str, bool | None, str, bool | None]
-"""Goal, what was measured, whether it was reached (None: not measured), the stretch goal, and whether that was."""
+"""Goal, measured value, whether it is reached (None: not measured), stretch goal, and whether that is reached."""
 
 GOALS = {
     "flag_cpu": "flag end to end on 2 CPU cores: within 90 s and 2 GB",

@@ -29,7 +29,7 @@ def substep(result: Row) -> list[str]:
 
 @table(PAGE, "runs.whole", "sim_*")
 def whole(result: Row) -> list[str]:
-    """Time and memory of whole runs, and whether they stayed whole."""
+    """Time and memory of whole runs, and the health of the material."""
     parts = ("simulation", "shading", "rendering", "writing")
     head = ["run", "particles", "frames", "substeps", *(f"{part} [s]" for part in parts)]
     head += ["process [s]", "host memory [GiB]", "device memory [GiB]"]

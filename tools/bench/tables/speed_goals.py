@@ -1,4 +1,4 @@
-"""The goals of ``bench.py speed`` on an H200: times in ms, the second of a pair is the stretch goal."""
+"""The goals of ``bench.py speed`` on an H200: times in ms; the second number of a pair is the stretch goal."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def _median(rows: list[Row], key: str) -> float:
 
 
 def goals(result: Row) -> list[tuple[str, str, bool]]:
-    """What was to be reached, what was measured, and whether it is."""
+    """The goals, the measured values, and whether each goal is reached."""
     found: list[tuple[str, str, bool]] = []
     pair = result.get("pair", {})
     if pair.get("bare") and pair.get("lightning"):
@@ -55,14 +55,14 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
 
 @table(PAGE, "training.goals", "train_*")
 def goal_table(result: Row) -> list[str]:
-    """Where it was measured, and the goals."""
+    """The device, and the goals."""
     rows = [[goal, measured, yes_no(reached)] for goal, measured, reached in goals(result)]
     return [source(result), "", *grid(["goal", "measured", "reached"], rows)]
 
 
 @table(PAGE, "training.capture", "train_*")
 def capture(result: Row) -> list[str]:
-    """The bare loop, Lightning, and what was tried beside them."""
+    """The bare loop, Lightning, and the variants."""
     rows = [
         (f"{name}, run {k + 1}", row) for name, rows in result.get("pair", {}).items() for k, row in enumerate(rows)
     ]
@@ -79,14 +79,14 @@ def capture(result: Row) -> list[str]:
 
 @value("training.spread", "train_*")
 def spread(result: Row, name: str) -> str:
-    """How far the runs of one side differ."""
+    """Range of the PSNR of the runs with one name."""
     values = [row["psnr_db"] for row in result["pair"][name]]
     return f"{max(values) - min(values):.2f} dB"
 
 
 @table(PAGE, "training.gains", "train_*")
 def gains(result: Row) -> list[str]:
-    """The variants in the order of what they gain over the mean of the bare loop's runs."""
+    """The variants, sorted by their gain over the mean of the bare loop's runs."""
     bare = [row["psnr_db"] for row in result.get("pair", {}).get("bare", [])]
     found = {
         FOX_VARIANTS[name][0]: row["psnr_db"] - statistics.mean(bare)
@@ -98,7 +98,7 @@ def gains(result: Row) -> list[str]:
 
 @table(PAGE, "training.flag", "train_*")
 def flag(result: Row) -> list[str]:
-    """What each of the surface losses does to a flag whose surface is known."""
+    """The effect of each surface loss on a flag whose surface is known."""
     found = {name.removeprefix("flag:"): row for name, row in result.get("flag", {}).items() if "failed" not in row}
     head = ["losses", "round", "decided", "small", "angle to true normal: median, 90 % [°]"]
     head += ["distance: median, 90 % [mm]", "area `paper`", "area `coverage`", "PSNR [dB]", "Gaussians", "seconds"]
