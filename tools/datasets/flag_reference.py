@@ -1,7 +1,7 @@
-"""The three flags of the paper's benchmark as an independent cloth solver sees them, and what their files hold.
+"""The three flags of the paper's benchmark for an independent cloth solver, and their files.
 
-Parameters are those of the paper's table; what it leaves open is chosen here and said so. Nothing in this file needs
-Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` puts it together.
+Parameters are those of the paper's table; values that it does not give are chosen here and marked. Nothing in this file
+needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` combines them.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ PINNED = ("left", "corners", "top")
 
 @dataclass(frozen=True)
 class FlagPattern:
-    """One flag of the benchmark: what it is made of, how it hangs, and what moves it.
+    """One flag of the benchmark: its material, how it is held, and what moves it.
 
-    Seen from the -y side the flag spans ``width`` to the right (x) and ``height`` upwards (z) from the origin; ``yaw``
-    then turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
+    Seen from the -y side, the flag spans ``width`` to the right (x) and ``height`` upwards (z) from the origin. Then
+    ``yaw`` turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
 
     Attributes:
         youngs_modulus: E [Pa]; paper.
@@ -62,25 +62,25 @@ class FlagPattern:
         flow: Velocity of the air [m/s], constant and uniform; paper.
         pinned: ``left`` edge, ``top`` edge, or three ``corners`` with the lower left one free; paper.
         texture: ``white``, ``stripes``, or the path of an image. White for pattern 1: paper.
-        paper_drag: C_D, C_F and C_L of the paper's table, which are those of its own law of force. Kept for the record:
-            Blender's wind is not that law.
-        thickness: [m]; the paper gives none.
-        width: [m]; the paper gives none, nor ``height``.
+        paper_drag: C_D, C_F and C_L of the paper's table, for the paper's force law. Kept for the record: Blender's
+            wind follows another law.
+        thickness: [m]; not given in the paper.
+        width: [m]; not given in the paper, like ``height``.
         height: [m].
         yaw: Angle about z [degrees].
-        ripple: Amplitude of one and a half waves along x in the rest shape [m], without which a flat flag under gravity
-            alone buckles by rounding.
-        corner: Side of the square of which all vertices are held at a pinned corner [m].
+        ripple: Amplitude of one and a half waves along x in the rest shape [m]. Without it, a flat flag under gravity
+            alone would buckle only by rounding errors.
+        corner: Side of the square in which all vertices are held at a pinned corner [m].
         gravity: Along -z [m/s²]; paper.
-        air_density: [kg/m³]; the paper gives none.
+        air_density: [kg/m³]; not given in the paper.
         damping: Rate at which every velocity decays [1/s].
-        drag: C of the pressure ½ ρ C U² that the wind exerts on a face at rest across it: that of a square plate.
+        drag: C of the pressure ½ ρ C U² of the wind on a face at rest across the flow; default: a square plate.
         cells: Cells along the longer side, each with a vertex.
-        quality: Steps of Blender's solver a frame; a power of two.
-        frames: Number of frames, of which the first is the rest shape; paper.
-        fps: Frames a second; paper.
-        self_collision: Whether the cloth keeps away from itself.
-        bending: Bending stiffness as a share of that of a plate.
+        quality: Steps of Blender's solver per frame; a power of two.
+        frames: Number of frames, the first being the rest shape; paper.
+        fps: Frames per second; paper.
+        self_collision: Whether self-contact is on.
+        bending: Bending stiffness as a share of that of a plate of this thickness.
     """
 
     youngs_modulus: float
@@ -158,7 +158,7 @@ class FlagPattern:
         return Grid.of_cells(self.width, self.height, self.cells, held)
 
     def rest(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points [m] and unit normals of the rest shape at places (..., 2) of the cloth, each (..., 3)."""
+        """Points [m] and unit normals of the rest shape at positions (..., 2) on the cloth, each (..., 3)."""
         u, v = uv[..., 0], uv[..., 1]
         wave = 3 * math.pi
         slope = self.ripple * wave / self.width * np.cos(wave * u)
@@ -168,7 +168,7 @@ class FlagPattern:
         return points @ self.turn().T, normals @ self.turn().T
 
     def pin_uv(self) -> np.ndarray:
-        """What is held, as boxes (u low, u high, v low, v high) on the cloth, shape (K, 4)."""
+        """The held parts, as boxes (u low, u high, v low, v high) on the cloth, shape (K, 4)."""
         if self.pinned == "left":
             return np.array([[0.0, 0.0, 0.0, 1.0]])
         if self.pinned == "top":
@@ -177,7 +177,7 @@ class FlagPattern:
         return np.array([[0.0, u, 1 - v, 1.0], [1 - u, 1.0, 1 - v, 1.0], [1 - u, 1.0, 0.0, v]])
 
     def pins(self, uv: np.ndarray) -> np.ndarray:
-        """Indices of the places (V, 2) that are held."""
+        """Indices of the positions (V, 2) that are held."""
         eps = 1e-9
         inside = [
             (uv[:, 0] >= a - eps) & (uv[:, 0] <= b + eps) & (uv[:, 1] >= c - eps) & (uv[:, 1] <= d + eps)
@@ -186,7 +186,7 @@ class FlagPattern:
         return np.flatnonzero(np.any(inside, axis=0))
 
     def truth(self) -> dict[str, np.ndarray]:
-        """The rest shape as ``vertices``, ``normals``, triangles ``faces`` and ``uv``, normals on the camera's side."""
+        """The rest shape: ``vertices``, ``normals`` (on the camera's side), triangles ``faces`` and ``uv``."""
         grid = self.grid()
         vertices, normals = self.rest(grid.uv())
         squares = grid.faces()
@@ -196,7 +196,7 @@ class FlagPattern:
     # ---- physics
 
     def material(self) -> ClothMaterial:
-        """The sheet that a plate of this thickness is."""
+        """The sheet that corresponds to a plate of this thickness."""
         plate = self.youngs_modulus * self.thickness**3 / (12 * (1 - self.poisson_ratio**2))
         return ClothMaterial(
             self.density * self.thickness,
@@ -210,21 +210,21 @@ class FlagPattern:
         return 0.5 * self.air_density * self.drag * sum(u * u for u in self.flow)
 
     def run(self) -> ClothRun:
-        """What is done to the sheet."""
+        """Gravity, wind and solver settings."""
         x, y, z = (float(u) for u in self.flow)
         return ClothRun(
             self.frames, self.fps, self.quality, self.gravity, (x, y, z), self.pressure(), self.self_collision
         )
 
     def cloth_settings(self) -> dict[str, Any]:
-        """All that the motion depends on."""
+        """Everything that the motion depends on."""
         own = {name: value for name, value in asdict(self).items() if name not in ("texture", "paper_drag")}
         blender = blender_settings(self.grid(), self.material(), self.run())
         return own | {f"blender.{name}": value for name, value in blender.items()}
 
 
 def least_quality(pattern: FlagPattern, least: int = 8) -> int:
-    """The smallest power of two steps a frame, from ``least``, that Blender's bending allows on this mesh."""
+    """The smallest power of two of steps per frame, from ``least``, that Blender's bending allows on this mesh."""
     number = bending_number(pattern.grid(), pattern.material(), replace(pattern, quality=1).run())
     quality = least
     while number / quality**2 > BENDING_LIMIT:
@@ -239,9 +239,9 @@ PATTERNS = {
     2: FlagPattern(3e3, 0.3, 30.0, (2.5, 0.5, 0.0), "corners", drag=0.8),
     3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=140, quality=64),
 }
-"""The paper's three patterns. The wind of pattern 3 would blow along the flag's plane: the flag stands at 35 degrees to
-it, so that in patterns 2 and 3 alike the air comes from the camera's side. Drag and damping are chosen so that the
-motion converges with the mesh, see docs/flag_dataset.md."""
+"""The paper's three patterns. The wind of pattern 3 would blow along the flag's plane, so this flag is turned by 35
+degrees. In patterns 2 and 3, the air then comes from the camera's side. Drag and damping are chosen so that the motion
+converges with the mesh, see docs/flag_dataset.md."""
 
 
 # ---- pictures
@@ -265,7 +265,7 @@ def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
 
         try:
             image = iio.imread(pattern.texture)
-        except Exception as error:  # the readers of the formats raise what they like
+        except Exception as error:  # each image reader raises its own kinds of errors
             raise ValueError(
                 f"Cannot read the texture {pattern.texture} ({error}): give white, stripes or an image."
             ) from error
@@ -286,7 +286,7 @@ def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = mat
     """Cameras all around the flag at rest, spread evenly over a sphere on a golden spiral, upright in z.
 
     Args:
-        pattern: The flag; each image holds all of it.
+        pattern: The flag; each image shows all of it.
         count: Number of cameras.
         size: Width and height of their images [pixels].
         angle: Field of view [radians].
@@ -304,13 +304,13 @@ def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = mat
 def reference_view(
     pattern: FlagPattern, positions: np.ndarray, width: int, height: int, angle: float = math.radians(40.0)
 ) -> View:
-    """The camera of the reference video: it looks along the initial normal and holds the whole motion.
+    """The camera of the reference video: it looks along the initial normal, and the whole motion is in view.
 
     Args:
         pattern: The flag.
         positions: The motion [m], shape (F, V, 3).
-        width: Of the image [pixels].
-        height: Of the image [pixels].
+        width: Width of the image [pixels].
+        height: Height of the image [pixels].
         angle: Horizontal field of view [radians].
     """
     normal = pattern.normal()
@@ -325,17 +325,17 @@ def reference_view(
 
 
 def lamp_position(pattern: FlagPattern, side: int = 1) -> np.ndarray:
-    """Where the area light stands [m]: on the initial normal, six flag lengths away; ``side`` -1 mirrors it."""
+    """Position of the area light [m]: on the initial normal, six flag lengths away; ``side`` -1 mirrors it."""
     return pattern.center() + side * 6.0 * pattern.longer_side * pattern.normal()
 
 
 def frame_order(count: int, stride: int = 10) -> list[int]:
-    """Frames in the order in which they are made: every ``stride``-th first, so that a part shows the whole."""
+    """The order in which frames are made: every ``stride``-th first, so that an unfinished set spans the motion."""
     return sorted(range(count), key=lambda frame: (frame % stride != 0, frame))
 
 
 def transforms_fields(views: list[View], names: list[str]) -> dict[str, Any]:
-    """The fields of a ``transforms.json`` for cameras that differ in pose alone."""
+    """The fields of a ``transforms.json`` for cameras that differ only in pose."""
     view = views[0]
     frames = [{"file_path": name, "transform_matrix": v.pose.tolist()} for v, name in zip(views, names, strict=True)]
     return {
@@ -354,12 +354,12 @@ def transforms_fields(views: list[View], names: list[str]) -> dict[str, Any]:
 
 
 def settings_hash(settings: dict[str, Any]) -> str:
-    """Hash of settings that does not depend on their order."""
+    """Hash of the settings, independent of their order."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raise a ValueError that names each setting in which ``found``, of the output ``where``, is not as ``wanted``."""
+    """Raise a ValueError that names each setting of the output ``where`` that differs from ``wanted``."""
     wanted = json.loads(json.dumps(wanted))  # tuples become lists
     changed = [
         f"`{name}` was {found.get(name)!r} and is now {wanted.get(name)!r}"
@@ -374,7 +374,7 @@ def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -
 
 
 def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let ``write`` fill a file beside ``path`` and then give it its name, so that no half-written file is left."""
+    """Let ``write`` fill a temporary file and then rename it to ``path``, so that no half-written file is left."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial-{path.name}")
     write(partial)
@@ -382,7 +382,7 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write JSON, whole or not at all."""
+    """Write JSON, completely or not at all."""
     write_whole(path, lambda partial: partial.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8"))
 
 
@@ -392,11 +392,11 @@ class Cloth:
 
     Attributes:
         positions: Vertices at each frame [m], float32, shape (F, V, 3).
-        faces: Squares as indices of vertices, their normals on the camera's side; shape (Q, 4).
-        uv: Place of each vertex on the flag, in 0 to 1, shape (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
+        faces: Squares as indices of vertices, with normals on the camera's side; shape (Q, 4).
+        uv: Position of each vertex on the flag, in 0 to 1, (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
         columns: Faces along u.
         rows: Faces along v.
-        settings: Fields of the :class:`FlagPattern` that rule the motion.
+        settings: Fields of the :class:`FlagPattern` that determine the motion.
     """
 
     positions: np.ndarray
@@ -407,7 +407,7 @@ class Cloth:
     settings: dict[str, Any]
 
     def sample(self, uv: np.ndarray) -> np.ndarray:
-        """Points on the surface at each frame [m] at places (P, 2) of the flag, shape (F, P, 3); bilinear."""
+        """Points on the surface at each frame [m], for positions (P, 2) on the flag; bilinear; shape (F, P, 3)."""
         i, s = _between(self.uv[:: self.rows + 1, 0], uv[:, 0])
         j, t = _between(self.uv[: self.rows + 1, 1], uv[:, 1])
         at = self.positions.reshape(len(self.positions), self.columns + 1, self.rows + 1, 3)
@@ -417,13 +417,13 @@ class Cloth:
 
 
 def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The interval of ascending ``nodes`` that each place (P,) is in, and its share of that, float32, shape (P, 1)."""
+    """The interval of ascending ``nodes`` that contains each place (P,), and the share of it, float32, (P, 1)."""
     low = np.searchsorted(nodes[1:-1], places, side="right")
     return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
 
 
 def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
-    """Solve a flag and write its motion, unless the file is there already.
+    """Solve a flag and write its motion, unless the file exists.
 
     Args:
         pattern: The flag.
@@ -435,7 +435,7 @@ def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None
 
     Raises:
         ImportError: If ``bpy`` is not there.
-        ValueError: If the file is there, but of other settings; or if ``quality`` is too low for the mesh.
+        ValueError: If the file exists but has other settings, or if ``quality`` is too low for the mesh.
     """
     settings = pattern.cloth_settings()
     if path.exists():
@@ -486,12 +486,12 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
     """Read a motion.
 
     Args:
-        path: The ``.npz``. Beside the fields of :class:`Cloth` it holds ``rest_normals``, ``pins`` (indices),
+        path: The ``.npz``. Besides the fields of :class:`Cloth` it has ``rest_normals``, ``pins`` (indices),
             ``pin_uv`` (boxes), ``areal_density``, ``membrane_stiffness``, ``bending_stiffness``, ``gravity``, ``flow``
             and more, with their ``units``, and the ``hash`` of ``settings``.
 
     Raises:
-        ValueError: If it is no such file.
+        ValueError: If it is not such a file.
     """
     try:
         with np.load(path) as data:
@@ -502,11 +502,11 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
         raise ValueError(f"{path} is not the motion of a flag ({error}): make it again.") from error
 
 
-# ---- how well the reference knows itself
+# ---- uncertainty of the reference
 
 
 def even_uv(pattern: FlagPattern, along: int = 80) -> np.ndarray:
-    """Places spread evenly over the flag at rest, ``along`` on the longer side, shape (P, 2)."""
+    """Positions spread evenly over the flag at rest, ``along`` of them on the longer side, shape (P, 2)."""
     spacing = pattern.longer_side / along
     counts = [max(1, round(side / spacing)) for side in (pattern.width, pattern.height)]
     axes = [(np.arange(count) + 0.5) / count for count in counts]
@@ -532,18 +532,18 @@ def chamfer_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def difference(pattern: FlagPattern, a: Cloth, b: Cloth, every: int = 1, along: int = 80) -> dict[str, Any]:
-    """How far two solutions of one flag are apart.
+    """Distance between two solutions of one flag.
 
     Args:
         pattern: The flag.
-        a: One.
-        b: The other, on any mesh.
-        every: Compare every how many-th frame.
+        a: One solution.
+        b: The other solution, on any mesh.
+        every: Compare only every ``every``-th frame.
         along: Points along the longer side, see :func:`even_uv`.
 
     Returns:
         As shares of the longer side: ``chamfer``, the mean of :func:`chamfer_distance` over the frames;
-        ``chamfer_per_frame``; and ``corresponding``, the mean distance between the same places of the cloth.
+        ``chamfer_per_frame``; and ``corresponding``, the mean distance between the same positions on the cloth.
 
     Raises:
         ValueError: If the numbers of frames differ.
@@ -567,11 +567,11 @@ VARIANTS = ("steps doubled", "coarser", "finer", "half the cells", "hardly bendi
 
 
 def variants(pattern: FlagPattern, names: Iterable[str] = VARIANTS) -> dict[str, FlagPattern]:
-    """The same flag with twice the steps, and on a mesh of three and of five quarters as many cells along a side.
+    """The same flag with twice the steps, and on meshes with three and five quarters as many cells along a side.
 
-    The last two are other flags, on half as many cells: with a fiftieth of the bending stiffness, which tells what
-    bending does to it, and one that keeps away from itself. Beside them stands the same flag on that mesh. Where the
-    mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
+    The last two are different flags, on half as many cells: one with a fiftieth of the bending stiffness, which shows
+    the effect of bending, and one with self-contact. The same flag on that mesh is included for comparison. Where the
+    mesh changes, the steps change by powers of two, so that Blender's bending stays within its limit.
     """
     coarser, finer = (replace(pattern, cells=times * pattern.cells // 4) for times in (3, 5))
     half = replace(pattern, cells=pattern.cells // 2)
