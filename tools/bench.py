@@ -18,7 +18,7 @@ import os
 
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as in tools/sim.py; must be set before torch is imported
 
-from bench.command import main  # the folder beside this file
+from bench.command import main  # the folder next to this file
 
 if __name__ == "__main__":
     main(__doc__ or "")

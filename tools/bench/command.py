@@ -27,7 +27,7 @@ def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Nam
 
 
 def fill_pages(options: argparse.Namespace) -> None:
-    """Fill the slots of the pages beside the results."""
+    """Fill the slots of the pages next to the results."""
     pages.refill(Path(options.results))
 
 
@@ -67,7 +67,7 @@ COMMANDS = {
                      _going_on("flags", flags.measure), flags.add_arguments),
     "gallery": Command("Run the paper's scenes and make pictures of them.",
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
-    "pages": Command("Fill the slots of the pages beside the results.", fill_pages, device=False),
+    "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),
     "film": Command("An animated WebP of finished runs side by side.",

@@ -60,7 +60,7 @@ def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Pa
 
 
 def refill(results: Path, only: str | None = None) -> None:
-    """Fill the pages beside a folder of results and draw their plots; with ``only``, one page if it is there."""
+    """Fill the pages next to a folder of results and draw their plots; with ``only``, one page if it exists."""
     docs = results.parent
     if only is not None and not (docs / only).exists():
         return
