@@ -1,24 +1,24 @@
-"""Measure, record as JSON, and fill the tables of the documentation from what was recorded.
+"""Run measurements, record them as JSON, and fill the tables of the documentation from the records.
 
 ``python tools/bench.py substep``    one elastic substep; writes docs/results/substep_<device>.json
 ``python tools/bench.py speed``      rollouts, batches and frames; writes docs/results/speed_<device>.json
 ``python tools/bench.py sim``        the main job end to end; writes docs/results/sim_<device>.json
-``python tools/bench.py accuracy``   errors against closed forms; writes docs/results/accuracy_<device>.json
+``python tools/bench.py accuracy``   errors against exact solutions; writes docs/results/accuracy_<device>.json
 ``python tools/bench.py pareto``     speed against error; writes docs/results/pareto_<device>.json
 ``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
-``python tools/bench.py train``      trainings of a capture and of a generated flag; writes docs/results/train_cuda.json
+``python tools/bench.py train``      training on a capture and a generated flag; writes docs/results/train_cuda.json
 ``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json
 ``python tools/bench.py gallery``    the paper's scenes; writes docs/results/gallery_<device>.json and pictures
-``python tools/bench.py pages``      the slots of docs/benchmarks.md, validation.md, training.md and so on
+``python tools/bench.py pages``      fills the slots of docs/benchmarks.md, validation.md, training.md and so on
 ``python tools/bench.py pictures``   a strip of frames of a finished run
 ``python tools/bench.py film``       the README's moving picture from finished runs
 """
 
 import os
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as in tools/sim.py; must be set before torch is imported
 
-from bench.command import main  # the folder beside this file
+from bench.command import main  # the folder next to this file
 
 if __name__ == "__main__":
     main(__doc__ or "")

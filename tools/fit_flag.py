@@ -1,14 +1,14 @@
 """Find the speed of a wind and the stiffness of a flag from the motion of the flag alone.
 
-``python tools/fit_flag.py``                     about a minute on one CPU core; exit code 1 if it misses by over 2 %
-``python tools/fit_flag.py --json result.json``  also writes what was found
+``python tools/fit_flag.py``                     about a minute on one CPU core; exit code 1 if the error is over 2 %
+``python tools/fit_flag.py --json result.json``  also writes the result
 
-A small flag, held at its pole side, is let go in a steady wind of known direction. Its particles are recorded at some
-frames, with noise as a camera would add. Then both numbers are forgotten, guessed wrongly, and found again by descent
-along the gradient of the mean squared distance, through every substep of the simulation.
+A small flag, held at its pole side, is released in a steady wind of known direction. The positions of its particles
+are recorded at some frames, with noise like that of a camera. The fit then starts from wrong guesses of both numbers
+and finds them by gradient descent on the mean squared distance, through every substep of the simulation.
 
-The flag is soft and heavy enough for its weight and the wind to stretch it by centimetres: of a stiff flag, which only
-swings, no motion would tell how stiff it is. The interval in which each number is sought keeps the substep stable.
+The flag is so soft and heavy that its weight and the wind stretch it by centimetres. A stiff flag only swings, and its
+motion would not show how stiff it is. The search interval of each number keeps the substep stable.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, before torch is imported
+os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as in tools/sim.py; must be set before torch is imported
 
 import torch
 from torch import Tensor
@@ -46,7 +46,7 @@ MILLIMETRE = 1e-3
 
 @dataclass(frozen=True)
 class Setup:
-    """What is known of the recording.
+    """What is known about the recording.
 
     Attributes:
         spacing: Distance between particles [m].
@@ -67,7 +67,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Fit:
-    """What was found.
+    """The result of a fit.
 
     Attributes:
         values: Wind speed [m/s] and Young's modulus [Pa].
@@ -107,19 +107,19 @@ def simulate(setup: Setup, speed: Tensor, youngs_modulus: Tensor) -> Tensor:
     def force(state: MPMState) -> Tensor:
         return aero(wind, state.velocity, *deform_patch(state.F_total, normals, areas))
 
-    # the same substeps whatever the guess: those of the stiffest cloth in the interval
+    # use the same substeps for every guess: those of the stiffest cloth in the interval
     steps = solver.substeps(solver.init_state(material(SOUGHT[1][1])), setup.frame_dt)
     state = solver.init_state(material(youngs_modulus))
     frames = []
     for _ in range(setup.frames):
-        # keep one state for each frame; the backward pass computes the substeps between them again
+        # keep one state per frame; the backward pass recomputes the substeps between them
         state = solver.rollout(state, setup.frame_dt / steps, steps, force, checkpoint=steps)
         frames.append(state.position)
     return torch.stack(frames)
 
 
 def record(setup: Setup, truth: tuple[float, float] = TRUTH, noise: float = 1e-4, seed: int = 0) -> Tensor:
-    """The motion to be explained, with Gaussian noise [m] on every coordinate; shape (frames, P, 3)."""
+    """The recorded motion, with Gaussian noise [m] on every coordinate; shape (frames, P, 3)."""
     with torch.no_grad():
         motion = simulate(setup, torch.tensor(truth[0]), torch.tensor(truth[1]))
     generator = torch.Generator().manual_seed(seed)
@@ -136,10 +136,10 @@ def fit(
     """Find both numbers by L-BFGS with a line search, in the logarithm of each between the ends of its interval.
 
     Args:
-        setup: What is known.
+        setup: What is known about the recording.
         observed: Positions [m], shape (frames, P, 3).
-        guess: Where to start.
-        iterations: Most iterations; each takes one simulation, sometimes more.
+        guess: Starting values.
+        iterations: Maximum number of iterations; each takes one simulation, sometimes more.
         report: Called after each simulation with its number, mean squared distance [mm²] and the two values.
 
     Returns:
@@ -167,10 +167,10 @@ def fit(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Record, forget, find; 0 if both are found within 2 %."""
+    """Record a motion and fit it; returns 0 if both numbers are found within 2 %."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=Setup.frames, help="recorded frames, 0.02 s apart")
-    parser.add_argument("--iterations", type=int, default=15, help="most iterations of L-BFGS")
+    parser.add_argument("--iterations", type=int, default=15, help="maximum number of L-BFGS iterations")
     parser.add_argument("--noise", type=float, default=1e-4, help="noise of the recorded positions [m]")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise")
     parser.add_argument("--json", type=Path, default=None, help="file for the result")

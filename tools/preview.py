@@ -1,7 +1,7 @@
-"""Look at a splat before it is simulated: ``python tools/preview.py SCENE.ply``.
+"""Preview a splat before simulating it: ``python tools/preview.py SCENE.ply``.
 
-Prints its bounds, up axis, Gaussians, and a guess at every number that a run needs; draws them over the splat; and
-writes a first configuration. With ``--config`` it shows what that configuration would do instead.
+Prints the bounds, up axis and Gaussians of the splat and a guess for every number that a run needs, draws them over
+the splat, and writes a first configuration. With ``--config`` it shows what that configuration does instead.
 """
 
 from __future__ import annotations

@@ -31,6 +31,6 @@ def test_runs_side_by_side(tmp_path):
 
 def test_a_missing_frame_is_named(tmp_path):
     run = _run(tmp_path / "a", (0, 200, 0), frames=2)
-    with pytest.raises(ValueError, match=r"00002\.png is missing: give --frames_shown"):
+    with pytest.raises(ValueError, match=r"00002\.png is missing: choose --frames_shown"):
         films.film([run], tmp_path / "film.webp", range(3), (8, 8), 40)
     assert not (tmp_path / "film.webp").exists()

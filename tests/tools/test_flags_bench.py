@@ -167,13 +167,13 @@ def test_goals_and_what_one_change_does():
     assert found == {
         "pattern 3: Chamfer distance within 3 % of the longer side": ("2.00 % (reference itself: 0.67 %)", True),
         "pattern 3: Chamfer distance 0.25 times that of PhysGaussian's way": ("0.20 times", True),
-        "pattern 3: PSNR +4.2 dB against PhysGaussian's way": ("+4.00 dB", False),
-        "pattern 3: without surface modelling at least twice the Chamfer distance": ("1.50 times", False),
-        "pattern 3: without shading a lower PSNR": ("+1.00 dB", False),
+        "pattern 3: PSNR +4.2 dB over PhysGaussian's way": ("+4.00 dB", False),
+        "pattern 3: Chamfer distance at least twice as large without surface modelling": ("1.50 times", False),
+        "pattern 3: lower PSNR without shading": ("+1.00 dB", False),
     }
     lines = tables.pattern_lines(rows, 3)
     assert lines[0].endswith("0.50 %, 1.00 %, 3.00 %")
-    assert "half the thickness, twice E and density -0.20; no shading +0.00; without the" in lines[1]
+    assert "half the thickness, double E and density -0.20; no shading +0.00; without the" in lines[1]
     assert lines[1].endswith("damping +0.50")
     assert tables.pattern_lines(rows, 1) == []
 

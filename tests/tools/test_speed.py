@@ -91,7 +91,7 @@ def test_everything_is_measured_and_shown(bench, tmp_path):
     assert "| 2 of 64 particles, `updated`, gusts, 4 substeps |" in text
     assert "| dx = 0.1 m, 1,536 Gaussians, 64x36 |" in text
     assert "| `updated`, a particle | 16 | 12 |" in text
-    assert "Made with `--quick`" in text
+    assert "Recorded with `--quick`" in text
     assert (tmp_path / "docs/pictures/speed_cpu.png").stat().st_size > 10_000
     assert "failed" not in text
 
@@ -107,7 +107,7 @@ def test_a_run_that_is_killed_keeps_what_it_has(bench, monkeypatch, tmp_path):
     assert found["partial"] is True
     assert len(found["sand"]) == 1
     assert found["frame"] == []
-    assert "The run was stopped before its end" in _pages(bench, tmp_path / "d/r")
+    assert "The run was stopped early" in _pages(bench, tmp_path / "d/r")
 
 
 def test_a_case_without_memory_is_recorded_and_the_others_are_measured(bench, monkeypatch, tmp_path):

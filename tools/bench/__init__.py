@@ -1,1 +1,1 @@
-"""Behind ``python tools/bench.py``: cases that measure, tables of what was recorded, and the pages that show them."""
+"""Behind ``python tools/bench.py``: cases that measure, tables of the records, and the pages that show them."""

@@ -1,4 +1,4 @@
-"""Time and memory of a call, and what becomes of one that fails."""
+"""Time and memory of a call, and how failures are recorded."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Row = dict[str, Any]
 
 
 class Clock:
-    """Marks in time; on a GPU events, as its stream gets to them."""
+    """Marks in time; on a GPU they are events in its stream."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -35,14 +35,14 @@ class Clock:
             self.marks.append(time.perf_counter())
 
     def read(self) -> list[float]:
-        """Milliseconds from mark to mark."""
+        """Milliseconds between consecutive marks."""
         self._wait()
         pairs = zip(self.marks, self.marks[1:], strict=False)
         return [a.elapsed_time(b) if self.device.type == "cuda" else 1e3 * (b - a) for a, b in pairs]
 
 
 def spread(samples: list[float], share: float = 1.0) -> dict[str, float]:
-    """Median and quartiles of times [ms], each times ``share``."""
+    """Median and quartiles of times [ms], each multiplied by ``share``."""
     low, median, high = statistics.quantiles(samples, n=4) if len(samples) > 1 else samples * 3
     return {
         "median_ms": share * median,
@@ -55,7 +55,7 @@ def spread(samples: list[float], share: float = 1.0) -> dict[str, float]:
 def timed(
     function: Callable[[], Any], device: torch.device, repeats: int, warm: int = 3, share: float = 1.0
 ) -> dict[str, float]:
-    """Milliseconds of a call after warm-up, times ``share``: median and quartiles; on a GPU between events."""
+    """Milliseconds of a call after warm-up, multiplied by ``share``: median and quartiles; on a GPU between events."""
     for _ in range(warm):
         function()
     samples = []
@@ -69,7 +69,7 @@ def timed(
 
 
 def copy_bandwidth(size: int, device: torch.device) -> Row:
-    """Bytes per second of a copy within the memory of the device, read and written."""
+    """Bytes per second of a copy within device memory, counting both reads and writes."""
     source = torch.rand(size // 4, device=device)
     target = torch.empty_like(source)
     took = timed(lambda: target.copy_(source), device, 20 if device.type == "cuda" else 7)
@@ -77,14 +77,14 @@ def copy_bandwidth(size: int, device: torch.device) -> Row:
 
 
 def clear() -> None:
-    """Give back the memory that nothing uses."""
+    """Free unused memory."""
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
 
 
 def guarded(function: Callable[[], Row]) -> Row:
-    """What the function gives, or ``failed`` with the reason: one case must not cost the others."""
+    """The result of the function, or ``failed`` with the reason, so that one failure does not stop the other cases."""
     try:
         return function()
     except Exception as error:
@@ -95,7 +95,7 @@ def guarded(function: Callable[[], Row]) -> Row:
 
 
 class Peak:
-    """Most memory that torch's allocator held since the last start, beyond what it held at first; None on a CPU."""
+    """Peak memory of torch's allocator since the last start, minus what it held at first; None on a CPU."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device

@@ -14,7 +14,7 @@ from bench.slots import SlotError
 
 
 def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Namespace], None]:
-    """A command that adds to what was recorded on the same device."""
+    """A command that adds to an earlier record of the same device."""
 
     def run(options: argparse.Namespace) -> None:
         device, result = record.start(options.device)
@@ -27,7 +27,7 @@ def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Nam
 
 
 def fill_pages(options: argparse.Namespace) -> None:
-    """Fill the slots of the pages beside the results."""
+    """Fill the slots of the pages next to the results."""
     pages.refill(Path(options.results))
 
 
@@ -37,10 +37,10 @@ class Command:
 
     Attributes:
         help: What it does.
-        run: Does it.
+        run: The function that does it.
         add_arguments: Adds its own options.
-        device: Whether it takes ``--device``.
-        page: The page that is filled again after it.
+        device: Whether it has the option ``--device``.
+        page: The page to refill afterwards.
     """
 
     help: str
@@ -54,20 +54,20 @@ COMMANDS = {
     "substep": Command("Measure one elastic substep.", runs.substep),
     "speed": Command("Measure rollouts of many sizes, sand, batches and frames, with memory and error.",
                      speed.run, speed.add_arguments),
-    "sim": Command("Measure the main job.", runs.sim, runs.add_arguments),
-    "accuracy": Command("Measure errors against closed forms and experiments.",
+    "sim": Command("Measure whole runs: the default flag and a captured object.", runs.sim, runs.add_arguments),
+    "accuracy": Command("Measure errors against exact solutions and experiments.",
                         accuracy.run, accuracy.add_arguments, page="validation.md"),
     "pareto": Command("Measure speed against error over the settings of the solver.",
                       pareto.run, pareto.add_arguments, page="validation.md"),
     "gradients": Command("Measure the memory of gradients through long rollouts, and fit a flag.",
                          gradients.run, device=False, page="validation.md"),
-    "train": Command("Measure trainings: a bare gsplat loop beside Lightning, and what the surface losses buy.",
+    "train": Command("Measure training: a bare gsplat loop and Lightning, and the effect of the surface losses.",
                      _going_on("train", training.measure), training.add_arguments),
     "flags": Command("Train, simulate and compare the flags of the paper with Blender's cloth.",
                      _going_on("flags", flags.measure), flags.add_arguments),
-    "gallery": Command("Run and picture the paper's scenes.",
+    "gallery": Command("Run the paper's scenes and make pictures of them.",
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
-    "pages": Command("Fill the slots of the pages beside the results.", fill_pages, device=False),
+    "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),
     "film": Command("An animated WebP of finished runs side by side.",
@@ -91,7 +91,7 @@ def build_parser(description: str) -> argparse.ArgumentParser:
 
 
 def main(description: str, arguments: list[str] | None = None) -> None:
-    """Parse and run one command, then fill the page that shows what it recorded."""
+    """Parse and run one command, then refill the page that shows its record."""
     options: Any = build_parser(description).parse_args(arguments)
     try:
         options.command.run(options)

@@ -1,4 +1,4 @@
-"""The README's moving picture: finished runs side by side as one animated WebP."""
+"""The README's moving picture: finished runs side by side in one animated WebP."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ TIME = "frames/{:05d}.png"
 
 
 def panel(frame: Path, width: int, height: int) -> np.ndarray:
-    """A frame cut to the shape of a panel about its middle, and made that small; shape (height, width, 3)."""
+    """A frame, cropped around its centre and resized to a panel; shape (height, width, 3)."""
     from PIL import Image
 
     with Image.open(frame) as picture:
@@ -25,7 +25,7 @@ def panel(frame: Path, width: int, height: int) -> np.ndarray:
 def film(
     runs: list[Path], target: Path, frames: range, size: tuple[int, int], frame_ms: int, quality: int = 60
 ) -> None:
-    """Write an animated WebP that plays forwards and starts again.
+    """Write an animated WebP that plays in a loop.
 
     Args:
         runs: Output folders of runs, one for each panel from left to right.
@@ -33,7 +33,7 @@ def film(
         frames: Frame numbers to show.
         size: Width and height of a panel [pixels].
         frame_ms: How long a frame is shown [ms].
-        quality: Of the compression, 0 to 100.
+        quality: Quality of the compression, 0 to 100.
 
     Raises:
         ValueError: If a run lacks one of the frames.
@@ -45,7 +45,7 @@ def film(
         files = [run / TIME.format(number) for run in runs]
         for file in files:
             if not file.is_file():
-                raise ValueError(f"{file} is missing: give --frames_shown that all runs have.")
+                raise ValueError(f"{file} is missing: choose --frames_shown so that all runs have the frames.")
         pictures.append(Image.fromarray(np.concatenate([panel(file, *size) for file in files], axis=1)))
     target.parent.mkdir(parents=True, exist_ok=True)
     pictures[0].save(

@@ -1,4 +1,4 @@
-"""The pages of the documentation that show what was recorded, filled again in place."""
+"""Fill the pages of the documentation that show records, in place."""
 
 from __future__ import annotations
 
@@ -24,26 +24,29 @@ from bench.tables import (
 )
 
 TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, runs, speed, training)
-"""What registers the slots."""
+"""The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
     "accuracy_*": accuracy_plot.draw,
     "pareto_*": pareto_plot.draw,
     "speed_*": speed_plot.draw,
 }
-"""What draws into the folder of the pictures, from which records."""
+"""Functions that draw into the folder of the pictures, by the records that they need."""
 
 
 def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Path, str]:
-    """The pages of a folder that have slots, filled; nothing is written.
+    """Fill the pages of a folder that have slots, without writing them.
 
     Args:
         docs: Folder of the pages.
-        records: What was recorded.
-        only: Name of the one page to fill, which may then lack slots; all if None, which may not.
+        records: The records.
+        only: Name of a single page to fill, which may lack slots; None fills all pages, which may not.
+
+    Returns:
+        The text of each page.
 
     Raises:
-        SlotError: If a page cannot be filled, or lacks a slot for something that was recorded.
+        SlotError: If a page cannot be filled, or lacks a slot that a record needs.
     """
     if only is None:
         for page in sorted({slot.page for slot in slots.SLOTS.values() if slot.page}):
@@ -57,7 +60,7 @@ def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Pa
 
 
 def refill(results: Path, only: str | None = None) -> None:
-    """Fill the pages beside a folder of results and draw their plots; with ``only``, one page if it is there."""
+    """Fill the pages next to a folder of results and draw their plots; with ``only``, one page if it exists."""
     docs = results.parent
     if only is not None and not (docs / only).exists():
         return

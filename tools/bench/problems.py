@@ -1,4 +1,4 @@
-"""What is timed: a sheet in wind and a block of sand, and the fewest bytes that a substep of them must move."""
+"""The timed problems (a sheet in wind and a block of sand), and the fewest bytes that a substep must move."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CUBE = GridSpec(0.01, (0, 0, 0), (100, 100, 100))
 
 
 def sheet(particles: int, device: torch.device) -> MaterialPoints:
-    """A square sheet of 0.9 m, level but for a ripple, within a cube of 1 m."""
+    """A square sheet of 0.9 m, level except for a ripple, within a cube of 1 m."""
     side = round(particles**0.5)
     axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) / side * 0.9 + 0.05
     x, y = (g.reshape(-1) for g in torch.meshgrid(axis, axis, indexing="ij"))
@@ -28,7 +28,7 @@ def sheet(particles: int, device: torch.device) -> MaterialPoints:
 
 
 def block(particles: int, device: torch.device) -> MaterialPoints:
-    """A cube of sand: at a million particles it is 0.9 m wide, with fewer smaller, with more denser."""
+    """A cube of sand: 0.9 m wide for a million particles, smaller for fewer, denser for more."""
     side = round(particles ** (1 / 3))
     spacing = 0.9 / max(side, 100)
     axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) * spacing + 0.05
@@ -39,14 +39,14 @@ def block(particles: int, device: torch.device) -> MaterialPoints:
 
 
 def waves(position: Tensor) -> Tensor:
-    """A smooth velocity across the sheet, up to 1 m/s, so that what moves is more than round-off."""
+    """A smooth velocity across the sheet, up to 1 m/s, so that the motion is larger than round-off."""
     x, y, _ = position.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, zero, torch.sin(2 * math.pi * x) * torch.cos(2 * math.pi * y)], dim=-1)
 
 
 def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> WindForce:
-    """Wind on every particle of a sheet, or of many."""
+    """Wind on every particle of one or several sheets."""
     slope = 0.027 * torch.cos(9 * points.position[..., 0])
     normal = torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)
     device = points.position.device
@@ -55,13 +55,13 @@ def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> Win
 
 
 def wind(number: int, gusts: bool, device: torch.device) -> WindField:
-    """A wind, another one for each number."""
+    """A wind that is different for each number."""
     modulations = [UniformGust()] if gusts else []
     return WindField([2.0, 0.0, 1.0 + 0.01 * number], modulations=modulations, seed=number).to(device)
 
 
 def nodes_in_reach(position: Tensor, dx: float) -> int:
-    """Number of grid nodes in the stencil of any particle: those that get mass."""
+    """Number of grid nodes in the stencil of any particle, which are the nodes that get mass."""
     low = torch.floor(position.reshape(-1, 3).double() / dx - 0.5).long()
     low = low - low.amin(0)
     shape = [int(n) + 3 for n in low.amax(0)]
@@ -74,13 +74,13 @@ TRAFFIC: dict[str, dict[str, tuple[int, int]]] = {
     "total": {"a particle": (6, 0), "a node": (7, 6)},
     "updated": {"a particle": (16, 12), "a node": (7, 7)},
 }
-"""Numbers that a substep reads and writes; docs/benchmarks.md says which."""
+"""How many numbers a substep reads and writes; docs/benchmarks.md says which."""
 
-WIND_TRAFFIC, PLASTIC_TRAFFIC = (4, 0), (9, 9)  # more of them for a particle
+WIND_TRAFFIC, PLASTIC_TRAFFIC = (4, 0), (9, 9)  # extra numbers for a particle
 
 
 def fewest_bytes(formulation: str, particles: int, nodes: int, wind: bool = False, plastic: bool = False) -> int:
-    """Fewest bytes that a substep in float32 must move through the memory of the device.
+    """Fewest bytes that a substep in float32 must move through device memory.
 
     Each input of a particle is read once, each output written once; the fields of the nodes that have mass are read
     once and written once.

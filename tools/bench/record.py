@@ -1,4 +1,4 @@
-"""The recorded JSON: where a measurement starts, how it is written, and how it is read again."""
+"""The recorded JSON: how a record is started, written and read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Row = dict[str, Any]
 
 
 def start(device: str) -> tuple[torch.device, Row]:
-    """The device of a name or ``auto``, and the head of a record: device, versions and seed."""
+    """The device for a name or ``auto``, and the head of a record: device, versions and seed."""
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     found = torch.device(device)
@@ -27,7 +27,7 @@ def start(device: str) -> tuple[torch.device, Row]:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file so that there is always a whole one, whenever the process is killed."""
+    """Write a file so that it is always complete, even if the process is killed."""
     draft = path.with_name(path.name + ".part")
     draft.write_text(text)
     os.replace(draft, path)
@@ -48,13 +48,13 @@ def read(folder: Path) -> dict[str, Row]:
 
 
 def kept_rows(folder: Path, name: str, keep: Callable[[Row], bool]) -> list[Row]:
-    """The rows of an earlier record that are to stay; none if there is no such record."""
+    """The rows of an earlier record to keep; none if there is no such record."""
     path = folder / f"{name}.json"
     return [row for row in json.loads(path.read_text())["rows"] if keep(row)] if path.exists() else []
 
 
 def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable[..., None]) -> None:
-    """Add to what was recorded on the same device, and write after each part."""
+    """Add to an earlier record of the same device, and write after each part."""
     folder = Path(options.results)
     path = folder / f"{name}.json"
     if path.exists():

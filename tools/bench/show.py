@@ -37,13 +37,15 @@ def add_pictures_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--run", required=True, help="output folder of a run")
     command.add_argument("--name", required=True, help="name of the picture")
     command.add_argument("--frames_shown", default="0,20,40,60", help="frame numbers")
-    command.add_argument("--columns", default="0,1", help="part of the width to keep, as shares")
+    command.add_argument(
+        "--columns", default="0,1", help="left and right end of the part to keep, as shares of the width"
+    )
 
 
 def add_film_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py film``."""
-    command.add_argument("--runs", required=True, help="output folders of runs, a list with commas")
+    command.add_argument("--runs", required=True, help="output folders of runs, separated by commas")
     command.add_argument("--name", default="swaying", help="name of the picture")
-    command.add_argument("--frames_shown", default="0:75:2", help="first frame, the one after the last, step")
-    command.add_argument("--size", default="320x320", help="of each panel [pixels]")
-    command.add_argument("--quality", type=int, default=60, help="0 to 100")
+    command.add_argument("--frames_shown", default="0:75:2", help="first frame, end (exclusive), step")
+    command.add_argument("--size", default="320x320", help="size of each panel [pixels]")
+    command.add_argument("--quality", type=int, default=60, help="quality of the compression, 0 to 100")

@@ -1,6 +1,6 @@
-"""Slots: the places of a Markdown page that hold what was recorded.
+"""Slots: the places in a Markdown page that show records.
 
-A page is a file that a person edits. A table, or a number within a sentence, stands between two comments::
+People edit the pages. A table, or a number within a sentence, is placed between two comments::
 
     <!-- begin: speed.substeps speed_cuda -->
 
@@ -11,9 +11,9 @@ A page is a file that a person edits. A table, or a number within a sentence, st
 
     A flag is <!-- begin: flags.distance flags_cuda ours 3 -->1.2 %<!-- end --> away from its reference.
 
-The words of the first comment are the name of the slot, the recorded file that it is made from, and what else the slot
-asks for. :func:`fill` puts the text between the comments anew and leaves all other text as it is. A comment in
-backquotes is text.
+The words of the first comment are the name of the slot, the record that it is made from, and further arguments of the
+slot. :func:`fill` replaces the text between the comments and leaves all other text as it is. A comment in backquotes is
+plain text.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any
 
 Row = dict[str, Any]
 Records = Mapping[str, Row]
-"""What was recorded, by the name of its file without ``.json``."""
+"""The records, by file name without ``.json``."""
 
 _MARK = re.compile(r"(?<!`)<!-- (?:begin:\s*(?P<words>[^>]*?)|(?P<end>end)) -->")
 
@@ -42,10 +42,10 @@ class Slot:
 
     Attributes:
         name: First word of the comment.
-        page: The page that has to show it; None if no page has to.
-        records: Which recorded files it is made from, as ``fnmatch`` understands it.
-        together: Made from all of these files at once, and so without a file among its words.
-        make: Text, or lines, from the record (or the list of all), and from the words that follow.
+        page: The page that must show it; None if no page must.
+        records: Pattern (for ``fnmatch``) of the records that it is made from.
+        together: Whether it is made from all of these records together; its words then name no record.
+        make: Function of the record (or the list of all) and of the words that follow; returns text or lines.
     """
 
     name: str
@@ -60,7 +60,7 @@ SLOTS: dict[str, Slot] = {}
 
 
 def table(page: str, name: str, records: str, together: bool = False) -> Callable[[Any], Any]:
-    """Register a function that makes lines: a slot that ``page`` must have, one for each of the recorded files."""
+    """Register a function that makes lines: a slot that ``page`` must have, once for each record."""
 
     def register(make: Callable[..., list[str]]) -> Callable[..., list[str]]:
         SLOTS[name] = Slot(name, page, records, together, make)
@@ -70,7 +70,7 @@ def table(page: str, name: str, records: str, together: bool = False) -> Callabl
 
 
 def value(name: str, records: str, together: bool = False) -> Callable[[Any], Any]:
-    """Register a function that makes a few words: a slot within a sentence, which a page may have."""
+    """Register a function that makes a few words: an optional slot within a sentence."""
 
     def register(make: Callable[..., str]) -> Callable[..., str]:
         SLOTS[name] = Slot(name, None, records, together, make)
@@ -80,7 +80,7 @@ def value(name: str, records: str, together: bool = False) -> Callable[[Any], An
 
 
 def fill(page: str, text: str, records: Records) -> str:
-    """The text of a page with its slots filled from what was recorded.
+    """The text of a page with its slots filled from the records.
 
     Raises:
         SlotError: If a comment has no partner, or a slot is unknown, misplaced or cannot be made.
@@ -116,7 +116,7 @@ def used(text: str) -> list[str]:
 
 
 def wanted(page: str, records: Records) -> list[str]:
-    """The words of the slots that a page must have for what was recorded."""
+    """The words of the slots that a page must have for these records."""
     found = []
     for slot in SLOTS.values():
         if slot.page == page:
@@ -132,13 +132,13 @@ def check_complete(page: str, text: str, records: Records) -> None:
 
 
 def _is_alone(text: str, start: int, end: int) -> bool:
-    """Whether a comment has a line to itself."""
+    """Whether a comment is alone on its line."""
     before, after = text[:start].rpartition("\n")[2], text[end:].partition("\n")[0]
     return not before.strip() and not after.strip()
 
 
 def _content(page: str, words: str, alone: bool, line: str, records: Records) -> str:
-    """What a slot is filled with; ``line`` is its line up to the end comment."""
+    """The content of a slot; ``line`` is its line up to the end comment."""
     try:
         made = _made(words, records)
     except (KeyError, IndexError, TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""The relations between Blender's cloth settings and SI units, measured on panels whose answers are known."""
+"""The relations between Blender's cloth settings and SI units, measured on panels with known solutions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _row(name: str, measured: float, expected: float, unit: str, means: str) -> 
 
 
 def free_fall(cell: float, quality: int) -> dict[str, Any]:
-    """Acceleration of a panel that nothing holds."""
+    """Acceleration of a free panel."""
     grid = Grid.of_cells(20 * cell, 20 * cell, 20)
     run = ClothRun(frames=12, quality=quality)
     height = solve_cloth(grid, grid.flat(), NOTHING, SHEET, run)[..., 2].astype(np.float64).mean(1)
@@ -46,7 +46,7 @@ def damped_fall(cell: float, quality: int, rate: float = 2.0) -> dict[str, Any]:
 
 
 def hanging_panel(cell: float, quality: int) -> list[dict[str, Any]]:
-    """Stretch of a panel under its own weight, held by its upper edge, and how much narrower it gets."""
+    """Stretch of a panel that hangs by its upper edge under its own weight, and how much narrower it gets."""
     width, height, gravity = 0.4, 0.8, 2.0
     grid = Grid.of_cells(width, height, round(height / cell), "top")
     material = replace(SHEET, air_rate=20.0)
@@ -55,7 +55,7 @@ def hanging_panel(cell: float, quality: int) -> list[dict[str, Any]]:
     shape = (grid.columns + 1, grid.rows + 1, 3)
     last = solve_cloth(grid, grid.flat(), pins, material, run)[-1].astype(np.float64).reshape(shape)
     strain = np.diff(last[:, :, 2].mean(0)) / np.diff(grid.flat().reshape(shape)[0, :, 2]) - 1
-    lower = slice(2, grid.rows // 2)  # well away from the edge that cannot get narrower
+    lower = slice(2, grid.rows // 2)  # away from the held edge, which cannot get narrower
     # a row of faces carries the rows of vertices below it; summed over all, that is rho g L^2 / 2E
     carried = material.areal_density * height * gravity * np.arange(1, grid.rows + 1) / (grid.rows + 1)
     measured = carried[lower].sum() / strain[lower].sum()
@@ -69,7 +69,7 @@ def hanging_panel(cell: float, quality: int) -> list[dict[str, Any]]:
 
 
 def sheared_panel(cell: float, quality: int) -> dict[str, Any]:
-    """Sag of the free side of a high and narrow panel, held by its left side: away from its ends it is sheared only."""
+    """Sag of the free side of a tall, narrow panel held by its left side: away from its ends it is in pure shear."""
     width, height, gravity = 0.2, 1.6, 1.0
     grid = Grid.of_cells(width, height, round(height / cell), "left")
     run = ClothRun(frames=75, quality=quality, gravity=gravity)
@@ -77,7 +77,7 @@ def sheared_panel(cell: float, quality: int) -> dict[str, Any]:
     last = solve_cloth(grid, grid.flat(), pins, replace(SHEET, air_rate=20.0), run)[-1].astype(np.float64)
     fallen = (grid.flat() - last)[:, 2].reshape(grid.columns + 1, grid.rows + 1)
     sag = fallen[-1, grid.rows // 4 : -(grid.rows // 4)].mean()
-    # columns of vertices beyond each face, as the cells that they are
+    # number of columns of cells beyond each face
     along = np.arange(1, grid.columns + 1)[::-1] * SHEET.areal_density * gravity * grid.cells[0]
     lengths = np.diff(grid.flat().reshape(grid.columns + 1, grid.rows + 1, 3)[:, 0, 0])
     modulus = SHEET.membrane / (2 * (1 + POISSON_RATIO))
@@ -85,7 +85,7 @@ def sheared_panel(cell: float, quality: int) -> dict[str, Any]:
 
 
 def wind(cell: float, quality: int, speed: float = 2.0, incidence: float = 90.0) -> list[dict[str, Any]]:
-    """Pressure on a free panel without gravity, and the speed that it reaches (not where it would turn)."""
+    """Pressure on a free panel without gravity, and the speed that it reaches (unless the panel would turn)."""
     grid = Grid.of_cells(20 * cell, 20 * cell, 20)
     angle = math.radians(incidence)
     flow = (speed * math.cos(angle), speed * math.sin(angle), 0.0)
@@ -97,7 +97,7 @@ def wind(cell: float, quality: int, speed: float = 2.0, incidence: float = 90.0)
     # sigma dv/dt = p (sin a - v / U): v = U sin a (1 - exp(-t / tau)), tau = sigma U / p
     ends = speed * math.sin(angle)
     rate = -np.diff(np.log(1 - velocity[:4] / ends)).mean() * run.fps
-    if turns:  # the rate tells the slope with v; the pressure at rest is that of the first frame
+    if turns:  # the rate gives the slope with v; the first frame gives the pressure at rest
         through = 1 - math.exp(-1 / (run.fps * SHEET.areal_density * speed / pressure))
         share = 1 - through * SHEET.areal_density * speed / pressure * run.fps
         rate = velocity[0] / (ends * share) * pressure / (SHEET.areal_density * speed)
@@ -117,11 +117,11 @@ def cantilever(cell: float, quality: int) -> dict[str, Any]:
     flat = grid.flat()[:, [0, 2, 1]]  # in the x-y plane
     material = replace(SHEET, air_rate=4.0)
     run = ClothRun(frames=125, quality=quality, gravity=gravity)
-    pins = np.flatnonzero(flat[:, 0] < 3 * cell)  # three rows: the first face that turns is one cell wide
+    pins = np.flatnonzero(flat[:, 0] < 3 * cell)  # three rows, so that the first face that turns is one cell wide
     shape = (grid.columns + 1, grid.rows + 1, 3)
     last = solve_cloth(grid, flat, pins, material, run)[-1].astype(np.float64).reshape(shape)
     sag = -last[-1, :, 2].mean()
-    # faces on hinges: each turns by its moment over D / cell, and lowers the end by its distance to it
+    # faces on hinges: each turns by its moment over D / cell, and lowers the end by that angle times its distance
     along = flat.reshape(shape)[:, 0, 0]
     weight = material.areal_density * length / (grid.columns + 1) * gravity  # of a row of vertices, per length across
     hinges = along[2:-1]
@@ -136,11 +136,11 @@ def check_relations(
     """Measure all relations.
 
     Args:
-        coarse: Cell [m] and steps a frame.
-        fine: The same of a second mesh, or None.
+        coarse: Cell size [m] and steps per frame.
+        fine: The same for a second mesh, or None.
 
     Returns:
-        ``blender``, its version, and ``checks``, a list with ``name``, ``measured``, ``expected``, ``ratio``, ``unit``
+        ``blender`` (its version) and ``checks``, a list with ``name``, ``measured``, ``expected``, ``ratio``, ``unit``
         and ``expected_from``.
     """
     rows: list[dict[str, Any]] = []

@@ -1,7 +1,7 @@
-"""Blender's cloth solver in SI units: what ``make_flag_dataset.py`` asks it, and the relations it is asked with.
+"""Blender's cloth solver in SI units, for ``make_flag_dataset.py``.
 
-This is the only file that runs the solver; ``bpy`` is imported when a cloth is solved. The relations between
-Blender's settings and SI units are measured (``make_flag_dataset.py --check`` measures them again), since Blender
+This is the only file that runs the solver. ``bpy`` is imported when a cloth is solved. The relations between
+Blender's settings and SI units are measured (``make_flag_dataset.py --check`` measures them again), because Blender
 documents none of them. Blender's cloth counts time in frames: a stiffness in its units is one in N/m divided by fps².
 """
 
@@ -15,33 +15,35 @@ from typing import Any
 import numpy as np
 
 LATTICE = 4 / 3
-"""E h over the stiffness of a spring, in a square lattice with one diagonal to a square, turned from square to square,
-and all springs alike: the value of isotropic lattices, and the measured one."""
+"""E h divided by the stiffness of a spring, in a square lattice with one diagonal per square, alternating from square
+to square, and all springs alike. This is the value of isotropic lattices, and also the measured one."""
 
 BENDING = 0.0295
-"""Bending stiffness D [N m] over ``bending_stiffness`` x edge² x fps², measured on a cantilever taken as what it is: a
-chain of stiff squares on hinges, the first at the clamp: across its sides a square does not bend along its diagonal."""
+"""Bending stiffness D [N m] divided by ``bending_stiffness`` x edge² x fps², measured on a cantilever. The cantilever
+is modelled as a chain of stiff squares on hinges, the first at the clamp, because a square that bends across its sides
+does not bend along its diagonal."""
 
 POISSON_RATIO = 1 / 3
-"""Poisson's ratio of that lattice, which no setting changes; measured 0.31 and 0.325 on cells of 2 and 1 cm."""
+"""Poisson's ratio of that lattice, whatever the settings; measured: 0.31 and 0.325 on cells of 2 and 1 cm."""
 
 BENDING_LIMIT = 1.25
-"""Blender's bending is explicit: ``bending_number`` must stay below this. Against much shorter steps the motion of
-pattern 2 on cells of 2 cm is off by 2 to 4 mm at 1.2, by 1 mm at 0.3, and wrong at 4.9, where nothing blows up."""
+"""Blender's bending is explicit: ``bending_number`` must stay below this. Compared with much shorter steps, the
+motion of pattern 2 on cells of 2 cm is off by 2 to 4 mm at 1.2 and by 1 mm at 0.3. At 4.9 it is wrong, although nothing
+blows up."""
 
 SPRING_TIME = 2.2e-3
-"""Damping of a membrane spring over its stiffness [s]: what Blender's defaults amount to on flags of 2 cm cells."""
+"""Damping of a membrane spring divided by its stiffness [s]: that of Blender's defaults on flags of 2 cm cells."""
 
 BENDING_DAMPING = 0.5 / 0.3
-"""``bending_damping`` over vertex mass: Blender's defaults for the mass that they assume. It is explicit too: over
-vertex mass and quality, 0.4 crumpled a flag of 1 cm cells at the scale of its mesh, 0.1 and less did not."""
+"""``bending_damping`` divided by vertex mass: Blender's defaults, for the mass that they assume. It is explicit too.
+Divided by vertex mass and quality, 0.4 crumpled a flag of 1 cm cells at the scale of its mesh; 0.1 and less did not."""
 
 
 def require_bpy() -> Any:
     """Import ``bpy``.
 
     Raises:
-        ImportError: If it is not there; the message names the extra.
+        ImportError: If it is not installed; the message names the extra.
     """
     try:
         import bpy
@@ -55,22 +57,22 @@ def require_bpy() -> Any:
 
 @dataclass(frozen=True)
 class Grid:
-    """A rectangular cloth as a mesh in the x-z plane, of which every vertex stands for the same share of the cloth.
+    """A rectangular cloth as a mesh in the x-z plane, in which every vertex represents the same share of the cloth.
 
-    Blender gives every vertex the same mass and every line of springs the same stiffness, at the rim or not. So the
-    cloth is cut into equal cells with a vertex in the middle of each, and only those of the rim are moved out to it: a
-    mesh of squares with an outer ring one and a half cells wide. Were it one cell wide, a vertex of the rim would have
-    the mass of a cell and half its area, an error of first order in the cell. Along an edge that is held the mass of
-    the rim does not matter, and a ring of one cell is right.
+    Blender gives every vertex the same mass and every line of springs the same stiffness, at the rim or not. Therefore
+    the cloth is cut into equal cells with a vertex in the middle of each, and the vertices of the outermost cells are
+    moved out to the rim. The result is a mesh of squares with an outer ring one and a half cells wide. With a ring of
+    one cell, a vertex at the rim would have the mass of a cell but half its area, an error of first order in the cell.
+    Along a held edge the mass of the rim does not matter, and a ring of one cell is right.
 
-    Vertex ``i * (rows + 1) + j`` is the j-th from below of the i-th column.
+    Vertex ``i * (rows + 1) + j`` is the j-th from below in the i-th column.
 
     Attributes:
         width: Length along x [m].
         height: Length along z [m].
         columns: Number of faces along x.
         rows: Number of faces along z.
-        held: The edge that is held: ``left``, ``top`` or none.
+        held: The held edge: ``left``, ``top`` or None.
     """
 
     width: float
@@ -84,7 +86,7 @@ class Grid:
         """The mesh with ``cells`` square cells along the longer side.
 
         Raises:
-            ValueError: If the shorter side is not a whole number of cells, to 5 %, or less than two.
+            ValueError: If the shorter side is not a whole number of cells (to within 5 %), or less than two.
         """
         cell = max(width, height) / cells
         across, up = max(1, round(width / cell)), max(1, round(height / cell))
@@ -98,7 +100,7 @@ class Grid:
 
     @property
     def cells(self) -> tuple[float, float]:
-        """Sides of a cell along x and z [m]; half a cell of the cloth hangs on an edge that is held."""
+        """Sides of a cell along x and z [m]; half a cell of the cloth belongs to a held edge."""
         return (
             self.width / (self.columns + (0.5 if self.held == "left" else 1.0)),
             self.height / (self.rows + (0.5 if self.held == "top" else 1.0)),
@@ -106,7 +108,7 @@ class Grid:
 
     @property
     def cell(self) -> float:
-        """Side of a square as large as a cell [m]."""
+        """Side of a square with the area of a cell [m]."""
         return math.sqrt(math.prod(self.cells))
 
     @property
@@ -130,11 +132,11 @@ class Grid:
         return np.stack(np.meshgrid(u, v, indexing="ij"), -1).reshape(-1, 2)
 
     def triangles(self) -> np.ndarray:
-        """The faces cut into two, along one diagonal and the other by turns, as Blender gets them; (2 Q, 3).
+        """The faces cut into two, along alternating diagonals, as they are given to Blender; (2 Q, 3).
 
-        Blender strings both diagonals of a square, but those springs do not push back: sheared, such a square is half
-        as stiff, and it bends along a diagonal only where two squares meet. A diagonal that is an edge of the mesh is a
-        spring like any other.
+        For squares, Blender adds both diagonals, but those springs do not push back. Such a square is half as stiff in
+        shear, and its diagonals do not resist bending. A diagonal that is an edge of the mesh is a spring like any
+        other.
         """
         faces = self.faces()
         column, row = np.divmod(np.arange(len(faces)), self.rows)
@@ -144,7 +146,7 @@ class Grid:
         return np.concatenate([first, second])
 
     def faces(self) -> np.ndarray:
-        """Faces as indices of vertices, turned so that their normal is on the -y side; int64, shape (Q, 4)."""
+        """Faces as indices of vertices, with normals on the -y side; int64, shape (Q, 4)."""
         corner = (np.arange(self.columns)[:, None] * (self.rows + 1) + np.arange(self.rows)).reshape(-1)
         return np.stack([corner, corner + self.rows + 1, corner + self.rows + 2, corner + 1], -1)
 
@@ -162,7 +164,7 @@ class ClothMaterial:
         areal_density: Mass per area [kg/m²].
         membrane: Young's modulus times thickness, E h [N/m].
         bending: Bending stiffness D [N m].
-        spring_time: Damping of a membrane spring over its stiffness [s].
+        spring_time: Damping of a membrane spring divided by its stiffness [s].
         air_rate: Rate at which every velocity decays [1/s].
     """
 
@@ -175,16 +177,16 @@ class ClothMaterial:
 
 @dataclass(frozen=True)
 class ClothRun:
-    """What is done to a sheet.
+    """Gravity, wind and solver settings of a run.
 
     Attributes:
-        frames: Number of frames, of which the first is the rest shape.
-        fps: Frames a second.
-        quality: Steps of the solver a frame.
+        frames: Number of frames; the first is the rest shape.
+        fps: Frames per second.
+        quality: Solver steps per frame.
         gravity: Along -z [m/s²].
         flow: Velocity of the air [m/s].
         pressure: Pressure of the air on a face at rest across the flow [Pa].
-        self_collision: Whether the sheet keeps half a cell away from itself.
+        self_collision: Whether self-contact is on, at a distance of half a cell.
     """
 
     frames: int
@@ -203,12 +205,12 @@ def bending_number(grid: Grid, material: ClothMaterial, run: ClothRun) -> float:
 
 
 def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict[str, float]:
-    """Blender's settings for a sheet, by the measured relations.
+    """Blender's settings for a sheet, from the measured relations.
 
     Args:
         grid: The mesh.
-        material: What it is made of.
-        run: What is done to it.
+        material: Its material.
+        run: Gravity, wind and solver settings.
 
     Returns:
         ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind.
@@ -244,21 +246,21 @@ def solve_cloth(
     run: ClothRun,
     report: Any = None,
 ) -> np.ndarray:
-    """Let Blender move a sheet.
+    """Simulate a sheet with Blender.
 
     Args:
         grid: Its mesh.
-        vertices: Rest shape [m], in which no spring is stretched; shape (V, 3).
-        pins: Vertices that stay where they are.
-        material: What it is made of.
-        run: What is done to it.
+        vertices: Rest shape [m], without stretched springs; shape (V, 3).
+        pins: Vertices that are held.
+        material: Its material.
+        run: Gravity, wind and solver settings.
         report: Called after each frame with its number, from 1.
 
     Returns:
         Vertices at each frame [m], float32, shape (frames, V, 3).
 
     Raises:
-        ImportError: If ``bpy`` is not there.
+        ImportError: If ``bpy`` is not installed.
         ValueError: If ``quality`` is too low for the bending of this mesh.
         ArithmeticError: If the solver blew up.
     """
@@ -291,7 +293,7 @@ def solve_cloth(
     cloth.bending_model = "ANGULAR"
     for name in settings.keys() - {"gravity", "strength", "flow"}:
         setattr(cloth, name, settings[name])
-    for name in ("tension", "compression", "bending"):  # no vertex group scales a stiffness
+    for name in ("tension", "compression", "bending"):  # so that no vertex group scales a stiffness
         setattr(cloth, f"{name}_stiffness_max", settings[f"{name}_stiffness"])
     cloth.use_pressure = cloth.use_internal_springs = cloth.use_dynamic_mesh = False
     modifier.collision_settings.use_collision = False
@@ -322,7 +324,7 @@ def solve_cloth(
 def _add_wind(bpy: Any, scene: Any, run: ClothRun, settings: dict[str, float]) -> None:
     from mathutils import Vector
 
-    bpy.ops.object.effector_add(type="WIND")  # flow, wind factor and shape as needed; forcefield_toggle leaves them 0
+    bpy.ops.object.effector_add(type="WIND")  # sets flow, wind factor and shape; forcefield_toggle leaves them at 0
     wind = bpy.context.object
     wind.rotation_mode = "QUATERNION"
     wind.rotation_quaternion = Vector((0.0, 0.0, 1.0)).rotation_difference(Vector(run.flow))

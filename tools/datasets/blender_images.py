@@ -1,6 +1,6 @@
-"""Photographs of a sheet by Blender's path tracer: what ``tools/datasets/make_flag_dataset.py`` asks for pictures.
+"""Pictures of a sheet by Blender's path tracer, for ``tools/datasets/make_flag_dataset.py``.
 
-``bpy`` is imported when a studio is opened.
+``bpy`` is imported when a studio is created.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class View:
         return float(0.5 * self.width / np.tan(0.5 * self.angle_x))
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Where points [m] (..., 3) are seen [pixels], from the upper left corner; shape (..., 2)."""
+        """Positions of points [m] (..., 3) in the image [pixels], from the upper left corner; shape (..., 2)."""
         seen = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return self.focal * seen[..., :2] / -seen[..., 2:] * [1, -1] + [0.5 * self.width, 0.5 * self.height]
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera to world, OpenGL axes, of a camera that is upright in z; shape (4, 4)."""
+    """Camera to world, OpenGL axes, for a camera that is upright in z; shape (4, 4)."""
     backward = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0.0, 0.0, 1.0], backward)
     right /= np.linalg.norm(right)
@@ -59,20 +59,20 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 class Studio:
     """A sheet, lights and a camera.
 
-    Light is set so that white cloth across the line to one lamp has the pixel value 1 with ``linear``, and each colour
-    of the texture its own. The cloth scatters diffusely and the same on both sides.
+    The light is set so that white cloth facing one lamp has the pixel value 1 with ``linear``, and each colour of the
+    texture has its own value. The cloth scatters diffusely and equally on both sides.
 
     Args:
         faces: Squares of the sheet, shape (Q, 4).
-        uv: Place of its vertices on the texture, shape (V, 2).
+        uv: Position of its vertices on the texture, shape (V, 2).
         texture: Colours in 0 to 1, upper row first, shape (H, W, 3).
         lamps: Positions of the area lights [m], shape (L, 3).
         center: Point that they shine on [m], shape (3,).
         lamp_size: Side of a lamp [m].
         samples: Light paths per pixel.
         transparent: Give the images an alpha channel instead of a black background.
-        transfer: ``linear``: pixel values are proportional to light, and textures are taken so. ``srgb``: both are as
-            cameras give them.
+        transfer: ``linear``: pixel values are proportional to light, and so are the textures. ``srgb``: both are as
+            from a camera.
         threads: Threads to render with; 0 for all.
 
     Raises:
@@ -135,7 +135,7 @@ class Studio:
 
         light = self._bpy.data.lights.new(name, "AREA")
         light.shape, light.size = "SQUARE", size
-        # a diffuse lamp of power P gives P / (pi d^2) across it, white cloth scatters 1 / pi of that
+        # a diffuse lamp of power P gives P / (pi d^2) at distance d; white cloth scatters 1 / pi of that
         light.energy = float(np.pi**2 * ((position - center) ** 2).sum())
         lamp = self._bpy.data.objects.new(name, light)
         lamp.matrix_world = Matrix(look_at(position, center).tolist())
@@ -147,7 +147,7 @@ class Studio:
         self._mesh.update()
 
     def photograph(self, view: View, path: Path) -> None:
-        """Write a PNG; it has its name only when it is whole."""
+        """Write a PNG; it gets its name only when it is complete."""
         from mathutils import Matrix
 
         render = self._scene.render
@@ -163,7 +163,7 @@ class Studio:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what Blender prints for each picture, past Python's own output, from the terminal."""
+    """Hide what Blender prints for each picture, which bypasses Python's own output."""
     sys.stdout.flush()
     kept = os.dup(1)
     with open(os.devnull, "w") as nowhere:

@@ -12,7 +12,7 @@ from flag_reference import FlagPattern, least_quality
 
 
 def even_uv(pattern: FlagPattern, along: int = 80) -> np.ndarray:
-    """Places spread evenly over the flag at rest, ``along`` on the longer side, shape (P, 2)."""
+    """Positions spread evenly over the flag at rest, ``along`` of them on the longer side, shape (P, 2)."""
     spacing = pattern.longer_side / along
     counts = [max(1, round(side / spacing)) for side in (pattern.width, pattern.height)]
     axes = [(np.arange(count) + 0.5) / count for count in counts]
@@ -38,18 +38,18 @@ def chamfer_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def difference(pattern: FlagPattern, a: Cloth, b: Cloth, every: int = 1, along: int = 80) -> dict[str, Any]:
-    """How far two solutions of one flag are apart.
+    """Distance between two solutions of one flag.
 
     Args:
         pattern: The flag.
-        a: One.
-        b: The other, on any mesh.
-        every: Compare every how many-th frame.
+        a: One solution.
+        b: The other solution, on any mesh.
+        every: Compare only every ``every``-th frame.
         along: Points along the longer side, see :func:`even_uv`.
 
     Returns:
         As shares of the longer side: ``chamfer``, the mean of :func:`chamfer_distance` over the frames;
-        ``chamfer_per_frame``; and ``corresponding``, the mean distance between the same places of the cloth.
+        ``chamfer_per_frame``; and ``corresponding``, the mean distance between the same positions on the cloth.
 
     Raises:
         ValueError: If the numbers of frames differ.
@@ -73,11 +73,11 @@ VARIANTS = ("steps doubled", "coarser", "finer", "half the cells", "hardly bendi
 
 
 def variants(pattern: FlagPattern, names: Iterable[str] = VARIANTS) -> dict[str, FlagPattern]:
-    """The same flag with twice the steps, and on a mesh of three and of five quarters as many cells along a side.
+    """The same flag with twice the steps, and on meshes with three and five quarters as many cells along a side.
 
-    The last two are other flags, on half as many cells: with a fiftieth of the bending stiffness, which tells what
-    bending does to it, and one that keeps away from itself. Beside them stands the same flag on that mesh. Where the
-    mesh changes, the steps follow by powers of two, so that Blender's bending stays within its limit.
+    The last two are different flags, on half as many cells: one with a fiftieth of the bending stiffness, which shows
+    the effect of bending, and one with self-contact. The same flag on that mesh is included for comparison. Where the
+    mesh changes, the steps change by powers of two, so that Blender's bending stays within its limit.
     """
     coarser, finer = (replace(pattern, cells=times * pattern.cells // 4) for times in (3, 5))
     half = replace(pattern, cells=pattern.cells // 2)

@@ -35,12 +35,12 @@ UNITS = {
 
 
 def settings_hash(settings: dict[str, Any]) -> str:
-    """Hash of settings that does not depend on their order."""
+    """Hash of the settings, independent of their order."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Raise a ValueError that names each setting in which ``found``, of the output ``where``, is not as ``wanted``."""
+    """Raise a ValueError that names each setting of the output ``where`` that differs from ``wanted``."""
     wanted = json.loads(json.dumps(wanted))  # tuples become lists
     changed = [
         f"`{name}` was {found.get(name)!r} and is now {wanted.get(name)!r}"
@@ -55,7 +55,7 @@ def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -
 
 
 def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let ``write`` fill a file beside ``path`` and then give it its name, so that no half-written file is left."""
+    """Let ``write`` fill a temporary file and then rename it to ``path``, so that no half-written file is left."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".partial-{path.name}")
     write(partial)
@@ -63,7 +63,7 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write JSON, whole or not at all."""
+    """Write JSON, completely or not at all."""
     write_whole(path, lambda partial: partial.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8"))
 
 
@@ -73,11 +73,11 @@ class Cloth:
 
     Attributes:
         positions: Vertices at each frame [m], float32, shape (F, V, 3).
-        faces: Squares as indices of vertices, their normals on the camera's side; shape (Q, 4).
-        uv: Place of each vertex on the flag, in 0 to 1, shape (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
+        faces: Squares as indices of vertices, with normals on the camera's side; shape (Q, 4).
+        uv: Position of each vertex on the flag, in 0 to 1, (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
         columns: Faces along u.
         rows: Faces along v.
-        settings: Fields of the :class:`FlagPattern` that rule the motion.
+        settings: Fields of the :class:`FlagPattern` that determine the motion.
     """
 
     positions: np.ndarray
@@ -88,7 +88,7 @@ class Cloth:
     settings: dict[str, Any]
 
     def sample(self, uv: np.ndarray) -> np.ndarray:
-        """Points on the surface at each frame [m] at places (P, 2) of the flag, shape (F, P, 3); bilinear."""
+        """Points on the surface at each frame [m], for positions (P, 2) on the flag; bilinear; shape (F, P, 3)."""
         i, s = _between(self.uv[:: self.rows + 1, 0], uv[:, 0])
         j, t = _between(self.uv[: self.rows + 1, 1], uv[:, 1])
         at = self.positions.reshape(len(self.positions), self.columns + 1, self.rows + 1, 3)
@@ -98,13 +98,13 @@ class Cloth:
 
 
 def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The interval of ascending ``nodes`` that each place (P,) is in, and its share of that, float32, shape (P, 1)."""
+    """The interval of ascending ``nodes`` that contains each place (P,), and the share of it, float32, (P, 1)."""
     low = np.searchsorted(nodes[1:-1], places, side="right")
     return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
 
 
 def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
-    """Solve a flag and write its motion, unless the file is there already.
+    """Solve a flag and write its motion, unless the file exists.
 
     Args:
         pattern: The flag.
@@ -116,7 +116,7 @@ def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None
 
     Raises:
         ImportError: If ``bpy`` is not there.
-        ValueError: If the file is there, but of other settings; or if ``quality`` is too low for the mesh.
+        ValueError: If the file exists but has other settings, or if ``quality`` is too low for the mesh.
     """
     settings = pattern.cloth_settings()
     if path.exists():
@@ -167,12 +167,12 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
     """Read a motion.
 
     Args:
-        path: The ``.npz``. Beside the fields of :class:`Cloth` it holds ``rest_normals``, ``pins`` (indices),
+        path: The ``.npz``. Besides the fields of :class:`Cloth` it has ``rest_normals``, ``pins`` (indices),
             ``pin_uv`` (boxes), ``areal_density``, ``membrane_stiffness``, ``bending_stiffness``, ``gravity``, ``flow``
             and more, with their ``units``, and the ``hash`` of ``settings``.
 
     Raises:
-        ValueError: If it is no such file.
+        ValueError: If it is not such a file.
     """
     try:
         with np.load(path) as data:

@@ -29,7 +29,7 @@ def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
 
         try:
             image = iio.imread(pattern.texture)
-        except Exception as error:  # the readers of the formats raise what they like
+        except Exception as error:  # each image reader raises its own kinds of errors
             raise ValueError(
                 f"Cannot read the texture {pattern.texture} ({error}): give white, stripes or an image."
             ) from error
@@ -50,7 +50,7 @@ def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = mat
     """Cameras all around the flag at rest, spread evenly over a sphere on a golden spiral, upright in z.
 
     Args:
-        pattern: The flag; each image holds all of it.
+        pattern: The flag; each image shows all of it.
         count: Number of cameras.
         size: Width and height of their images [pixels].
         angle: Field of view [radians].
@@ -68,13 +68,13 @@ def sphere_views(pattern: FlagPattern, count: int, size: int, angle: float = mat
 def reference_view(
     pattern: FlagPattern, positions: np.ndarray, width: int, height: int, angle: float = math.radians(40.0)
 ) -> View:
-    """The camera of the reference video: it looks along the initial normal and holds the whole motion.
+    """The camera of the reference video: it looks along the initial normal, and the whole motion is in view.
 
     Args:
         pattern: The flag.
         positions: The motion [m], shape (F, V, 3).
-        width: Of the image [pixels].
-        height: Of the image [pixels].
+        width: Width of the image [pixels].
+        height: Height of the image [pixels].
         angle: Horizontal field of view [radians].
     """
     normal = pattern.normal()
@@ -89,17 +89,17 @@ def reference_view(
 
 
 def lamp_position(pattern: FlagPattern, side: int = 1) -> np.ndarray:
-    """Where the area light stands [m]: on the initial normal, six flag lengths away; ``side`` -1 mirrors it."""
+    """Position of the area light [m]: on the initial normal, six flag lengths away; ``side`` -1 mirrors it."""
     return pattern.center() + side * 6.0 * pattern.longer_side * pattern.normal()
 
 
 def frame_order(count: int, stride: int = 10) -> list[int]:
-    """Frames in the order in which they are made: every ``stride``-th first, so that a part shows the whole."""
+    """The order in which frames are made: every ``stride``-th first, so that an unfinished set spans the motion."""
     return sorted(range(count), key=lambda frame: (frame % stride != 0, frame))
 
 
 def transforms_fields(views: list[View], names: list[str]) -> dict[str, Any]:
-    """The fields of a ``transforms.json`` for cameras that differ in pose alone."""
+    """The fields of a ``transforms.json`` for cameras that differ only in pose."""
     view = views[0]
     frames = [{"file_path": name, "transform_matrix": v.pose.tolist()} for v, name in zip(views, names, strict=True)]
     return {

@@ -1,7 +1,7 @@
 """The three flags of the paper's benchmark as an independent cloth solver sees them.
 
-Parameters are those of the paper's table; what it leaves open is chosen here and said so. Nothing in this file needs
-Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` puts it together. Motions
+Parameters are those of the paper's table; values that it does not give are chosen here and marked. Nothing in this file
+needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` combines them. Motions
 and their files are in ``flag_motion.py``, textures and cameras in ``flag_pictures.py``, comparisons in
 ``flag_difference.py``.
 """
@@ -20,10 +20,10 @@ PINNED = ("left", "corners", "top")
 
 @dataclass(frozen=True)
 class FlagPattern:
-    """One flag of the benchmark: what it is made of, how it hangs, and what moves it.
+    """One flag of the benchmark: its material, how it is held, and what moves it.
 
-    Seen from the -y side the flag spans ``width`` to the right (x) and ``height`` upwards (z) from the origin; ``yaw``
-    then turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
+    Seen from the -y side, the flag spans ``width`` to the right (x) and ``height`` upwards (z) from the origin. Then
+    ``yaw`` turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
 
     Attributes:
         youngs_modulus: E [Pa]; paper.
@@ -32,25 +32,25 @@ class FlagPattern:
         flow: Velocity of the air [m/s], constant and uniform; paper.
         pinned: ``left`` edge, ``top`` edge, or three ``corners`` with the lower left one free; paper.
         texture: ``white``, ``stripes``, or the path of an image. White for pattern 1: paper.
-        paper_drag: C_D, C_F and C_L of the paper's table, which are those of its own law of force. Kept for the record:
-            Blender's wind is not that law.
-        thickness: [m]; the paper gives none.
-        width: [m]; the paper gives none, nor ``height``.
+        paper_drag: C_D, C_F and C_L of the paper's table, for the paper's force law. Kept for the record: Blender's
+            wind follows another law.
+        thickness: [m]; not given in the paper.
+        width: [m]; not given in the paper, like ``height``.
         height: [m].
         yaw: Angle about z [degrees].
-        ripple: Amplitude of one and a half waves along x in the rest shape [m], without which a flat flag under gravity
-            alone buckles by rounding.
-        corner: Side of the square of which all vertices are held at a pinned corner [m].
+        ripple: Amplitude of one and a half waves along x in the rest shape [m]. Without it, a flat flag under gravity
+            alone would buckle only by rounding errors.
+        corner: Side of the square in which all vertices are held at a pinned corner [m].
         gravity: Along -z [m/s²]; paper.
-        air_density: [kg/m³]; the paper gives none.
+        air_density: [kg/m³]; not given in the paper.
         damping: Rate at which every velocity decays [1/s].
-        drag: C of the pressure ½ ρ C U² that the wind exerts on a face at rest across it: that of a square plate.
+        drag: C of the pressure ½ ρ C U² of the wind on a face at rest across the flow; default: a square plate.
         cells: Cells along the longer side, each with a vertex.
-        quality: Steps of Blender's solver a frame; a power of two.
-        frames: Number of frames, of which the first is the rest shape; paper.
-        fps: Frames a second; paper.
-        self_collision: Whether the cloth keeps away from itself.
-        bending: Bending stiffness as a share of that of a plate.
+        quality: Steps of Blender's solver per frame; a power of two.
+        frames: Number of frames, the first being the rest shape; paper.
+        fps: Frames per second; paper.
+        self_collision: Whether self-contact is on.
+        bending: Bending stiffness as a share of that of a plate of this thickness.
     """
 
     youngs_modulus: float
@@ -128,7 +128,7 @@ class FlagPattern:
         return Grid.of_cells(self.width, self.height, self.cells, held)
 
     def rest(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points [m] and unit normals of the rest shape at places (..., 2) of the cloth, each (..., 3)."""
+        """Points [m] and unit normals of the rest shape at positions (..., 2) on the cloth, each (..., 3)."""
         u, v = uv[..., 0], uv[..., 1]
         wave = 3 * math.pi
         slope = self.ripple * wave / self.width * np.cos(wave * u)
@@ -138,7 +138,7 @@ class FlagPattern:
         return points @ self.turn().T, normals @ self.turn().T
 
     def pin_uv(self) -> np.ndarray:
-        """What is held, as boxes (u low, u high, v low, v high) on the cloth, shape (K, 4)."""
+        """The held parts, as boxes (u low, u high, v low, v high) on the cloth, shape (K, 4)."""
         if self.pinned == "left":
             return np.array([[0.0, 0.0, 0.0, 1.0]])
         if self.pinned == "top":
@@ -147,7 +147,7 @@ class FlagPattern:
         return np.array([[0.0, u, 1 - v, 1.0], [1 - u, 1.0, 1 - v, 1.0], [1 - u, 1.0, 0.0, v]])
 
     def pins(self, uv: np.ndarray) -> np.ndarray:
-        """Indices of the places (V, 2) that are held."""
+        """Indices of the positions (V, 2) that are held."""
         eps = 1e-9
         inside = [
             (uv[:, 0] >= a - eps) & (uv[:, 0] <= b + eps) & (uv[:, 1] >= c - eps) & (uv[:, 1] <= d + eps)
@@ -156,7 +156,7 @@ class FlagPattern:
         return np.flatnonzero(np.any(inside, axis=0))
 
     def truth(self) -> dict[str, np.ndarray]:
-        """The rest shape as ``vertices``, ``normals``, triangles ``faces`` and ``uv``, normals on the camera's side."""
+        """The rest shape: ``vertices``, ``normals`` (on the camera's side), triangles ``faces`` and ``uv``."""
         grid = self.grid()
         vertices, normals = self.rest(grid.uv())
         squares = grid.faces()
@@ -166,7 +166,7 @@ class FlagPattern:
     # ---- physics
 
     def material(self) -> ClothMaterial:
-        """The sheet that a plate of this thickness is."""
+        """The sheet that corresponds to a plate of this thickness."""
         plate = self.youngs_modulus * self.thickness**3 / (12 * (1 - self.poisson_ratio**2))
         return ClothMaterial(
             self.density * self.thickness,
@@ -180,21 +180,21 @@ class FlagPattern:
         return 0.5 * self.air_density * self.drag * sum(u * u for u in self.flow)
 
     def run(self) -> ClothRun:
-        """What is done to the sheet."""
+        """Gravity, wind and solver settings."""
         x, y, z = (float(u) for u in self.flow)
         return ClothRun(
             self.frames, self.fps, self.quality, self.gravity, (x, y, z), self.pressure(), self.self_collision
         )
 
     def cloth_settings(self) -> dict[str, Any]:
-        """All that the motion depends on."""
+        """Everything that the motion depends on."""
         own = {name: value for name, value in asdict(self).items() if name not in ("texture", "paper_drag")}
         blender = blender_settings(self.grid(), self.material(), self.run())
         return own | {f"blender.{name}": value for name, value in blender.items()}
 
 
 def least_quality(pattern: FlagPattern, least: int = 8) -> int:
-    """The smallest power of two steps a frame, from ``least``, that Blender's bending allows on this mesh."""
+    """The smallest power of two of steps per frame, from ``least``, that Blender's bending allows on this mesh."""
     number = bending_number(pattern.grid(), pattern.material(), replace(pattern, quality=1).run())
     quality = least
     while number / quality**2 > BENDING_LIMIT:
@@ -209,6 +209,6 @@ PATTERNS = {
     2: FlagPattern(3e3, 0.3, 30.0, (2.5, 0.5, 0.0), "corners", drag=0.8),
     3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=140, quality=64),
 }
-"""The paper's three patterns. The wind of pattern 3 would blow along the flag's plane: the flag stands at 35 degrees to
-it, so that in patterns 2 and 3 alike the air comes from the camera's side. Drag and damping are chosen so that the
-motion converges with the mesh, see docs/flag_dataset.md."""
+"""The paper's three patterns. The wind of pattern 3 would blow along the flag's plane, so this flag is turned by 35
+degrees. In patterns 2 and 3, the air then comes from the camera's side. Drag and damping are chosen so that the motion
+converges with the mesh, see docs/flag_dataset.md."""

@@ -1,9 +1,9 @@
-"""Make the flag benchmark: the motion of three flags by Blender's cloth solver, photographs of them, and a video.
+"""Make the flag data set: the motion of three flags from Blender's cloth solver, photos of them, and a video.
 
 ``python tools/datasets/make_flag_dataset.py --preview``      all three, small, in two minutes on two cores
 ``python tools/datasets/make_flag_dataset.py --pattern 2``    one, at full size
 ``python tools/datasets/make_flag_dataset.py --check``        measures how Blender's settings relate to SI units
-``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from the same flag solved otherwise
+``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from other solutions of it
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 
@@ -41,15 +41,15 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Pictures:
-    """How the pictures are taken.
+    """Settings of the pictures.
 
     Attributes:
         size: Width and height of the video [pixels].
         samples: Light paths per pixel.
-        views: Number of photographs of the rest shape.
+        views: Number of photos of the rest shape.
         view_size: Their width and height [pixels].
         transfer: ``linear``, pixel values proportional to light, which the paper's shading law assumes, or ``srgb``.
-        every: Render every how many-th frame of the video.
+        every: Render only every ``every``-th frame of the video.
         threads: Threads to render with; 0 for all.
     """
 
@@ -66,10 +66,10 @@ PREVIEW = Pictures(size=(320, 180), samples=4, views=24, view_size=128, every=10
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Make a folder and note the settings of what goes there.
+    """Make a folder and record the settings of its contents.
 
     Raises:
-        ValueError: If the folder was made with others; the message names them.
+        ValueError: If the folder was made with other settings; the message names them.
     """
     path = folder / "settings.json"
     if path.exists():
@@ -79,14 +79,14 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
 
 
 def picture_settings(pattern: FlagPattern, texture: np.ndarray, pictures: Pictures) -> dict[str, Any]:
-    """What all pictures of a flag depend on; those of its motion depend on that as well."""
+    """The settings that all pictures of a flag depend on; pictures of its motion also depend on the motion."""
     shape = {name: getattr(pattern, name) for name in ("width", "height", "yaw", "ripple")}
     digest = hashlib.sha256(np.ascontiguousarray(texture).tobytes()).hexdigest()[:16]
     return shape | {"texture": digest, "samples": pictures.samples, "transfer": pictures.transfer}
 
 
 def missing_pictures(folder: Path, names: list[str]) -> list[str]:
-    """Those of the pictures that are not there yet, in the same order."""
+    """The pictures that do not exist yet, in the same order."""
     return [name for name in names if not (folder / name).is_file()]
 
 
@@ -113,9 +113,9 @@ def make_truth(pattern: FlagPattern, folder: Path) -> None:
 
 
 def make_train(pattern: FlagPattern, folder: Path, pictures: Pictures, report: Report) -> int:
-    """Photograph the rest shape from all around.
+    """Render the rest shape from all around.
 
-    There is a lamp on either side: with the video's alone every view from behind would be black.
+    There is a lamp on each side. With only the video's lamp, every view from behind would be black.
 
     Returns:
         Number of pictures made.
@@ -138,9 +138,9 @@ def make_train(pattern: FlagPattern, folder: Path, pictures: Pictures, report: R
 
 
 def make_video(pattern: FlagPattern, cloth: Path, folder: Path, pictures: Pictures, report: Report) -> int:
-    """Photograph the motion from one camera along the initial normal, with one lamp behind it.
+    """Render the motion from one camera along the initial normal, with one lamp behind the camera.
 
-    Every tenth frame is made first. The video itself is written once all frames are there, if imageio is.
+    Every tenth frame is made first. The video itself is written once all frames exist, if imageio is installed.
 
     Returns:
         Number of pictures made.
@@ -172,7 +172,7 @@ def make_video(pattern: FlagPattern, cloth: Path, folder: Path, pictures: Pictur
 
 
 def write_film(path: Path, frames: list[Path], fps: int) -> bool:
-    """Join pictures to an mp4; returns False, and writes nothing, where imageio is not there."""
+    """Join pictures into an mp4; returns False, and writes nothing, if imageio is not installed."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401
@@ -189,14 +189,14 @@ def write_film(path: Path, frames: list[Path], fps: int) -> bool:
 def make_uncertainty(
     pattern: FlagPattern, folder: Path, names: list[str], report: Report, every: int = 5, along: int = 80
 ) -> dict[str, Any]:
-    """Solve a flag otherwise and compare.
+    """Solve variants of a flag and compare them with it.
 
     Args:
-        pattern: The flag; its own motion is ``cloth.npz``, solved if it is not there.
-        folder: Of the pattern. Motions go to ``uncertainty/``.
+        pattern: The flag; its own motion is ``cloth.npz``, solved if it does not exist.
+        folder: Folder of the pattern. Motions go to ``uncertainty/``.
         names: Keys of :func:`flag_difference.variants`.
         report: Called with a line of progress.
-        every: Compare every how many-th frame.
+        every: Compare only every ``every``-th frame.
         along: Points compared along the longer side.
 
     Returns:
@@ -261,19 +261,19 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--only", nargs="+", choices=PARTS, default=list(PARTS), help="which parts")
     add("--preview", action="store_true", help="coarse mesh, small pictures, every tenth frame")
     add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140)")
-    add("--quality", type=int, help="steps of the solver a frame, a power of two (what the mesh needs)")
-    add("--frames", type=int, help="number of frames, of which the first is the rest shape (250)")
+    add("--quality", type=int, help="solver steps per frame, a power of two (default: what the mesh needs)")
+    add("--frames", type=int, help="number of frames, the first being the rest shape (250)")
     add("--flag-size", type=float, nargs=2, metavar=("WIDTH", "HEIGHT"), help="sides of the flag [m]")
     add("--texture", help="white, stripes, or the path of an image")
     add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (0.8 in pattern 2, else 1.28)")
     add("--damping", type=float, help="rate at which every velocity decays [1/s] (2, 1, 1)")
-    add("--self-collision", action="store_true", default=None, help="keep the cloth away from itself")
-    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="of the video [pixels] (1920x1080)")
+    add("--self-collision", action="store_true", default=None, help="turn self-contact on")
+    add("--size", type=_size, metavar="WIDTHxHEIGHT", help="size of the video [pixels] (1920x1080)")
     add("--samples", type=int, help="light paths per pixel (16)")
-    add("--views", type=int, help="number of photographs of the rest shape (200)")
-    add("--view-size", type=int, help="their width and height [pixels] (400)")
-    add("--transfer", choices=TRANSFERS, help="linear: pixel values proportional to light; srgb: as cameras (linear)")
-    add("--every", type=int, help="render every how many-th frame (1)")
+    add("--views", type=int, help="number of photos of the rest shape (200)")
+    add("--view-size", type=int, help="width and height of the photos [pixels] (400)")
+    add("--transfer", choices=TRANSFERS, help="linear: pixels proportional to light; srgb: as from a camera (linear)")
+    add("--every", type=int, help="render only every N-th frame (1)")
     add("--threads", type=int, help="threads to render with; 0 for all (0)")
     add("--check", action="store_true", help="measure the relations between Blender's settings and SI units")
     add("--uncertainty", action="store_true", help="solve the flags otherwise, and compare")
@@ -283,7 +283,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
-    """The pattern that the command line asks for.
+    """The pattern chosen on the command line.
 
     Raises:
         ValueError: If an option is out of range.
@@ -300,7 +300,7 @@ def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
 
 
 def pictures_of(options: argparse.Namespace) -> Pictures:
-    """The pictures that the command line asks for.
+    """The pictures chosen on the command line.
 
     Raises:
         ValueError: If an option is out of range.
@@ -315,7 +315,7 @@ def pictures_of(options: argparse.Namespace) -> Pictures:
 
 
 def make(number: int, options: argparse.Namespace) -> None:
-    """Make what is missing of one pattern."""
+    """Make the missing files of one pattern."""
     pattern, pictures = flag_of(number, options), pictures_of(options)
     folder = options.out / f"pattern{number}"
 

@@ -1,4 +1,4 @@
-"""What ``bench.py accuracy`` measures: errors against closed forms and experiments."""
+"""What ``bench.py accuracy`` measures: errors against exact solutions and experiments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _plate(k: float, law: str, settings: Settings) -> dict[str, float]:
 
 
 def _surface(settings: Settings, **options: Any) -> dict[str, float]:
-    del settings  # no solver in it
+    del settings  # there is no solver in it
     return surfaces.surface_drag(**options)
 
 
@@ -111,7 +111,7 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
 
 
 def _soft_flag(dx: float, density: float, settings: Settings) -> dict[str, float]:
-    """250 frames of the softest of the paper's flags."""
+    """Run 250 frames of the softest of the paper's flags."""
     result, _ = flags.flag(
         dx,
         settings,
@@ -141,12 +141,12 @@ def measure(device: str, thorough: bool, only: str | None = None) -> list[Row]:
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py accuracy``."""
-    command.add_argument("--only", help="only the problems with this name")
+    command.add_argument("--only", help="only the problems whose name contains this")
     command.add_argument("--thorough", action="store_true", help="finer grids and full 3D; for a GPU")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure errors against closed forms and experiments."""
+    """Measure errors against exact solutions and experiments."""
     device, result = record.start(options.device)
     folder, name = Path(options.results), f"accuracy_{device.type}"
     only = options.only

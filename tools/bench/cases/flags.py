@@ -18,7 +18,7 @@ import yaml
 from bench.record import ROOT
 from gaussian_swaying.evaluation.compare import compare_run
 
-sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts, which find each other in their own folder
+sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts that import each other from their own folder
 
 from flag_reference import PATTERNS as REFERENCES
 
@@ -33,11 +33,11 @@ class Variant:
     """One way to simulate a flag.
 
     Attributes:
-        title: What the tables say.
+        title: The name in the tables.
         overlays: Files of configs/bench/variants on top of the matched configuration.
-        options: Further options of tools/sim.py.
-        patterns: Flags for which it differs from ``ours``.
-        training: Further options of tools/train.py; a variant with some has a splat of its own.
+        options: Other options of tools/sim.py.
+        patterns: The flags for which it differs from ``ours``.
+        training: Other options of tools/train.py; a variant with such options has its own splat.
         true_normals: Whether the Gaussians are turned to the reference's normals at rest.
     """
 
@@ -50,7 +50,7 @@ class Variant:
 
 
 def _grid(dx: float) -> tuple[str, ...]:
-    """Options for a grid spacing [m], with as many particles in a cell."""
+    """Options for a grid spacing [m], with the same number of particles per cell."""
     return (f"--solver.dx={dx:g}", f"--scene.particle_spacing={0.45 * dx:g}")
 
 
@@ -61,10 +61,10 @@ VARIANTS: dict[str, Variant] = {
     "no_shading": Variant("no shading", ("no_shading",)),
     "gusts": Variant("flow randomised", ("gusts",), patterns=(2, 3)),
     "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
-    "paper_area": Variant("areas π s1 s2", ("paper_area",)),
-    "membrane": Variant("one layer: no bending stiffness", options=("--scene.layers=1",)),
+    "paper_area": Variant("patch areas π s1 s2", ("paper_area",)),
+    "membrane": Variant("one layer (no bending stiffness)", options=("--scene.layers=1",)),
     "true_normals": Variant("with the reference's normals at rest", patterns=(2, 3), true_normals=True),
-    "one_point": Variant("one point to a Gaussian", options=("--scene.particle_spacing=null",)),
+    "one_point": Variant("one point per Gaussian", options=("--scene.particle_spacing=null",)),
     "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
     "total_03": Variant("`total`, dx = 0.03 m", options=_grid(0.03)),
     "total_02": Variant("`total`, dx = 0.02 m", options=_grid(0.02)),
@@ -73,16 +73,16 @@ VARIANTS: dict[str, Variant] = {
     "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), _grid(0.03)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), _grid(0.02)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
-    "stiffness_damping": Variant("damping of the stretching, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
+    "stiffness_damping": Variant("stiffness damping, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
     "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
-    "thin": Variant("half the thickness, twice E and density", options=("--material.thickness=0.005",)),
+    "thin": Variant("half the thickness, double E and density", options=("--material.thickness=0.005",)),
     **{
         f"b_{b:g}": Variant(
             f"size loss b = {b:g}, no late split",
             training=(
                 f"--model.loss_terms.size.init_args.b={b:g}",
-                "--model.densification.init_args.split_at=null",  # or it would make all sizes alike
+                "--model.densification.init_args.split_at=null",  # otherwise it would make all sizes alike
             ),
             patterns=(3,),
         )
@@ -101,7 +101,7 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
     arguments = [part for path in configs for part in ("--config", str(path))]
     if splat is not None:
         arguments += ["--scene.ply", str(splat)]
-    else:  # a ripple of 3 mm changes the incidence of the wind by more than a degree
+    else:  # the same ripple: 3 mm more would change the incidence of the wind by over a degree
         arguments += [f"--scene.generator.init_args.ripple={REFERENCES[pattern].ripple}"]
     camera = dataset / f"pattern{pattern}" / "video" / "camera.json"
     if camera.exists():
@@ -109,7 +109,7 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
         described = json.loads(camera.read_text())
         arguments += [f"--camera.width={described['w']}", f"--camera.height={described['h']}"]
     arguments += list(variant.options)
-    if {"particle", "no_surface"} & set(variant.overlays):  # as much friction as drag; no air in pattern 1
+    if {"particle", "no_surface"} & set(variant.overlays):  # friction equals drag; no air in pattern 1
         matched = yaml.safe_load((BENCH / f"flag{pattern}.yaml").read_text())
         arguments += [f"--aero.C_F={matched.get('aero', {}).get('C_D', 0.0)}"]
     if variant is VARIANTS["thin"]:
@@ -119,7 +119,7 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
 
 
 def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
-    """Train a splat of a flag from its photographs, unless it is there; how long it took lies beside it."""
+    """Train a splat of a flag from its photos, unless it exists; the time it took is saved next to it."""
     account = target / "training.json"
     if (target / "point_cloud.ply").exists():
         return json.loads(account.read_text()) if account.exists() else {"kept": True}
@@ -138,7 +138,7 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
 
 
 def turn_to_reference(splat: Path, cloth: Path, target: Path) -> None:
-    """Write a splat whose Gaussians are turned, the shortest way, to the normals of the reference at rest."""
+    """Write a splat whose Gaussians are turned, the shortest way, to the reference's normals at rest."""
     import numpy as np
     import torch
 
@@ -160,7 +160,7 @@ def turn_to_reference(splat: Path, cloth: Path, target: Path) -> None:
 
 
 def what_failed(told: str) -> str:
-    """The line of a process's last words that names the error."""
+    """The line of a process's last output that names the error."""
     lines = [line for line in told.strip().splitlines() if line.strip()]
     named = [line for line in lines if "rror:" in line]
     return (named or lines or ["no message"])[-1]
@@ -178,7 +178,7 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
     command += options.more.split() if options.more else []
     pictures = len(list((reference / "video" / "frames").glob("*.png")))
     with_pictures = pictures == 250
-    if not with_pictures:  # they may still be in the making
+    if not with_pictures:  # they may not be finished yet
         bare = folder / f"surface_{pattern}"
         bare.mkdir(parents=True, exist_ok=True)
         if not (bare / "cloth.npz").exists():
@@ -202,21 +202,21 @@ def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | 
         "mass_kg": summary["mass_kg"],
     }
     row["ms_per_frame"] /= max(summary["frames"], 1)
-    on = "cuda" if summary["peak_memory_bytes"]["device"] is not None else "cpu"  # where it ran
+    on = "cuda" if summary["peak_memory_bytes"]["device"] is not None else "cpu"  # the device of the run
     frames = options.frames or summary["frames"]
     found = compare_run(output, reference, frames=frames, points=options.points, device=on)
     row |= {key: found[key] for key in ("chamfer_share", "sampling_m", "psnr_of_mean_db") if key in found}
     row["mean"] = found["mean"]
     row["chamfer_per_frame_m"] = [entry.get("chamfer_m") for entry in found["per_frame"]]
-    (output / "trajectory.npz").unlink(missing_ok=True)  # gigabytes, and the figure needs the pictures alone
+    (output / "trajectory.npz").unlink(missing_ok=True)  # gigabytes, and the figure needs only the pictures
     return row
 
 
-_TIMES = (0.05, 0.2, 0.4, 0.6, 0.95)  # of a figure, as shares of the run
+_TIMES = (0.05, 0.2, 0.4, 0.6, 0.95)  # times of a figure, as shares of the run
 
 
 def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -> bool:
-    """Reference, ours, PhysGaussian's way and the error of ours at five times; False without pictures of all."""
+    """Draw reference, ours, PhysGaussian's way and our error at five times; False if pictures are missing."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -258,19 +258,19 @@ def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py flags``."""
     command.add_argument("--dataset", required=True, help="folder that tools/datasets/make_flag_dataset.py wrote")
-    command.add_argument("--rows", default=",".join(VARIANTS), help="a list with commas")
-    command.add_argument("--patterns", default="1,2,3", help="a list with commas")
+    command.add_argument("--rows", default=",".join(VARIANTS), help="separated by commas")
+    command.add_argument("--patterns", default="1,2,3", help="separated by commas")
     command.add_argument("--splats", default="outputs/flags", help="folder of the trained splats; `made` for splats "
-                         "made in code, which no training has blurred")  # fmt: skip
-    command.add_argument("--train_steps", type=int, default=7000, help="images of a training")
+                         "made in code, without training")  # fmt: skip
+    command.add_argument("--train_steps", type=int, default=7000, help="images of a training run")
     command.add_argument("--frames", type=int, help="only the first frames")
-    command.add_argument("--points", type=int, default=10_000, help="on the reference's surface")
+    command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
-    command.add_argument("--more", help='further options of tools/sim.py: --more="--frames=25"')
+    command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["rows"]``, saving it after each run; rows that are there and not asked for are kept."""
+    """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
     names = options.rows.split(",")
     if unknown := set(names) - set(VARIANTS):
         raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
@@ -305,7 +305,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
                         own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
                         turn_to_reference(own, Path(options.dataset) / f"pattern{pattern}" / "cloth.npz", splat)
                 elif variant.training or variant.true_normals:
-                    continue  # there is nothing to train, and normals are right
+                    continue  # there is nothing to train, and the normals are right
                 row |= run_row(pattern, name, options, splat, Path(scratch))
                 rows.setdefault(name, {})[str(pattern)] = row
                 shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}

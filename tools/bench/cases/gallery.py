@@ -1,4 +1,4 @@
-"""The scenes of the paper for ``bench.py gallery``: run, checked for whole and visible motion, and pictured."""
+"""The paper's scenes for ``bench.py gallery``: runs them, checks their motion, and makes pictures."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ SCENES = {
     "flag2": "Flag, pattern 2",
     "flag3": "Flag, pattern 3",
     "solid_surface_wind": "Solid, wind on its surface",
-    "solid_all_wind": "Solid, wind on all of it",
-    "sand_to_foam": "Sand made white foam",
+    "solid_all_wind": "Solid, wind on all Gaussians",
+    "sand_to_foam": "Sand turned into white foam",
 }
-"""File below configs/sim, without its ending, and title."""
+"""Name of the file in configs/sim, without suffix, and title."""
 
-_BASES = {"solid_all_wind": "solid_surface_wind", "sand_to_foam": "sand"}  # files of configs/sim/variants, and of what
+_BASES = {"solid_all_wind": "solid_surface_wind", "sand_to_foam": "sand"}
+"""Files in configs/sim/variants, and the scenes that they vary."""
 
 _SHOWN = (0.0, 0.08, 0.2, 0.45, 0.9)  # frames of a strip, as shares of the run
 _STRIP_WIDTH = 360  # of one picture [pixels]
@@ -71,7 +72,7 @@ def _without_modules(value: Any) -> Any:
 
 
 def strip(frames: Path, target: Path) -> None:
-    """A picture of five frames beside each other."""
+    """Make a picture of five frames side by side."""
     import numpy as np
     import torch
     from imageio.v3 import imread, imwrite
@@ -89,7 +90,7 @@ def strip(frames: Path, target: Path) -> None:
 
 
 def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
-    """Run a scene as a user does and keep what is told of it."""
+    """Run a scene as a user would, and return its summary."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "out"
         command = [sys.executable, str(ROOT / "tools" / "sim.py"), *arguments(name, options.preset)]
@@ -112,11 +113,11 @@ def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py gallery``."""
-    command.add_argument("--scenes", default=",".join(SCENES), help="a list with commas")
-    command.add_argument("--preset", help="folder of overlays below configs/sim; on a CPU `preview` if not given")
+    command.add_argument("--scenes", default=",".join(SCENES), help="separated by commas")
+    command.add_argument("--preset", help="folder of overlays below configs/sim; `preview` by default on a CPU")
     command.add_argument("--frames", type=int, help="only the first frames")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the strips")
-    command.add_argument("--more", help="further options of tools/sim.py, in quotes")
+    command.add_argument("--more", help="other options of tools/sim.py, in quotes")
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
@@ -133,7 +134,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
 
 
 def whole(row: Row) -> bool:
-    """Whether a run kept all its particles for all its frames and moved visibly, neither too little nor too far."""
+    """Whether a run kept all its particles, computed all its frames, and moved neither too little nor too far."""
     share = row.get("displacement_share")
     complete = row.get("status") == "complete" and row["frames"] >= row["frames_wanted"] and not row["lost_particles"]
     return bool(complete and share is not None and LEAST <= share <= MOST)
@@ -141,30 +142,30 @@ def whole(row: Row) -> bool:
 
 @value("gallery.least", "gallery_*", together=True)
 def least(_: list[Row]) -> str:
-    """Least mean displacement of what moves visibly."""
+    """The least mean displacement that counts as visible motion."""
     return f"{100 * LEAST:g} %"
 
 
 @value("gallery.most", "gallery_*", together=True)
 def most(_: list[Row]) -> str:
-    """Largest mean displacement of what stays in place."""
+    """The largest mean displacement of an object that stays in place."""
     return f"{100 * MOST:g} %"
 
 
 def of_today(name: str, row: Row) -> bool:
-    """Whether a run was recorded with the configuration files as they are now."""
+    """Whether a run was recorded with the present configuration files."""
     return bool(row.get("configuration") == fingerprint(name, row.get("preset")))
 
 
 def page(recorded: list[Row]) -> list[str]:
-    """Time, memory and motion of each scene, one table for each record."""
+    """Time, memory and motion of each scene, one table per record."""
     lines = []
     for result in recorded:
         stack = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
         lines += [f"{result['device']}; {stack}; seed {result['seed']}.", ""]
         lines += [
-            "| scene | particles | formulation | frames | substeps a frame | time a frame [ms] | process [s] | "
-            "host memory [GiB] | device memory [GiB] | displacement / size | whole |",
+            "| scene | particles | formulation | frames | substeps per frame | time per frame [ms] | "
+            "whole process [s] | host memory [GiB] | device memory [GiB] | displacement / size | OK |",
             "|" + "---|" * 11,
         ]
         for name, title in SCENES.items():
@@ -188,7 +189,7 @@ def page(recorded: list[Row]) -> list[str]:
         lines += [""]
         if any("failed" not in row and not of_today(name, row) for name, row in result["scenes"].items()):
             lines += [
-                "\\* Recorded before a configuration file of this scene was changed, or before that was noted.",
+                "\\* Recorded before a configuration file of this scene changed, or before records noted their files.",
                 "",
             ]
     return lines

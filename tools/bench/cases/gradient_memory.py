@@ -24,7 +24,7 @@ def peak() -> float:
 
 
 def main() -> None:
-    """Roll a flag of about a thousand particles out and take the gradient with respect to E and the wind."""
+    """Simulate a flag of about a thousand particles and compute the gradient with respect to E and the wind."""
     formulation, steps, checkpoint = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     before = peak()
     settings = Settings(formulation=formulation, dtype=torch.float32)

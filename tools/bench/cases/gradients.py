@@ -12,7 +12,7 @@ from pathlib import Path
 from bench import record
 
 ROLLOUTS = ((50, 0), (500, 0), (500, 22), (2000, 45))
-"""Substeps, and after how many a state is kept (0: all are)."""
+"""Number of substeps, and the interval at which states are kept (0: all are kept)."""
 
 
 def run(options: argparse.Namespace) -> None:

@@ -19,8 +19,8 @@ from gaussian_swaying.validation.settings import Settings
 
 Row = dict[str, Any]
 
-# per problem: sizes from coarse to fine, what they count, and the fixed substep [s]: for the flag PhysGaussian's, for
-# the others about what the finest grid needs
+# per problem: sizes from coarse to fine, their unit, and the fixed substep [s]: PhysGaussian's for the flag, and about
+# what the finest grid needs for the others
 PROBLEMS: dict[str, tuple[tuple[float, ...], str, float]] = {
     "bar": ((8, 16, 32, 64), "cells along the bar", 0.4 * 25 / 64 / 11.6),
     "cantilever": ((1, 2, 3, 4), "cells through the thickness", 0.0),
@@ -36,7 +36,7 @@ PROVEN_CFL = 0.47  # stable for every arrangement of particles and every Poisson
 
 
 def settings_of(problem: str, device: str) -> Iterator[tuple[Row, Settings]]:
-    """The settings swept for a problem: every CFL number in float32, float64 at the default, a fixed substep."""
+    """The settings to sweep for a problem: every CFL number in float32, the default in float64, a fixed substep."""
     sizes, _, fixed = PROBLEMS[problem]
     for size in sizes:
         for variant, (formulation, mls) in FORMULATIONS.items():
@@ -44,7 +44,7 @@ def settings_of(problem: str, device: str) -> Iterator[tuple[Row, Settings]]:
             coarse = size in sizes[:2]
             for cfl in CFLS:
                 if problem in ("cantilever", "hinged plate") and cfl < 0.4 and not (coarse and device == "cpu"):
-                    continue  # tens of thousands of substeps, for an error that the substep does not rule
+                    continue  # tens of thousands of substeps, for an error that hardly depends on the substep
                 yield (
                     {"size": size, "variant": variant, "dtype": "float32", "cfl": cfl, "substep": None},
                     replace(base, cfl=cfl),
@@ -62,7 +62,7 @@ def settings_of(problem: str, device: str) -> Iterator[tuple[Row, Settings]]:
 
 
 def run_problem(problem: str, size: float, settings: Settings, reference: Tensor | None) -> dict[str, float]:
-    """One run; its ``error`` is relative, for the hinged plate in degrees."""
+    """One run; its ``error`` is relative, except for the hinged plate, where it is in degrees."""
     if problem == "bar":
         return bars.vibrating_bar(int(size), settings)
     if problem == "cantilever":
@@ -102,7 +102,7 @@ def measure(device: str, only: list[str] | None = None) -> list[Row]:
 
 
 def front(rows: list[Row]) -> list[Row]:
-    """The rows that no other beats in both error and time, cheapest first."""
+    """The rows that no other row beats in both error and time, cheapest first."""
     good = sorted((r for r in rows if r["error"]), key=lambda r: (r["wall_per_simulated_s"], r["error"]))
     kept: list[Row] = []
     for row in good:
@@ -112,7 +112,7 @@ def front(rows: list[Row]) -> list[Row]:
 
 
 def is_default(row: Row) -> bool:
-    """Whether a row was run with the default settings of the solver, whatever its grid."""
+    """Whether a row used the default settings of the solver, on any grid."""
     return all(row[name] == value for name, value in DEFAULT.items())
 
 
@@ -133,7 +133,7 @@ def on_front(row: Row, rows: list[Row], noise: float = 0.1) -> bool:
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py pareto``."""
-    command.add_argument("--only", help="only the problems with these names, a list with commas")
+    command.add_argument("--only", help="only the problems with these names, separated by commas")
 
 
 def run(options: argparse.Namespace) -> None:

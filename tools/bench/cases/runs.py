@@ -1,4 +1,4 @@
-"""What ``bench.py substep`` and ``bench.py sim`` measure: one elastic substep, and whole runs as a user starts them."""
+"""What ``bench.py substep`` and ``bench.py sim`` measure: one elastic substep, and whole runs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def bench_substep(
 
 
 def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, Any]:
-    """Run tools/sim.py as a user does, in its own process, and keep its summary."""
+    """Run tools/sim.py as a user would, in its own process, and return its summary."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(record.ROOT / "tools" / "sim.py"), *arguments, "--device", device.type]
         begin = time.perf_counter()
@@ -80,12 +80,12 @@ def substep(options: argparse.Namespace) -> None:
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py sim``."""
     command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
-    command.add_argument("--frames", type=int, help="frames of the captured object; all if not given")
-    command.add_argument("--more", help='further options of tools/sim.py: --more="--frames=25"')
+    command.add_argument("--frames", type=int, help="frames of the captured object; default: all")
+    command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
 
 
 def sim(options: argparse.Namespace) -> None:
-    """Measure the main job."""
+    """Measure whole runs: the default flag and a captured object."""
     device, result = record.start(options.device)
     configs = record.ROOT / "configs" / "sim"
     more = options.more.split() if options.more else []

@@ -33,24 +33,24 @@ SECTIONS = ("substep", "sand", "batch", "frame")
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is measured on a device.
+    """How much to measure on a device.
 
     Attributes:
         counts: Particles of the sheets.
-        torch_limit: Most particles for which the torch path is timed beside the Triton one.
+        torch_limit: Most particles for which the torch path is timed as well as the Triton path.
         exact_limit: Most particles for which the error against float64 is measured.
         sand: Particles of the block of sand.
         scenes: Flags of the batch.
         side: Particles along a side of each of them.
-        steps: Substeps of the rollout that is timed, and of the longer one that gives the slope.
+        steps: Substeps of the timed rollout, and of the longer one that gives the slope.
         torch_steps: Substeps of the rollout with the torch path.
-        warm: Rollouts before the first that is timed; on CUDA one compiles and one records graphs.
-        repeats: Rollouts that are timed, and longer ones.
+        warm: Rollouts before the first timed one; on CUDA, one compiles and one records graphs.
+        repeats: Number of timed rollouts, and of longer ones.
         copy_bytes: Size of the copy [bytes].
-        frames: Frames before the first that is timed, and timed ones.
-        picture: Its width and height.
+        frames: Frames before the first timed one, and timed frames.
+        picture: Width and height of the picture.
         spacing: Distance between the Gaussians of the flag [m].
-        dx: Its grid spacings [m]; the goals are those of the first.
+        dx: Grid spacings of the flag [m]; the goals are for the first.
     """
 
     counts: tuple[int, ...]
@@ -99,7 +99,7 @@ PLANS = {
 
 
 def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
-    """The plan of a kind of device, with other counts (``"5000,20000"``), or all of it small enough for a test."""
+    """The plan for a kind of device; with other counts (``"5000,20000"``), or small enough for a test."""
     plan = PLANS[kind]
     if quick:
         plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
@@ -115,9 +115,9 @@ def _double(state: MPMState) -> MPMState:
 
 
 def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load: WindForce | None) -> Row:
-    """Largest difference from the same rollout by the torch path in float64.
+    """Largest difference from the same rollout with the torch path in float64.
 
-    Positions relative to the largest displacement since the start, velocities to the largest velocity.
+    Positions are relative to the largest displacement since the start, velocities to the largest velocity.
     """
     exact = MPMSolver(dx=solver.dx, formulation=solver.formulation, transfer="torch")
     exact.init_state(solver.points.map(Tensor.double))
@@ -133,7 +133,7 @@ def error_of(end: MPMState, solver: MPMSolver, start: MPMState, steps: int, load
 
 
 def bench_rollout(plan: Plan, asked: int, formulation: str, device: torch.device, copy: float, sand: bool) -> Row:
-    """Time, bytes, memory and error of substeps: a sheet in wind, or a block of sand without."""
+    """Time, bytes, memory and error of substeps: a sheet in wind, or a block of sand without wind."""
     peak = Peak(device)
     points = (block if sand else sheet)(asked, device)
     load = None if sand else wind_load(points, wind(0, True, device))
@@ -175,7 +175,7 @@ def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindForce 
 
 
 def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device) -> Row:
-    """Flags in different winds: all in one rollout, against a rollout of each, one after the other."""
+    """Flags in different winds: all in one rollout, compared with one rollout after another."""
     steps = plan.steps[0]
     winds = [wind(k, gusts, device) for k in range(plan.scenes)]
     one = sheet(plan.side**2, device)
@@ -212,7 +212,7 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
 
 
 def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
-    """Frames of configs/sim/flag.yaml, from the state of one to the picture of the next on the device."""
+    """Frames of configs/sim/flag.yaml: from the state of one frame to the picture of the next, on the device."""
     width, height = plan.picture
     arguments = ["--config", str(CONFIG), "--device", device.type, "--solver.dx", str(dx)]
     arguments += ["--scene.generator.init_args.spacing", str(plan.spacing)]
@@ -251,12 +251,12 @@ def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
 def measure(
     plan: Plan, device: torch.device, result: Row, save: Callable[[Row], None], only: list[str] | None = None
 ) -> None:
-    """Fill ``result`` with the wanted sections and save it after each case; ``partial`` is in it until the last.
+    """Fill ``result`` with the wanted sections and save it after each case; its key ``partial`` goes at the end.
 
     Args:
         plan: How much to measure.
-        device: Where.
-        result: What is known already; sections that are not wanted stay as they are.
+        device: Where to measure.
+        result: The record so far; sections that are not wanted stay as they are.
         save: Writes the result.
         only: Which of ``SECTIONS``; all if None.
     """
@@ -298,8 +298,8 @@ def measure(
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py speed``."""
-    command.add_argument("--counts", help="particles of the sheets, a list with commas")
-    command.add_argument("--only", help=f"of {', '.join(SECTIONS)}: a list with commas")
+    command.add_argument("--counts", help="particles of the sheets, separated by commas")
+    command.add_argument("--only", help=f"some of {', '.join(SECTIONS)}, separated by commas")
     command.add_argument("--quick", action="store_true", help="tiny counts, only to see that it runs")
 
 
@@ -309,7 +309,7 @@ def run(options: argparse.Namespace) -> None:
     result["kind"], result["threads"], result["quick"] = device.type, torch.get_num_threads(), options.quick
     folder = Path(options.results)
     if options.quick and folder.resolve() == record.RESULTS:
-        raise SystemExit("--quick measures nothing worth keeping: give it another folder with --results")
+        raise SystemExit("--quick measures nothing worth keeping: choose another folder with --results")
     name = f"speed_{device.type}"
     path = folder / f"{name}.json"
     only = options.only.split(",") if options.only else None

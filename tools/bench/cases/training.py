@@ -1,4 +1,4 @@
-"""Training runs for ``bench.py train``: a bare gsplat loop beside Lightning, variants of the fox, a flag's ablation."""
+"""Training runs for ``bench.py train``: a bare gsplat loop, Lightning, variants of the fox, and a flag's ablation."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def _weights(**weights: float) -> list[str]:
 
 FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
     "surface": ("all surface losses, paper's weights", []),
-    "consistent": ("initial points where the photos agree", [*_weights(**_NO_SURFACE), *_CONSISTENT]),
+    "consistent": ("initial points from photo-consistency", [*_weights(**_NO_SURFACE), *_CONSISTENT]),
     "mcmc": ("MCMC, 300,000 Gaussians", [*_weights(**_NO_SURFACE), *_MCMC]),
     "mcmc_consistent": (
-        "MCMC, 300,000 Gaussians, points where the photos agree",
+        "MCMC, 300,000 Gaussians, points from photo-consistency",
         [*_weights(**_NO_SURFACE), *_MCMC, *_CONSISTENT],
     ),
     "absgrad": (
@@ -63,17 +63,17 @@ FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
         ],
     ),
     "schedule": (
-        "densification until step 4,000, a harmonic degree every 500",
+        "densification until step 4,000, one more harmonic degree every 500",
         [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000", "--model.sh_every=500"],
     ),
     "degree_1": ("harmonics of degree 1", [*_weights(**_NO_SURFACE), "--model.sh_degree=1"]),
 }
-"""What is tried on the fox besides the schedule of the bare loop: name to description and command line."""
+"""Variants of the schedule of the bare loop on the fox: name to description and command line."""
 
 _ALL_SURFACE = {"anisotropy": 10.0, "entropy": 0.01, "size": 0.01}
 
 FLAG_ROWS: dict[str, tuple[str, dict[str, float]]] = {
-    "none": ("photometric alone", _NO_SURFACE),
+    "none": ("photometric only", _NO_SURFACE),
     "anisotropy": ("+ anisotropy", _NO_SURFACE | {"anisotropy": 10.0}),
     "entropy": ("+ entropy", _NO_SURFACE | {"anisotropy": 10.0, "entropy": 0.01}),
     "size": ("+ size (all)", _ALL_SURFACE),
@@ -81,7 +81,7 @@ FLAG_ROWS: dict[str, tuple[str, dict[str, float]]] = {
 }
 """Rows of the ablation of the surface losses: name to description and weights.
 
-The first four densify until image 15,000, as 3DGS does, the last as the configuration says.
+The first four densify until image 15,000, as 3DGS does; the last follows the configuration.
 """
 
 
@@ -97,7 +97,7 @@ def _arguments(config: str, more: list[str], steps: int, folder: Path) -> list[s
 
 
 class _Clock:
-    """Seconds between two places, with everything on the GPU done."""
+    """Seconds between two points, after waiting for the GPU."""
 
     def __init__(self) -> None:
         self.wait()
@@ -140,7 +140,7 @@ def _finish(model: GaussianSurfaceModel, data: CaptureDataModule, seconds: float
 
 
 def bare_loop(config: str, more: list[str], steps: int, device: torch.device) -> Row:
-    """The schedule of a configuration as a plain loop over gsplat, with the photometric loss alone.
+    """The schedule of a configuration as a plain loop over gsplat, with only the photometric loss.
 
     The images and cameras are on the device from the start; nothing is logged, checked or saved.
     """
@@ -211,11 +211,11 @@ def _count(data: CaptureDataModule) -> int:
 def lightning_run(
     config: str, more: list[str], steps: int, folder: Path, look: Callable[[Any, Any], Row] | None = None
 ) -> Row:
-    """The same through the classes of tools/train.py: logs, progress bar, and at the end a checkpoint and the .ply."""
+    """The same with the classes of tools/train.py: logs, progress bar, and a checkpoint and .ply at the end."""
     from lightning.pytorch.callbacks import Callback
 
     class Timer(Callback):
-        """Seconds from the first image to the last; it stands before the checkpoints among the callbacks."""
+        """Seconds from the first image to the last; it comes before the checkpoints in the list of callbacks."""
 
         clock: _Clock
         seconds = 0.0
@@ -261,12 +261,12 @@ def _flag_look(picture: Path | None) -> Callable[[GaussianSurfaceModel, Generate
 
 
 def flag_options(row: str) -> list[str]:
-    """Command line of one of FLAG_ROWS."""
+    """Command line for one of FLAG_ROWS."""
     return _weights(**FLAG_ROWS[row][1]) + ([] if row == "settled" else ["--model.densification.stop=15000"])
 
 
 def run(name: str, path: str, steps: int, folder: Path, picture: Path | None = None) -> Row:
-    """One run by name: ``bare``, ``lightning``, a name of FOX_VARIANTS, or ``flag:`` and one of FLAG_ROWS."""
+    """One run by name: ``bare``, ``lightning``, a name in FOX_VARIANTS, or ``flag:`` and a name in FLAG_ROWS."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     at = [f"--data.init_args.path={path}"]
     if name.startswith("flag:"):
@@ -279,7 +279,7 @@ def run(name: str, path: str, steps: int, folder: Path, picture: Path | None = N
 
 
 def _visible(gpu: int) -> str:
-    """What CUDA_VISIBLE_DEVICES says for one of the GPUs that this process sees."""
+    """The value of CUDA_VISIBLE_DEVICES for one of the GPUs that this process sees."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     return listed.split(",")[gpu] if listed else str(gpu)
 
@@ -287,9 +287,9 @@ def _visible(gpu: int) -> str:
 def run_apart(
     jobs: list[tuple[str, str, int, Path | None]], folder: Path, at_once: int, done: Callable[[str, Row], None]
 ) -> None:
-    """Several runs in processes of their own, ``done`` as each ends.
+    """Do several runs in separate processes, and call ``done`` when each ends.
 
-    They are spread over the GPUs; several at once on one device slow each other down.
+    The runs are spread over the GPUs. Several runs on one GPU slow each other down.
     """
     gpus = max(torch.cuda.device_count(), 1)
     waiting = list(jobs)
@@ -323,12 +323,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py train``."""
     command.add_argument("--capture", help="folder of photos for configs/train/fox.yaml")
     command.add_argument("--flag", default="outputs/captures/flag_800", help="folder of the generated flag's photos")
-    command.add_argument("--only", default=",".join(SECTIONS), help=f"of {', '.join(SECTIONS)}: a list with commas")
-    command.add_argument("--variants", default=",".join(FOX_VARIANTS), help="of the capture: a list with commas")
-    command.add_argument("--rows", default=",".join(FLAG_ROWS), help="of the flag: a list with commas")
-    command.add_argument("--steps", type=int, default=7000, help="images of a training of the capture")
-    command.add_argument("--flag_steps", type=int, default=30_000, help="images of a training of the flag")
-    command.add_argument("--repeats", type=int, default=2, help="of the bare loop and of Lightning, in turn")
+    command.add_argument(
+        "--only", default=",".join(SECTIONS), help=f"some of {', '.join(SECTIONS)}, separated by commas"
+    )
+    command.add_argument(
+        "--variants", default=",".join(FOX_VARIANTS), help="variants of the capture, separated by commas"
+    )
+    command.add_argument("--rows", default=",".join(FLAG_ROWS), help="rows of the flag, separated by commas")
+    command.add_argument("--steps", type=int, default=7000, help="images of a training run on the capture")
+    command.add_argument("--flag_steps", type=int, default=30_000, help="images of a training run on the flag")
+    command.add_argument("--repeats", type=int, default=2, help="runs of the bare loop and of Lightning, alternating")
     command.add_argument("--at_once", type=int, default=4, help="variants and rows trained at the same time")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the flag's pictures")
 
@@ -339,7 +343,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     if unknown := set(wanted) - set(SECTIONS):
         raise SystemExit(f"--only takes {', '.join(SECTIONS)}, not {', '.join(sorted(unknown))}")
     if {"pair", "variants"} & set(wanted) and not options.capture:
-        raise SystemExit("the capture is missing: give its folder with --capture, or leave it out with --only flag")
+        raise SystemExit("the capture is missing: pass its folder with --capture, or skip it with --only flag")
 
     def keep(section: str) -> Callable[[str, Row], None]:
         def done(name: str, row: Row) -> None:
@@ -372,7 +376,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
 
 
 def main() -> None:
-    """One run, for :func:`run_apart`."""
+    """Do one run, for :func:`run_apart`."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("name")
     parser.add_argument("path")

@@ -1,1 +1,1 @@
-"""Tables, values and plots made from the recorded JSON; each file is named after the case that records it."""
+"""Tables, values and plots made from the recorded JSON; each file has the name of the case that records its data."""

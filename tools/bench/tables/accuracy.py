@@ -43,7 +43,7 @@ def devices(results: list[Row]) -> list[str]:
 
 @rows_table("accuracy.goals")
 def goals(rows: list[Row]) -> list[str]:
-    """The goals, and what failed to be measured."""
+    """The goals, and the measurements that failed."""
     found = [(name, wanted, judge(rows)) for name, wanted, judge in GATES]
     reached = [[name, wanted, one[0], "yes" if one[1] else "**no**"] for name, wanted, one in found if one]
     lines = grid(["goal", "wanted", "measured", "reached"], reached)
@@ -67,7 +67,7 @@ def _convergence(rows: list[Row], problem: str, columns: dict[str, str], **param
 
 
 _LOSS = {"loss": "amplitude lost per period"}
-_SHIFT = {"end_shift": "the pin seems further out by [cells]"}
+_SHIFT = {"end_shift": "apparent outward shift of the pin [cells]"}
 
 CONVERGENCE: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
     "accuracy.free_bar": ("vibrating bar", _LOSS, {"ends": "free"}),
@@ -85,11 +85,11 @@ for _name, (_problem, _columns, _parameters) in CONVERGENCE.items():
 
 @rows_table("accuracy.free_block")
 def free_block(rows: list[Row]) -> list[str]:
-    """Energy and momenta of the block that nothing holds."""
+    """Energy and momenta of the free block."""
     names = {
-        "kept": "energy at the end, of the start",
+        "kept": "final / initial energy",
         "error": "largest change",
-        "growth": "largest rise of a single state",
+        "growth": "largest rise of any single state",
         "linear": "change of linear momentum",
         "angular": "change of angular momentum",
         "substeps": "substeps",
@@ -122,7 +122,7 @@ def hinged_plate(rows: list[Row]) -> list[str]:
 
 @rows_table("accuracy.surface_drag")
 def surface_drag(rows: list[Row]) -> list[str]:
-    """Drag on surfaces made of Gaussians, as a share of the exact one."""
+    """Drag on surfaces made of Gaussians, as a share of the exact drag."""
     places: dict[tuple[Any, ...], dict[str, str]] = {}
     for row in select(rows, "surface drag"):
         p = row["parameters"]
@@ -140,13 +140,13 @@ def surface_drag(rows: list[Row]) -> list[str]:
 
 @rows_table("accuracy.cantilever")
 def cantilever(rows: list[Row]) -> list[str]:
-    """Drop of a cantilever, and where its error comes from."""
+    """Drop of a cantilever, and the sources of its error."""
     names = {
         "drop": "drop / L",
         "error": "error of the drop",
-        "shear": "of that, shear",
-        "quadrature": "of that, quadrature",
-        "unexplained": "left over",
+        "shear": "part from shear",
+        "quadrature": "part from quadrature",
+        "unexplained": "unexplained part",
         "shortening_error": "error of the shortening",
     }
     return grid(
@@ -171,7 +171,7 @@ def _mobilised(degrees: float) -> float:
 
 @rows_table("accuracy.sand_angles")
 def sand_angles(rows: list[Row]) -> list[str]:
-    """Friction angles of the law of sand, of an element and of a layer."""
+    """Friction angles of the sand law, for an element and for a layer."""
     strength = _mobilised(30.0)
     exact = {"shear": math.degrees(math.atan(strength)), "plane": math.degrees(math.asin(strength))}
     shown = []
@@ -185,7 +185,7 @@ def sand_angles(rows: list[Row]) -> list[str]:
         angles = [f"{result['friction_deg']:.2f}", f"{result['exact']:.2f}"]
         shown += [["a layer that slides down an incline, from its acceleration", *angles]]
         shown += [["a layer on an incline: steepest on which it stands", f"{result['stands']:.0f}", "-"]]
-        shown += [["a layer on an incline: least on which it flows", f"{result['flows']:.0f}", "-"]]
+        shown += [["a layer on an incline: least steep on which it flows", f"{result['flows']:.0f}", "-"]]
     return grid(["test, phi = 30 degrees", "angle [deg]", "theory [deg]"], shown)
 
 
@@ -198,7 +198,7 @@ def plane_strain_angle(results: list[Row]) -> str:
 
 @value("accuracy.band", "accuracy_*", together=True)
 def band(results: list[Row]) -> str:
-    """The largest ratio of Lube's and Lajeunesse's run-outs, of the round columns."""
+    """The largest ratio between Lube's and Lajeunesse's run-outs, over the round columns."""
     rows = select([row for result in results for row in result["rows"]], "sand column", planar=False)
     pairs = [sorted((row["result"]["lube"], row["result"]["lajeunesse"])) for row in rows]
     return f"{max(high / low for low, high in pairs):.1f}"
@@ -206,14 +206,14 @@ def band(results: list[Row]) -> str:
 
 @rows_table("accuracy.sand_columns")
 def sand_columns(rows: list[Row]) -> list[str]:
-    """Run-out of columns of sand that collapse."""
+    """Run-out of collapsing columns of sand."""
     names = {
         "runout": "run-out",
         "lube": "Lube",
         "lajeunesse": "Lajeunesse",
         "height": "height / L0",
         "slope_deg": "slope [deg]",
-        "volume_ratio": "volume after / before",
+        "volume_ratio": "final / initial volume",
         "particles": "particles",
     }
     return grid(
@@ -252,7 +252,7 @@ def sand_exponents(rows: list[Row]) -> list[str]:
 
 @rows_table("accuracy.soft_flag")
 def soft_flag(rows: list[Row]) -> list[str]:
-    """Whether the softest of the paper's flags stays whole."""
+    """Whether the softest of the paper's flags keeps all its particles and does not tear."""
     return grid(
         ["dx [m]", "density [kg/m³]", "substeps", "torn", "singular values of F", "seconds"],
         [

@@ -28,7 +28,7 @@ def _bar_gate(ends: str) -> Callable[[list[Row]], tuple[str, bool] | None]:
     return judge
 
 
-gate("confined bar (free; either half is a fixed-free bar), frequency at 64 cells, `total`", "within 0.5 %")(
+gate("confined bar (free ends; each half is a fixed-free bar), frequency at 64 cells, `total`", "within 0.5 %")(
     _bar_gate("free")
 )
 gate("fixed-free bar, held by a PinnedRegion, frequency at 64 cells, `total`", "within 0.5 %")(_bar_gate("fixed-free"))
@@ -71,14 +71,14 @@ def _(rows: list[Row]) -> tuple[str, bool] | None:
     return None if worst is None else (f"{worst:.2f} degrees at worst", worst <= 1)
 
 
-@gate("drag on a plate and a sphere, whatever Gaussians carry them, areas `coverage`", "within 3 %")
+@gate("drag on a plate and a sphere, for any set of Gaussians, areas `coverage`", "within 3 %")
 def _(rows: list[Row]) -> tuple[str, bool] | None:
     found = select(rows, "surface drag", area="coverage")
     worst = max((abs(row["result"]["error"]) for row in found), default=None)
     return None if worst is None else (f"{100 * worst:.2f} % at worst", worst <= 0.03)
 
 
-@gate("free elastic block, energy averaged over a period, 100 periods, `total`", "changes by less than 0.1 %")
+@gate("free elastic block, energy averaged over a period, 100 periods, `total`", "change below 0.1 %")
 def _(rows: list[Row]) -> tuple[str, bool] | None:
     found = select(rows, "free block", variant="total")
     if not found:
@@ -87,7 +87,7 @@ def _(rows: list[Row]) -> tuple[str, bool] | None:
     return f"{100 * change:.4f} %", change < 1e-3
 
 
-@gate("soft flag, E = 3e3 Pa, density 20 to 50, dx 0.08 to 0.01, 250 frames, `total`", "stays whole")
+@gate("soft flag, E = 3e3 Pa, density 20 to 50, dx 0.08 to 0.01, 250 frames, `total`", "no particle torn or lost")
 def _(rows: list[Row]) -> tuple[str, bool] | None:
     found = select(rows, "soft flag")
     if len(found) < 8:

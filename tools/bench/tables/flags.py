@@ -30,13 +30,13 @@ def _psnr(row: Row | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-_GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB and share of the distance, against PhysGaussian's way
-_OTHER = {  # variants of the reference that are other flags, or on a mesh too coarse to count
-    "half the cells": "on half as many cells along a side",
+_GAIN = {1: (1.7, 0.83), 2: (0.3, 0.96), 3: (4.2, 0.25)}  # dB, and share of the distance of PhysGaussian's way
+_OTHER = {  # variants of the reference that are different flags, or have a mesh too coarse to count
+    "half the cells": "with half as many cells along a side",
     "hardly bending": "on that mesh, with a fiftieth of its bending stiffness",
-    "self-contact": "on that mesh, keeping away from itself",
+    "self-contact": "on that mesh, with self-contact",
 }
-_SHARE = 0.03  # of the longer side, that Chamfer distances are to stay within
+_SHARE = 0.03  # goal for Chamfer distances, as a share of the longer side
 
 
 def _complete(rows: Row, name: str, pattern: int) -> Row | None:
@@ -45,7 +45,7 @@ def _complete(rows: Row, name: str, pattern: int) -> Row | None:
 
 
 def goals(result: Row) -> list[tuple[str, str, bool]]:
-    """What was to be reached, what was measured, and whether it is."""
+    """The goals, the measured values, and whether each goal is reached."""
     rows, found = result["rows"], []
     for pattern in PATTERNS:
         ours = _complete(rows, "ours", pattern)
@@ -69,22 +69,22 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
             found.append((goal, f"{ratio:.2f} times", ratio <= factor))
             if "psnr_db" in ours["mean"] and "psnr_db" in other["mean"]:
                 gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
-                goal = f"pattern {pattern}: PSNR {decibels:+g} dB against PhysGaussian's way"
+                goal = f"pattern {pattern}: PSNR {decibels:+g} dB over PhysGaussian's way"
                 found.append((goal, f"{gain:+.2f} dB", gain >= decibels))
         other = _complete(rows, "no_surface", pattern)
         if other is not None:
             ratio = other["chamfer_share"] / share
-            goal = f"pattern {pattern}: without surface modelling at least twice the Chamfer distance"
+            goal = f"pattern {pattern}: Chamfer distance at least twice as large without surface modelling"
             found.append((goal, f"{ratio:.2f} times", ratio >= 2))
         other = _complete(rows, "no_shading", pattern)
         if other is not None and "psnr_db" in ours["mean"]:
             gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
-            found.append((f"pattern {pattern}: without shading a lower PSNR", f"{-gain:+.2f} dB", gain > 0))
+            found.append((f"pattern {pattern}: lower PSNR without shading", f"{-gain:+.2f} dB", gain > 0))
     return found
 
 
 def pattern_lines(rows: Row, pattern: int) -> list[str]:
-    """When a flag leaves its reference, and what moves it nearer or farther."""
+    """When a flag leaves its reference, and which changes move it closer or further away."""
     ours = _complete(rows, "ours", pattern)
     if ours is None:
         return []
@@ -95,7 +95,7 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
     if third:
         parts = [distances[:third], distances[third : 2 * third], distances[2 * third :]]
         told = ", ".join(f"{100 * sum(part) / len(part) / longer:.2f} %" for part in parts)
-        lines.append(f"- pattern {pattern}, distance in the three thirds of the run: {told}")
+        lines.append(f"- pattern {pattern}, distance in each third of the run: {told}")
     changes = {
         VARIANTS[name].title: row["chamfer_share"] - ours["chamfer_share"]
         for name in rows
@@ -104,15 +104,15 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
     if changes:
         order = sorted(changes, key=lambda name: changes[name])
         told = "; ".join(f"{name} {100 * changes[name]:+.2f}" for name in order)
-        lines.append(f"- pattern {pattern}, change of the distance [% of the longer side] by one thing: {told}")
+        lines.append(f"- pattern {pattern}, effect of a single change on the distance [% of the longer side]: {told}")
     return lines
 
 
 @table(PAGE, "flags.device", "flags_*")
 def device(result: Row) -> list[str]:
-    """What the runs were made with, and what is to be known of them."""
+    """The devices and versions of the runs, and notes about them."""
     lines = [f"Splats {result['splats']}; {source(result)}"]
-    lines += [f"Further options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
+    lines += [f"Other options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
     return [*lines, result["note"]] if result.get("note") else lines
 
 
@@ -138,7 +138,7 @@ def goal_table(result: Row) -> list[str]:
 
 @table(PAGE, "flags.changes", "flags_*")
 def changes(result: Row) -> list[str]:
-    """When each flag leaves its reference, and what one change at a time does."""
+    """When each flag leaves its reference, and the effects of single changes."""
     return [line for pattern in PATTERNS for line in pattern_lines(result["rows"], pattern)]
 
 
@@ -157,12 +157,12 @@ def costs(result: Row) -> list[str]:
         for pattern, row in sorted(result["rows"].get(name, {}).items())
         if "substeps" in row
     ]
-    return grid(["", "particles", "substeps", "time a frame [ms]", "device memory [GiB]"], shown)
+    return grid(["", "particles", "substeps", "time per frame [ms]", "device memory [GiB]"], shown)
 
 
 @table(PAGE, "flags.reference", "flags_*", together=True)
 def reference(results: list[Row]) -> list[str]:
-    """How far the reference is from itself, from the first record that says so."""
+    """Uncertainty of the reference, from the first record that has it."""
     lines = []
     for pattern, found in sorted(_uncertainty(results).items()):
         shown = [
@@ -189,7 +189,7 @@ def distance(result: Row, name: str, pattern: str) -> str:
 
 @value("flags.reference_distance", "flags_*", together=True)
 def reference_distance(results: list[Row], name: str, pattern: str) -> str:
-    """How far the reference is from itself, solved otherwise; the name has ``_`` for its spaces."""
+    """Distance between the reference and a variant of it; ``_`` in the name stands for a space."""
     return f"{100 * _uncertainty(results)[pattern][name.replace('_', ' ')]['chamfer']:.2f} %"
 
 
@@ -213,5 +213,5 @@ def incidence(_: list[Row], pattern: str) -> str:
 
 @value("flags.per_degree", "flags_*", together=True)
 def per_degree(_: list[Row], pattern: str) -> str:
-    """Change of the pressure, which goes with the sine of the incidence, by a degree."""
+    """Change of the pressure (proportional to the sine of the incidence) for one degree."""
     return f"{100 * math.radians(1) / math.tan(_incidence(pattern)):.0f} %"

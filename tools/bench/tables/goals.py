@@ -1,4 +1,4 @@
-"""The goals of docs/benchmarks.md: what was wanted, what was measured, and whether it is reached."""
+"""The goals of docs/benchmarks.md: what was wanted, what was measured, and whether the goal is reached."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from bench.tables.markdown import gib, grid, yes_no
 
 Row = dict[str, Any]
 Goal = tuple[str, str, bool | None, str, bool | None]
-"""Goal, what was measured, whether it was reached (None: not measured), the stretch goal, and whether that was."""
+"""Goal, measured value, whether it is reached (None: not measured), stretch goal, and whether that is reached."""
 
 GOALS = {
     "flag_cpu": "flag end to end on 2 CPU cores: within 90 s and 2 GB",
     "substep_cpu": "one elastic substep of 20,000 particles on 2 CPU cores: within 40 ms",
     "whole": "captured object over 250 frames: no particle lost, singular values of F within [0.5, 2]",
-    "round_trip": "captured object, frame 0 against the splat itself: PSNR of 35 dB",
-    "object_cuda": "captured object, 250 frames at 1920x1080 on one H200, files apart: within 180 s and 2 GiB",
-    "object_cuda_fast": "captured object, 250 frames at 1920x1080 on one H200, files apart: within 6 s",
+    "round_trip": "captured object, frame 0 compared with the splat itself: PSNR of at least 35 dB",
+    "object_cuda": "captured object, 250 frames at 1920x1080 on one H200, not counting files: within 180 s and 2 GiB",
+    "object_cuda_fast": "captured object, 250 frames at 1920x1080 on one H200, not counting files: within 6 s",
 }
 
 

@@ -12,7 +12,7 @@ Row = dict[str, Any]
 
 @table("validation.md", "gradients.memory", "gradients_*")
 def memory(result: Row) -> list[str]:
-    """Memory and time of the gradient through a rollout."""
+    """Memory and time of a gradient through a rollout."""
     rows = [
         [
             f"`{row['formulation']}`",
@@ -42,7 +42,7 @@ def fit(result: Row) -> list[str]:
 
 @value("gradients.noise", "gradients_*")
 def noise(result: Row) -> str:
-    """Noise of the trajectory that was fitted."""
+    """Noise of the fitted trajectory."""
     return f"{1e3 * result['fit']['noise']:g} mm"
 
 

@@ -37,7 +37,7 @@ def minutes(found: Row) -> list[str]:
 
 @value("long_flag.growth", "long_flag")
 def growth(found: Row, run: str) -> str:
-    """Growth of the mechanical energy in a minute, from a straight line through the logarithms."""
+    """Growth of the mechanical energy per minute, from a linear fit of its logarithm."""
     logarithms = [math.log(energy) for energy in found[run]["energy_per_minute_J"]["mechanical"]]
     middle, mean = (len(logarithms) - 1) / 2, sum(logarithms) / len(logarithms)
     slope = sum((k - middle) * (y - mean) for k, y in enumerate(logarithms))

@@ -1,4 +1,4 @@
-"""Pieces that several tables are made of."""
+"""Building blocks of the tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def grid(head: list[str], rows: Iterable[list[str]]) -> list[str]:
 
 
 def stack(result: dict[str, Any]) -> str:
-    """The versions that something was recorded with."""
+    """The software versions of a record."""
     return ", ".join(f"{name} {version}" for name, version in result["versions"].items())
 
 
@@ -23,10 +23,10 @@ def source(result: dict[str, Any]) -> str:
 
 
 def yes_no(reached: bool | None) -> str:
-    """A verdict; a dash if there is none."""
+    """``yes``, ``no``, or a dash for None."""
     return "-" if reached is None else "yes" if reached else "no"
 
 
 def gib(size: float | None, digits: int = 2) -> str:
-    """Bytes as GiB; a dash for a device that does not say."""
+    """Bytes as GiB; a dash for None."""
     return "-" if size is None else f"{size / 2**30:.{digits}f}"

@@ -15,22 +15,23 @@ PAGE = "validation.md"
 
 @value("pareto.proven_cfl", "pareto_*")
 def proven_cfl(_: Row) -> str:
-    """The largest CFL number that is stable for any arrangement of particles."""
+    """The largest CFL number that is proven stable for any arrangement of particles."""
     return f"{PROVEN_CFL}"
 
 
 @table(PAGE, "pareto.device", "pareto_*")
 def device(result: Row) -> list[str]:
-    """What the sweep was recorded on, and beside what."""
+    """The device of the sweep, and what else ran at the time."""
     lines = [f"{result['device']}; {stack(result)}; {result['threads']} thread(s)."]
     return [*lines, "", f"Recorded with {result['concurrent']}."] if "concurrent" in result else lines
 
 
 @table(PAGE, "pareto.cheapest", "pareto_*")
 def cheapest(result: Row) -> list[str]:
-    """For each problem and accuracy the cheapest proven setting, and where the default stands."""
-    head = ["problem", "size", "cheapest proven setting that is as accurate as the default", "error"]
-    head += ["default's error", "its time [s/s]", "default's", "default on the front of the proven", "of all"]
+    """The cheapest proven setting for each problem and accuracy, compared with the default."""
+    head = ["problem", "size", "cheapest proven setting at least as accurate as the default", "error"]
+    head += ["default's error", "its time [s/s]", "default's time [s/s]"]
+    head += ["default on the front of proven settings", "of all settings"]
     rows = []
     for problem, (_, unit, _) in PROBLEMS.items():
         own = [row for row in result["rows"] if row["problem"] == problem]
@@ -54,7 +55,7 @@ def cheapest(result: Row) -> list[str]:
 
 @value("pareto.on_front", "pareto_*")
 def default_on_front(result: Row) -> str:
-    """On how many grids the default is on the front of the proven settings."""
+    """The number of grids on which the default is on the front of the proven settings."""
     found = [row for row in result["rows"] if is_default(row) and row["error"]]
     safe = [row for row in result["rows"] if proven(row)]
     good = sum(on_front(row, [other for other in safe if other["problem"] == row["problem"]]) for row in found)
@@ -63,7 +64,7 @@ def default_on_front(result: Row) -> str:
 
 @value("pareto.time_at", "pareto_*")
 def time_at(result: Row, cfl: str) -> str:
-    """Time with another CFL number over that with the default: the median over runs that are alike otherwise."""
+    """Time with another CFL number divided by that with the default: the median over otherwise equal runs."""
     times: dict[Any, dict[float, float]] = {}
     for row in result["rows"]:
         if row["error"] and row["substep"] is None and row["dtype"] == DEFAULT["dtype"]:
@@ -77,9 +78,9 @@ def time_at(result: Row, cfl: str) -> str:
 
 @table(PAGE, "pareto.adaptive", "pareto_*")
 def adaptive(result: Row) -> list[str]:
-    """The adaptive substep against PhysGaussian's fixed one, on the flag."""
-    head = ["flag, dx [m]", "adaptive, CFL 0.4 [s/s]", "fixed 1e-4 s [s/s]", "times cheaper", "error"]
-    head += ["error of the fixed", "difference, share of the side"]
+    """The adaptive substep compared with PhysGaussian's fixed one, on the flag."""
+    head = ["flag, dx [m]", "adaptive, CFL 0.4 [s/s]", "fixed 1e-4 s [s/s]", "speedup", "error"]
+    head += ["error of the fixed substep", "difference (share of the longer side)"]
     flag = [row for row in result["rows"] if row["problem"] == "flag"]
     flag = [row for row in flag if row["variant"] == "total" and row["dtype"] == "float32"]
     rows = []

@@ -9,13 +9,13 @@ Row = dict[str, Any]
 
 
 def order(coarse: Row, fine: Row) -> float:
-    """Observed order of convergence in dx between two rows of a problem."""
+    """Observed order of convergence in dx between two rows of the same problem."""
     ratio = fine["parameters"]["cells"] / coarse["parameters"]["cells"]
     return math.log(coarse["result"]["error"] / fine["result"]["error"]) / math.log(ratio)
 
 
 def select(rows: list[Row], problem: str, **parameters: Any) -> list[Row]:
-    """The rows of a problem with the given parameters that did not fail."""
+    """The rows of a problem that have the given parameters and did not fail."""
     return [
         row
         for row in rows

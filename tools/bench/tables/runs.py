@@ -29,7 +29,7 @@ def substep(result: Row) -> list[str]:
 
 @table(PAGE, "runs.whole", "sim_*")
 def whole(result: Row) -> list[str]:
-    """Time and memory of whole runs, and whether they stayed whole."""
+    """Time and memory of whole runs, and the health of the material."""
     parts = ("simulation", "shading", "rendering", "writing")
     head = ["run", "particles", "frames", "substeps", *(f"{part} [s]" for part in parts)]
     head += ["process [s]", "host memory [GiB]", "device memory [GiB]"]
@@ -52,5 +52,5 @@ def whole(result: Row) -> list[str]:
         for run in result["runs"]
     ]
     if "round_trip_psnr_db" in result:
-        told.append(f"- PSNR of frame 0 against the splat as it was captured: {result['round_trip_psnr_db']:.1f} dB.")
+        told.append(f"- PSNR of frame 0 compared with the captured splat: {result['round_trip_psnr_db']:.1f} dB.")
     return [source(result), "", *grid(head, rows), "", *told]

@@ -15,33 +15,36 @@ PAGE = "benchmarks.md"
 
 @table(PAGE, "speed.fewest_numbers", "speed_*", together=True)
 def fewest_numbers(_: list[Row]) -> list[str]:
-    """How many numbers a substep reads and writes, as the fewest bytes are counted."""
+    """How many numbers a substep reads and writes, for the count of the fewest bytes."""
     rows = [
         [f"`{name}`, {what}", str(read), str(written)]
         for name, both in TRAFFIC.items()
         for what, (read, written) in both.items()
     ]
-    more = {"with wind, more for a particle": WIND_TRAFFIC, "with a plastic law, more for a particle": PLASTIC_TRAFFIC}
+    more = {
+        "with wind, extra for a particle": WIND_TRAFFIC,
+        "with a plastic law, extra for a particle": PLASTIC_TRAFFIC,
+    }
     rows += [[what, str(read), str(written)] for what, (read, written) in more.items()]
     return grid(["numbers of 4 bytes", "read", "written"], rows)
 
 
 @table(PAGE, "speed.device", "speed_*")
 def device(result: Row) -> list[str]:
-    """What it was measured on, and how fast a copy is there."""
+    """The device, and the speed of a copy on it."""
     lines = [source(result)]
     if result.get("partial"):
-        lines += ["", "The run was stopped before its end: what follows is a part."]
+        lines += ["", "The run was stopped early: the tables below are incomplete."]
     if result.get("quick"):
-        lines += ["", "Made with `--quick`: tiny counts, which only show that it runs."]
+        lines += ["", "Recorded with `--quick`: tiny counts, which only show that it runs."]
     copy = result["copy"]
-    told = f"A copy of {copy['copy_bytes'] / 2**20:,.0f} MiB within the memory of the device moves "
-    told += f"{copy['bytes_per_s'] / 1e9:,.0f} GB/s, read and written (median of {copy['repeats']})."
+    told = f"A copy of {copy['copy_bytes'] / 2**20:,.0f} MiB within device memory moves "
+    told += f"{copy['bytes_per_s'] / 1e9:,.0f} GB/s, counting both reads and writes (median of {copy['repeats']})."
     return [*lines, "", told]
 
 
 def _cases(head: list[str], rows: list[tuple[str, Row, Callable[[Row], list[str]]]]) -> list[str]:
-    """A table whose first column is a label; a case that failed says so in the second."""
+    """A table whose first column is a label; the second says if a case failed."""
     shown = []
     for label, row, cells in rows:
         failed = [f"failed: {row['failed']}".replace("\n", " ")] if "failed" in row else []
@@ -54,8 +57,8 @@ def substeps(result: Row) -> list[str]:
     """Rollouts: time, bytes, memory and error of a substep."""
     rows = result.get("substep", []) + [row | {"sand": True} for row in result.get("sand", [])]
     head = ["substep", "kernels", "nodes with mass", "median [ms]", "quartiles [ms]", "slope [ms]", "torch [ms]"]
-    head += ["fewest bytes [MB]", "moved [GB/s]", "share of the copy [%]", "of the slope [%]", "memory [MiB]"]
-    head += ["error of positions", "of velocities"]
+    head += ["fewest bytes [MB]", "bandwidth [GB/s]", "share of the copy [%]", "same, from the slope [%]"]
+    head += ["memory [MiB]", "error of positions", "error of velocities"]
 
     def cells(row: Row) -> list[str]:
         error, torch_path = row["error"] or {}, row["torch"] or {}
@@ -88,10 +91,10 @@ def substeps(result: Row) -> list[str]:
 
 @table(PAGE, "speed.batches", "speed_*")
 def batches(result: Row) -> list[str]:
-    """Many flags in one rollout, and one after the other."""
+    """Many flags in one rollout, and one after another."""
     rows = result.get("batch", [])
-    head = ["flags at once", "together [ms]", "one after the other [ms]", "together [10⁶ particle substeps/s]"]
-    head += ["one after the other [10⁶/s]", "ratio", "largest difference of positions"]
+    head = ["flags", "together [ms]", "one after another [ms]", "together [10⁶ particle substeps/s]"]
+    head += ["one after another [10⁶/s]", "ratio", "largest difference in positions"]
 
     def cells(row: Row) -> list[str]:
         times = [_digits(row[name]["median_ms"]) for name in ("together", "apart")]

@@ -1,4 +1,4 @@
-"""The goals of ``bench.py speed`` on an H200: times in ms, the second of a pair is the stretch goal."""
+"""The goals of ``bench.py speed`` on an H200: times in ms; the second number of a pair is the stretch goal."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def goals(result: Row) -> list[Goal]:
         row = ten if one is not None and "failed" not in one else one
         if one is not None and ten is not None and "failed" not in one | ten:
             row = {"ratio": ten["median_ms"] / one["median_ms"] / 10}
-        text = f"substep of 10,000,000 particles in wind, `{name}`, against ten of 1,000,000,"
+        text = f"substep of 10,000,000 particles in wind, `{name}`, compared with ten substeps of 1,000,000,"
         found.append(goal(text, row, "ratio", SCALING_GOAL, "times"))
     asked, limits = SAND_GOAL
     found.append(goal(f"substep of {asked:,} particles of sand", find("sand", asked=asked), "median_ms", limits, "ms"))
     for name in FORMULATIONS:
         for gusts in (False, True):
             text = f"one H200: many flags at once, `{name}`, {'gusts' if gusts else 'steady winds'}: throughput"
-            text += f" {BATCH_GOAL:g} times that of one after the other"
+            text += f" {BATCH_GOAL:g} times that of one flag after another"
             row = find("batch", formulation=name, gusts=gusts)
             if row is None or "failed" in row:
                 found.append((text, "not measured" if row is None else row["failed"], row and False, "-", None))

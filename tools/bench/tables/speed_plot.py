@@ -49,7 +49,7 @@ def _plot(result: Row, path: Path) -> None:
         draw(axes[0], rows, lambda r: (r["torch"] or {}).get("median_ms"), **own, label=f"{name}: transfer torch")
         floor = {"color": color, "linestyle": ":", "label": f"{name}: fewest bytes at the copy's bandwidth"}
         draw(axes[0], rows, lambda r: 1e3 * r["bytes"] / copy, **floor)
-        if name == "total":  # so that each formulation has its column of the legend
+        if name == "total":  # gives each formulation its own column in the legend
             draw(axes[0], sand, lambda r: r["median_ms"], **star)
         if with_memory:
             draw(axes[1], rows, lambda r: (r["memory_bytes"] or 0) / 2**20, color=color, marker="o")
