@@ -1,4 +1,4 @@
-"""The scenes of the paper as splats made in code, which stand in for its captures."""
+"""The scenes of the paper as splats made in code, in place of its captures."""
 
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.ficus import FicusScene

@@ -172,7 +172,7 @@ def test_empty_selection_says_what_to_change():
     for part in ("[0.0, 1.0, 2.0] to [3.0, 4.0, 5.0]", "0 are in Sphere(center=[9.0, 9.0, 9.0], radius=1.0)", "move"):
         assert part in str(error.value)
     with pytest.raises(
-        ValueError, match=r"2 lie in Everything.*threshold 0\.9; .*lower the threshold .*opacity is 0\.6"
+        ValueError, match=r"2 are in Everything.*threshold 0\.9; .*lower the threshold .*opacity is 0\.6"
     ):
         select_simulated(means, torch.tensor([0.5, 0.6]), Everything(), 0.9)
 
