@@ -1,4 +1,4 @@
-"""Areas of Gaussian patches: each alone, or so that overlapping ones add up to the surface."""
+"""Areas of Gaussian patches: each taken alone, or shared so that overlapping patches add up to the surface."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
-_RAYS = 32  # directions in which the cell of a patch is measured
+_RAYS = 32  # number of directions in which the cell of a patch is measured
 _SLAB = 0.75  # half thickness of one sheet, in neighbour spacings
 _REACH = 5.0  # longest reach of a patch over uncovered surface, in standard deviations
 _CLUSTER = 0.15  # centres closer than this, in neighbour spacings, are one cluster
 _SPIKE = 2.0  # longest reach of a cell, in neighbour spacings
-_FALSE_EDGE = 0.0015  # chance that a direction inside a random surface looks as if the surface ended there
+_FALSE_EDGE = 0.0015  # chance that a direction inside a surface of random points looks like a border
 
 
 def patch_area(log_scales: Tensor) -> Tensor:
@@ -44,20 +44,18 @@ def patch_area(log_scales: Tensor) -> Tensor:
 def coverage_area(
     means: Tensor, normals: Tensor, log_scales: Tensor, opacity: Tensor | None = None, neighbours: int = 24
 ) -> Tensor:
-    r"""Areas of overlapping patches that add up to the area of the surface they lie on.
+    r"""Areas of overlapping patches that add up to the area of their surface.
 
-    The sum does not depend on how many Gaussians carry the surface nor on how much they overlap, unlike that of
-    :func:`patch_area`. In two steps:
+    Unlike that of :func:`patch_area`, the sum does not depend on the number of Gaussians or their overlap. Two steps:
 
-    1. The surface is divided among the centres: each gets the cell of the points nearest to it (Voronoi) in its
-       tangent plane, measured along rays to the bisectors with its nearest neighbours on the same sheet (those less
-       than 3/4 of the local neighbour spacing off the tangent plane). Where the surface ends, the cell ends as far
-       beyond the centre as it reaches inwards. No cell reaches further than two neighbour spacings or five standard
-       deviations of the Gaussians around.
+    1. The surface is divided among the centres. Each centre gets its Voronoi cell in its tangent plane, measured along
+       rays to the bisectors with its nearest neighbours on the same sheet (those less than 3/4 of the local neighbour
+       spacing off the tangent plane). At a border of the surface the cell extends as far outwards as it does inwards.
+       No cell extends further than two neighbour spacings or five standard deviations of the nearby Gaussians.
     2. Each cell is shared among the Gaussians in proportion to their opacity there,
        :math:`A_i = \sum_j V_j \frac{g_i(x_j)}{\sum_l g_l(x_j)}`,
        :math:`g_i(x) = o_i \exp(-\lvert x - x_i \rvert^2 / (2 s_{i1} s_{i2}))`: a faint or tiny Gaussian among opaque
-       ones carries little. This keeps the sum.
+       ones gets little. The sum does not change.
 
     Parallel sheets at least one neighbour spacing apart count separately; closer ones count as one. A Gaussian with
     fewer than three neighbours in reach keeps its :func:`patch_area`. Computed in float64 on the CPU, so the result is
@@ -90,14 +88,14 @@ def coverage_area(
         weight = opacity.detach().cpu().double().clamp_min(1e-6)
     if count == 0:
         return means.new_zeros(0)
-    # Gaussians that share a centre form one site; its cell is shared among them by weight at the end.
+    # Gaussians with the same centre form one site; in the end its cell is shared among them by weight.
     site, owner = torch.unique(means.detach().cpu().double(), dim=0, return_inverse=True)
     own_area = patch_area(log_scales.detach().cpu().double())
     load = weight * own_area
     order = torch.argsort(load, stable=True)
     rank = torch.empty(count, dtype=torch.long).scatter_(0, order, torch.arange(count))
     heaviest = torch.zeros(len(site), dtype=torch.long).scatter_reduce_(0, owner, rank, "amax", include_self=False)
-    first = order[heaviest]  # the heaviest Gaussian of a site gives its normal and its size
+    first = order[heaviest]  # a site has the normal and size of its heaviest Gaussian
     normal = torch.nn.functional.normalize(normals.detach().cpu().double()[first], dim=-1)
     disc = own_area[first]
     total = torch.zeros(len(site), dtype=torch.float64).index_add_(0, owner, weight)
@@ -125,8 +123,8 @@ def coverage_area(
 def _cell_area(
     offset: Tensor, distance: Tensor, normal: Tensor, disc: Tensor, discs: Tensor, phase: int
 ) -> tuple[Tensor, Tensor]:
-    """Areas of the Voronoi cells (B,) in the tangent planes, and which neighbours (B, k) lie on the same sheet."""
-    # Clusters, such as the clones that densification leaves, count once in the estimate of the spacing.
+    """Areas of the Voronoi cells (B,) in the tangent planes, and which neighbours (B, k) are on the same sheet."""
+    # Clusters, such as clones from densification, count once in the estimate of the spacing.
     close = _CLUSTER * distance[:, -1] * math.sqrt(math.pi / offset.shape[1])
     gap = torch.cdist(offset, offset, compute_mode="donot_use_mm_for_euclid_dist")
     repeat = (gap < close[:, None, None]).tril(-1).any(-1) | (distance < close[:, None])
@@ -142,7 +140,7 @@ def _cell_area(
     stacked = same & (squared <= 1e-12 * spacing[:, None].square())
     same &= ~stacked
 
-    # Each cell has its own turn of the rays, spread evenly, so that the error of the quadrature averages out.
+    # Each cell rotates its rays by another angle, so that the errors of the quadrature average out.
     turn = torch.arange(phase, phase + len(offset), dtype=torch.float64) * 0.6180339887498949 % 1
     angle = (turn[:, None] + torch.arange(_RAYS)) * (2 * math.pi / _RAYS)
     ray = torch.stack([angle.cos(), angle.sin()], dim=-1)
@@ -154,13 +152,13 @@ def _cell_area(
     found = same.sum(-1, keepdim=True)
     local_size = ((disc[:, None] + (same * discs).sum(-1, keepdim=True)) / (math.pi * (1 + found))).sqrt()
     limit = torch.minimum(_SPIKE * spacing[:, None], _REACH * local_size)
-    # A direction is open if no neighbour lies within an angle of it that m random ones leave empty by chance with
-    # probability _FALSE_EDGE; 60 degrees for m = 16, and less than the 90 degrees that a straight edge leaves empty.
+    # A direction is open if no neighbour is within a certain angle of it. With m random neighbours that angle is empty
+    # by chance with probability _FALSE_EDGE. It is 60 degrees for m = 16, less than the 90 degrees at a straight edge.
     half_angle = (math.pi * (1 - _FALSE_EDGE ** (1 / (same & ~repeat).sum(-1, keepdim=True).clamp_min(1)))).clamp(
         math.radians(50), math.radians(85)
     )
     open_cosine = half_angle.cos()
-    # Where the surface ends: up to three straight edges, each as far out as the cell reaches on the other side.
+    # At a border: up to three straight edges, each as far out as the cell extends on the other side.
     for _ in range(3):
         widest = cosine.argmin(-1, keepdim=True)
         is_open = cosine.gather(-1, widest) < open_cosine

@@ -24,7 +24,7 @@ class GaussianCloud:
         scales: Natural logarithm of the standard deviations [scene units] along the axes, shape (N, 3).
         opacities: Logit of the opacity, shape (N,).
         sh: Spherical harmonics coefficients of the colour, constant first, shape (N, K, 3) with K = 1, 4, 9 or 16.
-        normals: Surface normals that came with the Gaussians, shape (N, 3), or None.
+        normals: Surface normals stored with the Gaussians, shape (N, 3), or None.
 
     Raises:
         ValueError: If a tensor does not have the shape above.
@@ -65,7 +65,7 @@ class GaussianCloud:
         return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
     def select(self, mask: Tensor) -> GaussianCloud:
-        """The Gaussians that a boolean mask (N,) or an index tensor (M,) picks."""
+        """The Gaussians selected by a boolean mask (N,) or an index tensor (M,)."""
         if mask.dtype == torch.bool:
             check_shape("mask", mask, len(self))
         return self._map(lambda tensor: tensor[mask])

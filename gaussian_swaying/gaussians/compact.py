@@ -15,16 +15,16 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import check_sizes_and_rotations, read_binary_header, read_ply
 from gaussian_swaying.gaussians.ply_table import read_element, read_header
 
-CHUNK = 256  # Gaussians that share a range of values in a compressed .ply
+CHUNK = 256  # number of Gaussians with a common range of values in a compressed .ply
 _SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a splat in any of the formats that are known: 3DGS .ply, compressed .ply or .splat.
+    """Read a splat in any supported format: 3DGS .ply, compressed .ply or .splat.
 
-    A name that ends in ``.splat`` is read by :func:`read_splat`, anything else as a .ply, compressed or not by what it
-    holds.
+    A file whose name ends in ``.splat`` is read by :func:`read_splat`, any other as a .ply. The content tells whether a
+    .ply is compressed.
 
     Args:
         path: File to read.
@@ -44,9 +44,9 @@ def read_gaussians(path: str | os.PathLike[str]) -> GaussianCloud:
 
 
 def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a .splat file: 32 bytes a Gaussian, colours of degree 0.
+    """Read a .splat file: 32 bytes for each Gaussian, colours of degree 0.
 
-    Colours, opacities and quaternions have 8 bits; an opacity at the end of its range is taken half a step from it.
+    Colours, opacities and quaternions have 8 bits; an opacity at the end of its range is moved inwards by half a step.
 
     Args:
         path: File to read.
@@ -56,7 +56,7 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is empty or cut off, or a Gaussian has no finite centre, no size or no rotation.
+        ValueError: If the file is empty or truncated, or a Gaussian has no finite centre, no size or no rotation.
     """
     path = check_regular(path, "the .splat file")
     size = path.stat().st_size
@@ -86,7 +86,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If the file is cut off or lacks something.
+        ValueError: If the file is truncated or something in it is missing.
     """
     path = Path(path)
     header = read_binary_header(path)
@@ -97,7 +97,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         raise ValueError(f"{path} holds zero Gaussians (element vertex 0); export the scene again.")
     for name in _PACKED:
         if name not in (vertices.dtype.names or ()):
-            raise ValueError(f"{path} has no property `{name}`, so it is no compressed .ply; export it again.")
+            raise ValueError(f"{path} has no property `{name}`, so it is not a compressed .ply; export it again.")
         if vertices.dtype[name].kind not in "iu":
             raise ValueError(f"{path}: property `{name}` is not a whole number; export the file again.")
     chunks: Any = read_element(path, header, "chunk") if "chunk" in held else np.empty(0)
@@ -130,7 +130,7 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
 
 def _three(packed: np.ndarray, bits: tuple[int, int, int]) -> np.ndarray:
-    """Three numbers in [0, 1] out of each whole number, the first in its highest bits; shape (N, 3)."""
+    """Three numbers in [0, 1] packed into each whole number, the first in the highest bits; shape (N, 3)."""
     shares, shift = [], sum(bits)
     for width in bits:
         shift -= width
@@ -169,7 +169,7 @@ def _cloud(
     rgba: np.ndarray,
     rest: np.ndarray | None = None,
 ) -> GaussianCloud:
-    """A cloud from colours and opacities (N, 4) as they are seen."""
+    """A cloud from colours and opacities (N, 4) as displayed, from 0 to 1."""
     half_a_step = 0.5 / 255
     opacity = np.clip(rgba[:, 3].astype(np.float64), half_a_step, 1 - half_a_step)
     base = (rgba[:, None, :3] - 0.5) / SH_DC

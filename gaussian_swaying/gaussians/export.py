@@ -24,9 +24,9 @@ from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 SUFFIXES = {"ply": ".ply", "compressed_ply": ".compressed.ply", "splat": ".splat", "usd": ".usdc"}
-"""Formats, and how their files' names end."""
-LARGEST_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, as opaque as float32 tells apart from 1
-LARGEST_LOG_SCALE = 20.0  # beyond it the compressed format has no numbers
+"""Formats, and the endings of their file names."""
+LARGEST_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
+LARGEST_LOG_SCALE = 20.0  # the compressed format has no larger numbers
 _GSPLAT = {"compressed_ply": "ply_compressed", "splat": "splat"}
 _PRIM = "/World/Gaussians"
 
@@ -34,8 +34,8 @@ _PRIM = "/World/Gaussians"
 def cleaned(cloud: GaussianCloud) -> GaussianCloud:
     """A splat that every format can hold.
 
-    Gaussians with a NaN, an infinite centre or colour, or a quaternion of zero are left out. Opacities and sizes beyond
-    what float32 tells apart are brought to the end of their range: logits to ±16, logarithms of the size to ±20.
+    Gaussians with a NaN, an infinite centre or colour, or a zero quaternion are left out. Opacities and sizes beyond
+    the useful range of float32 are clamped: logits to ±16, logarithms of the size to ±20.
 
     Args:
         cloud: The Gaussians.
@@ -59,13 +59,13 @@ def cleaned(cloud: GaussianCloud) -> GaussianCloud:
 
 
 def export_cloud(path: str | os.PathLike[str], cloud: GaussianCloud, format: str = "ply") -> None:
-    """Write Gaussians in one of several formats; the file appears under its name only when it is complete.
+    """Write Gaussians in one of several formats; the file gets its name only when it is complete.
 
     - ``ply``: as 3DGS stores them, with normals, see :func:`~gaussian_swaying.gaussians.ply.write_ply`.
-    - ``compressed_ply``: PlayCanvas' format for SuperSplat, 16 bytes and the harmonics in 8 bits a Gaussian, through
-      gsplat. Gaussians fainter than 1/255 are left out, their order changes, and there are no normals.
-    - ``splat``: antimatter15's format, 32 bytes a Gaussian, through gsplat. Colours are those of harmonics of degree 0;
-      no normals.
+    - ``compressed_ply``: PlayCanvas' format for SuperSplat, through gsplat: 16 bytes for each Gaussian, and harmonics
+      with 8 bits each. Gaussians fainter than 1/255 are left out, their order changes, and there are no normals.
+    - ``splat``: antimatter15's format, through gsplat: 32 bytes for each Gaussian. Colours are those of harmonics of
+      degree 0; no normals.
     - ``usd``: one frame, see :func:`write_usd`.
 
     Args:
@@ -96,10 +96,10 @@ def export_cloud(path: str | os.PathLike[str], cloud: GaussianCloud, format: str
 
 
 def format_of(path: str | os.PathLike[str]) -> str:
-    """The format that the end of a file's name stands for.
+    """The format that belongs to the ending of a file name.
 
     Raises:
-        ValueError: If it stands for none.
+        ValueError: If the ending is unknown.
     """
     name = Path(path).name
     for format, suffix in sorted(SUFFIXES.items(), key=lambda item: -len(item[1])):  # .compressed.ply before .ply
@@ -108,7 +108,7 @@ def format_of(path: str | os.PathLike[str]) -> str:
     if name.endswith((".usd", ".usda")):
         return "usd"
     endings = ", ".join((*SUFFIXES.values(), ".usda"))
-    raise ValueError(f"Cannot tell the format of {path}: let its name end in one of {endings}.")
+    raise ValueError(f"Cannot tell the format of {path}: give it a name that ends in one of {endings}.")
 
 
 def convert(
@@ -118,15 +118,15 @@ def convert(
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
 ) -> None:
-    """Write a splat, or the sequence of .ply that a run left in a folder, in the format of the target's name.
+    """Write a splat, or the .ply sequence of a run, in the format that the target's name stands for.
 
     Args:
         source: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads; for USD also a folder of
-            .ply, whose frames come in the order of their names.
+            .ply files, whose frames are sorted by name.
         target: File to write, see :func:`format_of`.
         fps: Frames per second of a folder.
-        metres_per_unit: Length of a scene unit [m], which USD files declare.
-        rotation: Takes scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
+        metres_per_unit: Length of a scene unit [m], written to USD files.
+        rotation: Rotation from scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
 
     Raises:
         FileNotFoundError: If the source or the target's folder does not exist.
@@ -145,7 +145,7 @@ def convert(
         return
     files = sorted(source.glob("*.ply"))
     if format != "usd" or not files:
-        what = "holds no .ply" if not files else f"is a folder of {len(files)} frames, which only USD can hold"
+        what = "contains no .ply" if not files else f"is a folder of {len(files)} frames, which only USD supports"
         raise ValueError(f"{source} {what}: give one .ply, or a folder of them and a target that ends in .usdc.")
     film = UsdFilm(fps, metres_per_unit, rotation)
     for frame, file in enumerate(files):
@@ -157,7 +157,7 @@ def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
     kept = cleaned(cloud)
     if len(kept) == 0:
         raise ValueError(
-            f"{path} was not written because none of its {len(cloud)} Gaussians is finite; check the run behind them."
+            f"{path} was not written because none of its {len(cloud)} Gaussians is finite; check the run that made it."
         )
     if len(kept) < len(cloud):
         warnings.warn(
@@ -169,7 +169,7 @@ def _kept(path: Path, cloud: GaussianCloud) -> GaussianCloud:
 
 
 def _replace(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write under a temporary name of the same ending, and rename."""
+    """Write under a temporary name with the same ending, then rename."""
     with atomic(path) as temporary:
         write(temporary)
 
@@ -180,7 +180,7 @@ def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:
 
     host = cloud.to("cpu", torch.float32)
     if format == "compressed_ply":
-        visible = host.opacities.sigmoid() > 1 / 255  # as the exporter leaves them out, which an empty file breaks
+        visible = host.opacities.sigmoid() > 1 / 255  # the exporter leaves the others out, and fails if none is left
         if not bool(visible.any()):
             raise ValueError(f"{path} was not written because all Gaussians are fainter than 1/255.")
     data: bytes = export_splats(
@@ -192,7 +192,7 @@ def _gsplat_bytes(path: Path, cloud: GaussianCloud, format: str) -> bytes:
         shN=host.sh[:, 1:],
         format=_GSPLAT[format],
     )
-    if format == "compressed_ply" and host.sh_degree == 0:  # an element without properties, which readers trip over
+    if format == "compressed_ply" and host.sh_degree == 0:  # an element without properties, which breaks readers
         head, mark, body = data.partition(b"end_header\n")
         data = re.sub(rb"element sh \d+\n", b"", head) + mark + body
     return data
@@ -209,12 +209,12 @@ def write_usd(
     metres_per_unit: float = 1.0,
     rotation: Tensor | None = None,
 ) -> None:
-    """Write Gaussians, still or moving, as USD (.usd, .usdc or .usda).
+    """Write static or moving Gaussians as USD (.usd, .usdc or .usda).
 
     The prim is a ``ParticleField3DGaussianSplat`` where usd-core has that schema (26.03), with positions, orientations,
-    scales, opacities and harmonics, as the values are after exponential and sigmoid. Older versions get a
-    ``Points`` prim with the same attributes, and normals and widths beside them. Each number that changes has a sample
-    for every frame. Programs that cannot draw splats find ``displayColor`` and ``displayOpacity``.
+    scales, opacities and harmonics, with values after exponential and sigmoid. With older versions it is a ``Points``
+    prim with the same attributes, plus normals and widths. Each number that changes has a sample for every frame. For
+    programs that cannot draw splats there are ``displayColor`` and ``displayOpacity``.
 
     Args:
         path: File to write; an existing one is replaced.
@@ -222,7 +222,7 @@ def write_usd(
         fps: Frames per second.
         start: Number of the first frame.
         metres_per_unit: Length of a scene unit [m].
-        rotation: Takes scene directions to z up, shape (3, 3); the scene's z is up if None.
+        rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
 
     Raises:
         ImportError: If usd-core is not installed.
@@ -243,16 +243,16 @@ def write_usd(
 
 
 def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
-    """What a USD prim holds of a splat, float32.
+    """The arrays of a splat for a USD prim, float32.
 
-    A Gaussian of a moving splat cannot be left out of a frame, so one that is not finite becomes a point of no opacity
-    at the origin.
+    A Gaussian of a moving splat cannot be left out of a frame, so one that is not finite becomes a transparent point at
+    the origin.
 
     Args:
         cloud: N Gaussians with K harmonics each.
 
     Returns:
-        ``positions`` (N, 3), ``orientations`` (N, 4) wxyz, ``scales`` (N, 3) and ``opacities`` (N,) as they are seen,
+        ``positions`` (N, 3), ``orientations`` (N, 4) wxyz, ``scales`` (N, 3) and ``opacities`` (N,) as displayed,
         ``harmonics`` (N, K, 3), ``normals`` (N, 3) and ``colors`` (N, 3), those of harmonics of degree 0.
     """
     host = cloud.to("cpu", torch.float32)
@@ -277,7 +277,7 @@ def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
 
 
 class UsdFilm:
-    """A USD stage that takes one frame after the other.
+    """A USD stage to which frames are added one by one.
 
     The whole film is in memory until it is saved, about 60 bytes for each Gaussian and frame without view-dependent
     colours.
@@ -285,7 +285,7 @@ class UsdFilm:
     Args:
         fps: Frames per second.
         metres_per_unit: Length of a scene unit [m].
-        rotation: Takes scene directions to z up, shape (3, 3); the scene's z is up if None.
+        rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
 
     Raises:
         ImportError: If usd-core is not installed.
@@ -312,10 +312,10 @@ class UsdFilm:
         self._end = 0
 
     def add(self, frame: int, arrays: dict[str, np.ndarray]) -> None:
-        """Take the arrays of :func:`usd_arrays` for a frame; frames come in order.
+        """Add a frame as arrays from :func:`usd_arrays`; add frames in order.
 
         Raises:
-            ValueError: If the frame has another number of Gaussians than the first.
+            ValueError: If the number of Gaussians differs from that of the first frame.
         """
         if self._first is None:
             self._first = self._end = frame
@@ -327,7 +327,7 @@ class UsdFilm:
             written, last = self._last.get(name, (frame, None))
             if last is not None and np.array_equal(array, last):
                 continue
-            if last is not None and written < self._end:  # it held until the frame that came before
+            if last is not None and written < self._end:  # it was constant up to the previous frame
                 self._set(name, last, self._end)
             self._set(name, array, frame)
             self._last[name] = (frame, array)
@@ -389,7 +389,7 @@ def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.nda
 
     Args:
         path: The file.
-        frame: Frame number; a frame without samples of its own is interpolated.
+        frame: Frame number; a frame without samples is interpolated.
 
     Raises:
         ImportError: If usd-core is not installed.
@@ -403,7 +403,7 @@ def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.nda
         normals = prim.GetAttribute("normals") or geom.PrimvarsAPI(prim).GetPrimvar("normals").GetAttr()
         arrays = {name: np.array(value, dtype=np.float32) for name, value in found.items()}
         arrays["normals"] = np.array(normals.Get(frame), dtype=np.float32)
-    except Exception as error:  # USD's own, and those of attributes that are missing
+    except Exception as error:  # errors of USD, and those for missing attributes
         raise ValueError(f"{path} cannot be read as a USD file of Gaussians: export it again.") from error
     arrays["orientations"] = arrays["orientations"][:, [3, 0, 1, 2]]
     arrays["harmonics"] = arrays["harmonics"].reshape(len(arrays["positions"]), -1, 3)
@@ -431,7 +431,7 @@ def _vec3(array: np.ndarray) -> Any:
 
 
 def _extent(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around all Gaussians to three standard deviations."""
+    """Corners of a box around all Gaussians, up to three standard deviations."""
     axes = quat_to_rotation(torch.from_numpy(arrays["orientations"])).numpy()
     reach = 3 * np.sqrt(np.square(axes * arrays["scales"][:, None, :]).sum(-1))
     return (arrays["positions"] - reach).min(0), (arrays["positions"] + reach).max(0)

@@ -1,6 +1,6 @@
-"""Points inside solids: a density grid of the Gaussians, what it encloses, and the volume that each point stands for.
+"""Points inside solids: a density grid of the Gaussians, the cells that it encloses, and the volume of each point.
 
-All of it is computed on the CPU in a fixed order, so the points are the same on every device.
+Everything is computed on the CPU in a fixed order, so the points are the same on every device.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from tqdm import tqdm
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
-MAX_CELLS = 30_000_000  # of the density grid: 120 MB, and some ten times that while it is used
+MAX_CELLS = 30_000_000  # of the density grid: 120 MB, and about ten times that while it is in use
 _BLUR = 0.5  # standard deviation of the blur that keeps thin Gaussians from falling between cell centres, in cells
 _CUT = 3.0  # where a kernel ends, in standard deviations
-_CHUNK = 1_000_000  # numbers that are held at once
+_CHUNK = 1_000_000  # values in memory at a time
 
 
 def density_grid(
@@ -42,10 +42,10 @@ def density_grid(
         \exp\bigl(-\tfrac12 (x - x_i)^T (A_i + \tfrac14 h^2 I)^{-1} (x - x_i)\bigr), \qquad
         s'^2 = s^2 + \tfrac14 h^2
 
-    The blur by half a cell h lets no Gaussian, however thin, slip between the centres; the two larger standard
-    deviations s keep the density of a sheet as it was. A kernel ends three standard deviations from its centre along
-    each axis, and at most ``max_radius`` cells from it, so that a Gaussian that has blown up costs no more than any
-    large one.
+    Because of the blur by half a cell h, no Gaussian, however thin, is missed between the centres. The factor with the
+    two larger standard deviations s keeps the density of a sheet unchanged. A kernel ends three standard deviations
+    from its centre along each axis, and at most ``max_radius`` cells from it, so that a huge Gaussian costs no more
+    than a large one.
 
     Args:
         means: Centres [m], shape (N, 3).
@@ -55,8 +55,8 @@ def density_grid(
         spacing: Side of a cell h [m].
         resolution: Number of cells along x, y and z.
         max_radius: Longest reach of a kernel [cells].
-        chunk: How many values are computed at once; the result does not depend on it by a bit.
-        advance: Called with the number of Gaussians that were just done.
+        chunk: How many values are computed at once; it does not change a bit of the result.
+        advance: Called with the number of Gaussians just processed.
 
     Returns:
         Density in float32, shape (nx, ny, nz).
@@ -73,7 +73,7 @@ def density_grid(
     reach = (_CUT * wide.diagonal(dim1=-2, dim2=-1).sqrt()).ceil().clamp(max=max_radius).long()
     home = place.round().long()
     touches = ((home + reach >= 0) & (home - reach < size)).all(-1)
-    margin = 2 * int(reach.max()) if len(means) else 0  # holds all of the kernels that touch the grid
+    margin = 2 * int(reach.max()) if len(means) else 0  # large enough for all kernels that touch the grid
     padded = size + 2 * margin + 1
     stride = torch.stack([padded[1] * padded[2], padded[2], torch.ones_like(padded[0])])
     base = ((home + margin) * stride).sum(-1)
@@ -142,13 +142,13 @@ def odd_crossings(dense: Tensor, direction: tuple[int, int, int]) -> Tensor:
 def enclosed(
     dense: Tensor, directions: int = 26, votes: float = 0.75, advance: Callable[[int], object] = lambda count: None
 ) -> Tensor:
-    """Cells within a body: not dense, and most rays from them cross its surface an odd number of times.
+    """Cells inside a body: not dense, and most rays from them cross its surface an odd number of times.
 
-    A ray that grazes a wall or slips through a gap is outvoted; from within a bowl the rays upwards say no.
+    The majority outvotes a ray that grazes a wall or passes through a gap. In a bowl the rays upwards vote against.
 
     Args:
         dense: Cells whose density is above the threshold, bool, shape (nx, ny, nz).
-        directions: How many rays a cell casts: 6, 18 or 26.
+        directions: Number of rays from each cell: 6, 18 or 26.
         votes: Share of the rays that must cross the surface an odd number of times, above 0.5 and at most 1.
         advance: Called with 1 after each direction.
 
@@ -163,10 +163,10 @@ def enclosed(
 
 
 def open_air(air: Tensor) -> Tensor:
-    """Cells of air that the outside reaches, through the faces of cells of air.
+    """Cells of air that are connected to the outside through faces of cells of air.
 
     Args:
-        air: Cells that are air, bool, shape (nx, ny, nz); outside the grid all is air.
+        air: Cells that are air, bool, shape (nx, ny, nz); everything outside the grid is air.
 
     Returns:
         Booleans, shape (nx, ny, nz): air without closed cavities.
@@ -178,7 +178,7 @@ def open_air(air: Tensor) -> Tensor:
         reached.select(axis, -1).fill_(True)
     before = -1
     while before != (before := int(reached.sum())):
-        for axis in range(3):  # every straight run of air that is reached anywhere is reached all along
+        for axis in range(3):  # if one cell of a straight run of air is reached, all of it is
             flat, mark = air.movedim(axis, -1), reached.movedim(axis, -1)
             starts = flat.clone()
             starts[..., 1:] &= ~flat[..., :-1]
@@ -190,10 +190,10 @@ def open_air(air: Tensor) -> Tensor:
 
 
 def depth_below(mask: Tensor, width: float) -> Tensor:
-    """How deep each cell lies below the surface of a mask [cells], from the mask blurred by a Gaussian.
+    """Depth of each cell below the surface of a mask [cells], from the mask blurred by a Gaussian.
 
-    Behind a plane the blurred mask is the normal distribution Phi(depth / width); its inverse gives the depth, to a
-    part of a cell and whichever way the plane is turned. It is right within about three widths of the surface.
+    Behind a plane the blurred mask is the normal distribution Phi(depth / width); its inverse gives the depth to a
+    fraction of a cell, for any direction of the plane. It is correct within about three widths of the surface.
 
     Args:
         mask: Booleans, shape (nx, ny, nz); outside the grid it is false.
@@ -230,7 +230,7 @@ def sample(field: Tensor, cells: Tensor, chunk: int = _CHUNK) -> Tensor:
 
 
 def sheet_depth(density: Tensor, cells: Tensor, covariances: Tensor, threshold: float) -> float:
-    """How far dense cells reach beyond the centres of the Gaussians that make them [cells], at the median Gaussian.
+    """How far dense cells extend beyond the centres of their Gaussians [cells], for the median Gaussian.
 
     A sheet with density d at its centres and a standard deviation s across it falls to the threshold at
     s sqrt(2 log(d / threshold)).
@@ -253,14 +253,14 @@ def sheet_depth(density: Tensor, cells: Tensor, covariances: Tensor, threshold: 
 
 @dataclass(frozen=True, slots=True)
 class Filling:
-    """What filling a body gave.
+    """The result of filling a body.
 
     Attributes:
         position: Points inside it [m], shape (Q, 3), float64.
-        volume: Volume that each stands for [m³], shape (Q,).
-        gaussian_volume: Volume that each Gaussian on or in the solid stands for [m³], shape (N,); zero for those more
-            than a cell away from it. Together with ``volume`` it adds up to the volume of the solid.
-        on_surface: Which Gaussians touch air that is open to the outside, bool, shape (N,).
+        volume: Volume of each [m³], shape (Q,).
+        gaussian_volume: Volume of each Gaussian on or in the solid [m³], shape (N,); zero for those more than a cell
+            away from it. Together with ``volume`` it adds up to the volume of the solid.
+        on_surface: Which Gaussians touch air that is connected to the outside, bool, shape (N,).
     """
 
     position: Tensor
@@ -279,7 +279,7 @@ def share_volume(owner: Tensor, filled: Tensor, element: float) -> tuple[Tensor,
 
     Args:
         owner: Element of each Gaussian, -1 for none, shape (N,).
-        filled: Whether an element has a filled point besides, shape (K,).
+        filled: Whether an element also has a filled point, shape (K,).
         element: Volume of an element [m³].
 
     Returns:
@@ -294,23 +294,25 @@ def share_volume(owner: Tensor, filled: Tensor, element: float) -> tuple[Tensor,
 class InteriorFilling:
     """Fills the inside of solids with points that carry mass, feel no wind and are not drawn.
 
-    A grid of the Gaussians' density (:func:`density_grid`) tells matter from air. Air cells from which most rays cross
-    the surface an odd number of times (:func:`enclosed`) are filled. The trace of the surface itself is about two cells
-    thick; its outer half is taken off again (:func:`sheet_depth`), so that the body ends where the centres of its outer
-    Gaussians are, and a single sheet encloses nothing. The volume of each element of the solid is shared equally among
-    the points in it, Gaussians and filled ones alike, so the body weighs density x volume and needs no thickness.
+    A grid of the Gaussians' density (:func:`density_grid`) separates matter from air. Air cells from which most rays
+    cross the surface an odd number of times (:func:`enclosed`) are filled. The dense cells of the surface itself are a
+    layer about two cells thick. Its outer half is removed again (:func:`sheet_depth`), so that the body ends at the
+    centres of its outer Gaussians, and a single sheet encloses nothing. The volume of each element of the solid is
+    shared equally among the points in it, Gaussians and filled points alike, so the body weighs density x volume and
+    needs no thickness.
 
-    On the surface are the Gaussians less than a cell deep below air that is open to the outside; the leaves within a
-    crown are, the wall of a closed cavity and the inside of a solid are not.
+    A Gaussian is on the surface if it is less than a cell below air that is connected to the outside. The leaves inside
+    a crown are on the surface. The wall of a closed cavity and the inside of a solid are not.
 
     Args:
-        spacing: Side of a cell [m]; half of ``solver.dx`` if null. Holes of the surface must be smaller.
-        threshold: Density above which a cell holds matter; a surface covered once has about 1.
+        spacing: Side of a cell [m]; half of ``solver.dx`` if null. Holes in the surface must be smaller.
+        threshold: Density above which a cell contains matter; a surface covered once has about 1.
         directions: Rays per cell: 6, 18 or 26.
-        votes: Share of the rays that must cross the surface an odd number of times, above 0.5. A deep bowl has 0.8 at
-            its bottom and counts as solid there; 0.9 leaves it empty but asks for a surface without holes.
-        particles_per_cell: Points in each cell of the solid that holds no Gaussian: 1, 8 or 27.
-        jitter: How far points are moved at random from their regular places, from 0 to 1 times their distance.
+        votes: Share of the rays that must cross the surface an odd number of times, above 0.5. At the bottom of a deep
+            bowl the share is 0.8, so the bowl counts as solid there; 0.9 leaves it empty, but then the surface must
+            have no holes.
+        particles_per_cell: Points in each cell of the solid without a Gaussian: 1, 8 or 27.
+        jitter: How far points are moved at random from their regular positions, from 0 to 1 times their distance.
         max_radius: Longest reach of a Gaussian [cells].
         seed: Seed of the jitter.
     """
@@ -330,15 +332,15 @@ class InteriorFilling:
         check_positive("filling.threshold", self.threshold)
         ray_directions(self.directions)
         if not 0.5 < self.votes <= 1:
-            raise ValueError(f"Expected `filling.votes` to lie above 0.5 and be at most 1, but got {self.votes}.")
+            raise ValueError(f"Expected `filling.votes` to be above 0.5 and at most 1, but got {self.votes}.")
         if self.particles_per_cell not in (1, 8, 27):
             raise ValueError(
                 f"Expected `filling.particles_per_cell` to be 1, 8 or 27, but got {self.particles_per_cell}."
             )
         if not 0 <= self.jitter <= 1:
-            raise ValueError(f"Expected `filling.jitter` to lie from 0 to 1, but got {self.jitter}.")
+            raise ValueError(f"Expected `filling.jitter` to be from 0 to 1, but got {self.jitter}.")
         if not 1 <= self.max_radius <= 64:
-            raise ValueError(f"Expected `filling.max_radius` to lie from 1 to 64 cells, but got {self.max_radius}.")
+            raise ValueError(f"Expected `filling.max_radius` to be from 1 to 64 cells, but got {self.max_radius}.")
 
     @torch.no_grad()
     def fill(
@@ -350,13 +352,13 @@ class InteriorFilling:
         progress: bool = True,
         chunk: int = _CHUNK,
     ) -> Filling:
-        """Fill the body that some Gaussians enclose.
+        """Fill the body enclosed by some Gaussians.
 
         Args:
             means: Centres [m], shape (N, 3).
             covariances: Covariances [m²], shape (N, 3, 3).
             opacities: Opacities from 0 to 1, shape (N,).
-            spacing: Side of a cell [m] if the component has none.
+            spacing: Side of a cell [m], used if the object has none.
             progress: Show a progress bar if it takes more than a second.
             chunk: How many values are computed at once; the result does not depend on it.
 
@@ -392,9 +394,9 @@ class InteriorFilling:
         element = solid_elements(depth_below(body, depth) - depth, side, chunk)
         if len(element) == 0:
             raise ValueError(
-                "Expected `filling` to find an inside, but no cell is enclosed: the surface is open, has holes wider "
-                f"than a cell of {h:.3g} m, or the body is thinner than three; change `filling.spacing`, lower "
-                "`filling.threshold` or `filling.votes`, or leave out `filling` for a shell."
+                "Expected `filling` to find an inside, but no cell is enclosed: the surface is open or has holes wider "
+                f"than a cell of {h:.3g} m, or the body is thinner than three cells; change `filling.spacing`, lower "
+                "`filling.threshold` or `filling.votes`, or remove `filling` for a shell."
             )
         fine = torch.tensor(resolution) * side
         owner, filled = assign(means, element, low, h / side, fine)
@@ -406,7 +408,7 @@ class InteriorFilling:
 
 
 def grid_around(means: Tensor, spacing: float, margin: int = 6) -> tuple[Tensor, tuple[int, int, int]]:
-    """Lower corner [m] (3,) and resolution of a grid around points (N, 3) with a margin of some cells.
+    """Lower corner [m] (3,) and resolution of a grid around points (N, 3), with a margin in cells.
 
     Raises:
         ValueError: If it would have more than ``MAX_CELLS`` cells.
@@ -417,10 +419,10 @@ def grid_around(means: Tensor, spacing: float, margin: int = 6) -> tuple[Tensor,
         raise ValueError(
             f"Expected `filling.spacing` to give at most {MAX_CELLS:,} cells, but {spacing:.3g} m gives "
             f"{float(size.prod()):,.0f} for an object of {[round(v, 3) for v in (high - low).tolist()]} m: raise it, "
-            "or leave stray Gaussians out of the region."
+            "or exclude stray Gaussians from the region."
         )
     nx, ny, nz = (int(n) for n in size.tolist())
-    # a quarter of a cell off the middle: what is rounded up at one face of a box is rounded down at the other
+    # a quarter of a cell off the middle: if one face of a box is rounded up, the opposite one is rounded down
     return 0.5 * (low + high) - spacing * (0.5 * size + 0.25), (nx, ny, nz)
 
 
@@ -431,12 +433,12 @@ def unravel(index: Tensor, resolution: Tensor) -> Tensor:
 
 
 def solid_elements(field: Tensor, side: int, chunk: int = _CHUNK) -> Tensor:
-    """Elements whose centres lie in the solid; a cell has side³ of them.
+    """Elements whose centres are inside the solid; a cell has side³ of them.
 
     Args:
         field: Depth below the surface [cells], shape (nx, ny, nz).
         side: Elements along the side of a cell.
-        chunk: How many are looked at at once.
+        chunk: How many are checked at once.
 
     Returns:
         One number for each, z fastest, ascending, shape (K,).
@@ -454,10 +456,10 @@ def solid_elements(field: Tensor, side: int, chunk: int = _CHUNK) -> Tensor:
 
 
 def assign(means: Tensor, element: Tensor, low: Tensor, spacing: float, resolution: Tensor) -> tuple[Tensor, Tensor]:
-    """Which element of the solid each Gaussian belongs to, and which elements need a point of their own.
+    """Which element of the solid each Gaussian belongs to, and which elements need an extra point.
 
-    A Gaussian belongs to the element that it is in, or else to the nearest within 1.5 spacings; an element that holds
-    the centre of a Gaussian needs no other point.
+    A Gaussian belongs to the element that it is in, or else to the nearest one within 1.5 spacings. An element that
+    contains the centre of a Gaussian needs no extra point.
 
     Args:
         means: Centres [m], shape (N, 3).

@@ -17,13 +17,14 @@ def group_points(points: Tensor, weight: Tensor, side: float, preferred: int | N
         points: Points, shape (N, 3).
         weight: Their weights, zero or more, shape (N,).
         side: Side of the cubes, in the unit of the points.
-        preferred: In a cube that holds some of the first ``preferred`` points, one of these is chosen; all if None.
+        preferred: If a cube contains some of the first ``preferred`` points, one of these is chosen; None for no
+            preference.
 
     Returns:
-        Indices of the chosen points, ascending, shape (M,); and for each point which of these stands for it, (N,).
+        Indices of the chosen points, ascending, shape (M,); and for each point which of these represents it, (N,).
 
     Raises:
-        ValueError: If a shape is not the one above or ``side`` is not positive.
+        ValueError: If a tensor does not have the shape above, or ``side`` is not positive.
     """
     check_shape("points", points, None, 3)
     check_shape("weight", weight, len(points))
@@ -48,15 +49,15 @@ def group_points(points: Tensor, weight: Tensor, side: float, preferred: int | N
 
 @torch.no_grad()
 def blend_weights(points: Tensor, queries: Tensor, count: int = 6) -> tuple[Tensor, Tensor]:
-    """Which points a query follows, and how much each; the weights change continuously from place to place.
+    """The points that a query follows, and their weights, which are continuous in space.
 
-    The weight of a point at distance d is (1/d - 1/R)², where R is the distance of the first point that is not taken
+    The weight of a point at distance d is (1/d - 1/R)², where R is the distance of the nearest point that is not used
     (Franke and Little's form of Shepard's method). So a query at a point follows that point alone.
 
     Args:
         points: Points, shape (M, 3).
-        queries: Who follows, shape (C, 3).
-        count: How many points a query follows; fewer if there are not as many.
+        queries: Points that follow, shape (C, 3).
+        count: How many points a query follows; fewer if there are fewer points.
 
     Returns:
         Indices of the points, and weights that add up to 1, each of shape (C, K).

@@ -97,7 +97,7 @@ _kept: dict[tuple[int, torch.dtype, torch.device], Tensor] = {}
 
 
 def _basis_by_product(directions: Tensor, degree: int) -> Tensor:
-    """:func:`sh_basis` as one product of matrices: a GPU takes longer to start dozens of operations than to do them."""
+    """:func:`sh_basis` as one product of matrices: on a GPU dozens of small operations take longer."""
     key = (degree, directions.dtype, directions.device)
     if key not in _kept:
         with torch.inference_mode(False):
@@ -118,7 +118,7 @@ def _monomials(points: Tensor, degree: int) -> Tensor:
 def _coefficients(degree: int) -> Tensor:
     """Matrix that takes :func:`_monomials` to :func:`sh_basis`, float64, shape (4^degree, (degree + 1)^2)."""
     with torch.inference_mode(False):
-        axis = torch.arange(-3, 4, 2, dtype=torch.float64)  # four values: cubic polynomials are determined by them
+        axis = torch.arange(-3, 4, 2, dtype=torch.float64)  # four values determine a cubic polynomial
         points = torch.cartesian_prod(axis, axis, axis)
         matrix = torch.linalg.pinv(_monomials(points, degree)) @ sh_basis(points, degree)
         return matrix.where(matrix.abs() > 1e-9, 0.0)  # round-off
@@ -132,7 +132,7 @@ def sh_to_color(sh: Tensor, directions: Tensor) -> Tensor:
         directions: Directions from the camera to the Gaussians, of any length above zero, shape (..., 3).
 
     Returns:
-        RGB colour, at least 0 and 1 for white, shape (..., 3).
+        RGB colour, at least 0, where 1 is white, shape (..., 3).
 
     Raises:
         ValueError: If a tensor does not have the shape above.
@@ -145,18 +145,18 @@ def sh_to_color(sh: Tensor, directions: Tensor) -> Tensor:
 
 
 def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
-    r"""Turn the coefficients along with an object, so that the colour in direction d becomes that in R^T d.
+    r"""Rotate the coefficients with an object, so that the colour in direction d becomes that in R^T d.
 
-    Each band turns within itself. Its matrix follows exactly from 2l + 1 fixed directions :math:`d_k`,
-    :math:`D_l = Y_l(d_k)^{-1} Y_l(R^T d_k)`, without Wigner recurrences. Differentiable.
+    Each band is rotated separately. Its matrix follows exactly from 2l + 1 fixed directions :math:`d_k`, :math:`D_l =
+    Y_l(d_k)^{-1} Y_l(R^T d_k)`, without Wigner recurrences. Differentiable.
 
     Args:
         sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.
-        rotation: Rotation matrices, shape (..., 3, 3); take them from the polar decomposition of a deformation
-            gradient, never the gradient itself.
+        rotation: Rotation matrices, shape (..., 3, 3), for example from the polar decomposition of a deformation
+            gradient; the gradient itself is not a rotation.
 
     Returns:
-        Coefficients of the turned object, shape (..., K, 3).
+        Coefficients of the rotated object, shape (..., K, 3).
 
     Raises:
         ValueError: If a tensor does not have the shape above.
@@ -177,7 +177,7 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
 @functools.cache
 def _sampling(band: int) -> tuple[Tensor, Tensor]:
     """Directions (2l+1, 3) and the inverse of their band's matrix (condition number below 6), in float64."""
-    with torch.inference_mode(False):  # they are kept, and may be needed for a gradient later
+    with torch.inference_mode(False):  # they are cached, and may be needed for a gradient later
         count = 2 * band + 1
         index = torch.arange(count, dtype=torch.float64)
         z = -0.3 + 1.1 * (index + 0.5) / count

@@ -20,7 +20,7 @@ from gaussian_swaying.geometry.patches import deform_all, smallest_axis_normal
 
 @dataclass(frozen=True, slots=True)
 class DeformedGaussians:
-    """What a renderer and a shader need of Gaussians after a deformation.
+    """The properties of deformed Gaussians that renderers and shaders need.
 
     Attributes:
         means: Centres [scene units], shape (..., N, 3).
@@ -45,7 +45,7 @@ class GaussianSurfaceModel(nn.Module):
 
     Args:
         cloud: Gaussians to start from; their tensors are copied.
-        requires_grad: Whether the parameters are to be trained.
+        requires_grad: Whether the parameters are trained.
     """
 
     reference_normals: Tensor | None
@@ -99,7 +99,7 @@ class GaussianSurfaceModel(nn.Module):
 
     @property
     def view_dependent(self) -> bool:
-        """Whether the colours depend on where they are seen from."""
+        """Whether the colours depend on the view direction."""
         return self.shN.shape[1] > 0
 
     def covariance(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""Gaussians as stored by 3D Gaussian Splatting, and the binary .ply file that holds them."""
+"""Reading and writing the binary .ply files of 3D Gaussian Splatting."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
-_OPAQUE_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, as opaque as float32 tells apart from 1
+_OPAQUE_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 
 
 def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     """Read a binary 3D Gaussian Splatting .ply file.
 
-    Takes the layout of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering") with its
-    properties in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to
-    3. Normals that are all zero, as most tools write them, count as none. An opacity of exactly 0 or 1, stored as an
+    The layout is that of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering"). Properties
+    may be in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to 3.
+    Normals that are all zero, as most tools write them, are ignored. An opacity of exactly 0 or 1, stored as an
     infinite logit, becomes a logit of -16 or 16 with a warning.
 
     Args:
@@ -95,8 +95,8 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     """Write Gaussians as a binary little-endian 3DGS .ply file, with the properties in their usual order.
 
-    The file appears under its name only when it is complete. Values are stored as float32, so reading the file gives
-    a float32 cloud back exactly. Without normals in the cloud, those of the smallest axes are written.
+    The file gets its name only when it is complete. Values are stored as float32, so a float32 cloud is read back
+    exactly. If the cloud has no normals, those of the smallest axes are written.
 
     Args:
         path: File to write; an existing one is replaced.
@@ -128,7 +128,7 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
 
 
 def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:
-    """Raise ValueError if a logarithm of a size (N, 3) gives none, or a quaternion (N, 4) is zero."""
+    """Raise ValueError if the logarithm of a size (N, 3) is out of range, or a quaternion (N, 4) is zero."""
     with np.errstate(over="ignore", under="ignore"):
         size = np.exp(scales)
     _reject(
@@ -143,7 +143,7 @@ def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray)
 
 
 def read_binary_header(path: Path) -> PlyHeader:
-    """The header of a binary .ply file, as :func:`~gaussian_swaying.gaussians.ply_table.read_header`; no text."""
+    """The header from :func:`~gaussian_swaying.gaussians.ply_table.read_header`; ValueError if the file is text."""
     header = read_header(path)
     if header.order == "":
         raise ValueError(f"{path} is an ASCII .ply (format ascii); export as binary.")
@@ -151,7 +151,7 @@ def read_binary_header(path: Path) -> PlyHeader:
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The f_rest properties in order, once their number is known to be that of a degree from 0 to 3."""
+    """The f_rest properties in order; ValueError unless their number is that of a degree from 0 to 3."""
     found = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
     if len(found) not in (0, 9, 24, 45):
         raise ValueError(
@@ -166,7 +166,7 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _read_opacities(path: Path, data: np.ndarray) -> np.ndarray:
-    """Opacity logits (N,) with infinite ones, that is opacities of exactly 0 or 1, made finite."""
+    """Opacity logits (N,); infinite ones, for opacities of exactly 0 or 1, are made finite."""
     with np.errstate(over="ignore"):
         logits = np.array(data["opacity"], dtype=np.float32)
     _reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")

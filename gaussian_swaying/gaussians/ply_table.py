@@ -1,4 +1,4 @@
-"""Tables of numbers from .ply files; what a header announces is compared with the size of the file first."""
+"""Tables of numbers from .ply files; the header is first compared with the size of the file."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class PlyElement:
 
     @property
     def row(self) -> int:
-        """Size of a binary row [bytes]; the least, if there are lists."""
+        """Size of a binary row [bytes]; the smallest possible one if there are lists."""
         return sum(1 if kind is None else int(kind[1:]) for _, kind in self.fields)
 
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """What a .ply file says about itself.
+    """The header of a .ply file.
 
     Attributes:
         order: ``<`` or ``>`` for binary numbers, empty for text.
@@ -60,14 +60,14 @@ class PlyHeader:
 
 
 def read_header(path: str | os.PathLike[str]) -> PlyHeader:
-    """Read the header of a .ply file, and compare the rows that it announces with the size of the file.
+    """Read the header of a .ply file, and compare its number of rows with the size of the file.
 
     Args:
         path: The file.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is no regular file, has a broken header, or is too short for its rows.
+        ValueError: If it is not a regular file, has a broken header, or is too short for its rows.
 
     Warns:
         UserWarning: If it is longer than its rows.
@@ -119,7 +119,7 @@ def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> 
         Structured array with a field for each property, shape (rows,).
 
     Raises:
-        ValueError: If there is no such element, or it or one before it holds lists.
+        ValueError: If there is no such element, or if it or one before it contains lists.
     """
     start = header.start
     for element in header.elements:
@@ -153,7 +153,7 @@ def _check_size(path: Path, header: PlyHeader) -> None:
         )
     if header.order and size > needed and not any(element.lists for element in header.elements):
         warnings.warn(
-            f"{path}: {size - needed:,} bytes follow that its header does not tell of, so its numbers may be shifted; "
+            f"{path}: {size - needed:,} bytes follow that its header does not mention, so its numbers may be shifted; "
             "export the file again if they look odd.",
             UserWarning,
             stacklevel=4,

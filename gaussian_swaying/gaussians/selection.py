@@ -11,7 +11,7 @@ from gaussian_swaying.geometry.regions import Everything, Region
 def select_simulated(
     means: Tensor, opacities: Tensor, region: Region | None = None, opacity_threshold: float = 0.1
 ) -> Tensor:
-    """Choose the Gaussians to simulate: those in a region that are not nearly transparent.
+    """Choose the Gaussians to simulate: those in a region that are opaque enough.
 
     Args:
         means: Centres [scene units], shape (N, 3).
@@ -28,7 +28,7 @@ def select_simulated(
     check_shape("means", means, None, 3)
     check_shape("opacities", opacities, means.shape[0])
     if not 0 <= opacity_threshold <= 1:
-        raise ValueError(f"Expected `opacity_threshold` to lie from 0 to 1, but got {opacity_threshold}.")
+        raise ValueError(f"Expected `opacity_threshold` to be from 0 to 1, but got {opacity_threshold}.")
     if means.shape[0] == 0:
         raise ValueError("Expected `means` to hold at least one Gaussian, but got none.")
     region = Everything() if region is None else region
@@ -38,7 +38,7 @@ def select_simulated(
         low, high = region.bounds(means)
         raise ValueError(
             f"No Gaussian is selected: the {means.shape[0]} centres span {low} to {high}{region.axes}, "
-            f"{int(inside.sum())} lie in "
+            f"{int(inside.sum())} are in "
             f"{region!r}, and none of these reaches the opacity threshold {opacity_threshold}; move the region into "
             f"these bounds or lower the threshold (the largest opacity is {float(opacities.max()):.3g})."
         )

@@ -1,4 +1,4 @@
-"""Points between the centres of Gaussians that lie farther apart than a grid can follow."""
+"""Points between the centres of Gaussians that are too far apart for a grid."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
-_VISIBLE = 0.25  # opacity down to which a Gaussian counts as surface
-_NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: those amid a square of four
+_VISIBLE = 0.25  # smallest opacity at which a Gaussian counts as surface
+_NEAR = 0.5**0.5  # points closer than this to another, in spacings, add nothing: as in the middle of a square
 _SMOOTH = 0.6  # standard deviations of split Gaussians, in steps of their lattice
-_ROUNDS = 3  # of trying the next point of a cell
-_MOST = 5_000_000  # points before those too close are left out
+_ROUNDS = 3  # of attempts with the next point of a cell
+_MOST = 5_000_000  # points before those that are too close are removed
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Subdivision:
     """Gaussians cut into pieces no larger than a spacing.
 
     Attributes:
-        parent: Gaussian that each further piece is of, shape (K,).
-        means: Centres of the further pieces [scene units], shape (K, 3).
-        log_scales: Logarithms of the standard deviations of all pieces [scene units]: first those in the middle of
-            each Gaussian, then the further ones, shape (N + K, 3).
-        opacity: Opacities of all pieces, those of their Gaussians at their centres, shape (N + K,).
+        parent: The Gaussian of each extra piece, shape (K,).
+        means: Centres of the extra pieces [scene units], shape (K, 3).
+        log_scales: Logarithms of the standard deviations of all pieces [scene units]: first the pieces in the middle of
+            each Gaussian, then the extra ones, shape (N + K, 3).
+        opacity: Opacities of all pieces: the opacity of the Gaussian at the centre of the piece, shape (N + K,).
     """
 
     parent: Tensor
@@ -40,11 +40,12 @@ class Subdivision:
 def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor, spacing: float) -> Subdivision:
     r"""Points on large Gaussians, so that no two neighbours on the surface are much farther apart than a spacing.
 
-    Training leaves large Gaussians where a surface is of one colour. With one material point to each, such a place has
-    a hole that a grid of fine cells does not bridge. Here the ellipse in which a Gaussian has at least a quarter of
-    full opacity, :math:`o \exp(-m^2 / 2) \ge 1/4` at the Mahalanobis distance m in its plane, is laid with points a
-    spacing apart; its own centre is one of them. Points nearer than :math:`\sqrt{1/2}` spacings to the centre of any
-    Gaussian, or to a point nearer to its own centre, are left out: those places have a point already.
+    Training leaves large Gaussians where a surface has only one colour. With one material point per Gaussian there
+    would be holes that a fine grid does not bridge. So points are placed a spacing apart on the ellipse where a
+    Gaussian has at least a quarter of full opacity, :math:`o \exp(-m^2 / 2) \ge 1/4` at the Mahalanobis distance m in
+    its plane. The centre of the Gaussian is one of them. A point closer than :math:`\sqrt{1/2}` spacings to the centre
+    of any Gaussian, or to a point that is nearer to the centre of its own Gaussian, is left out, because there is
+    already a point at that place.
 
     Args:
         means: Centres [scene units], shape (N, 3).
@@ -54,11 +55,11 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
         spacing: Largest distance of neighbours [scene units].
 
     Returns:
-        The pieces; Gaussians of at most a quarter of full opacity stay whole. The same on every device.
+        The pieces, the same on every device. Gaussians with at most a quarter of full opacity stay whole.
 
     Raises:
-        ValueError: If ``spacing`` is not above zero, a tensor does not have the shape above, or more than 5 million
-            points would have to be looked at.
+        ValueError: If ``spacing`` is not above zero, a tensor does not have the shape above, or there would be more
+            than 5 million candidate points.
     """
     check_positive("spacing", spacing)
     count = len(means)
@@ -77,8 +78,8 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
     if float(pieces[large].double().prod(-1).sum()) > _MOST:
         widest = float(half.amax() / spacing)
         raise ValueError(
-            f"Some Gaussians reach {widest:.3g} spacings of {spacing:.3g} far, which makes too many points: raise the "
-            "spacing (`scene.particle_spacing`), or leave such haze out with `scene.region` or "
+            f"Some Gaussians extend over {widest:.3g} spacings of {spacing:.3g}, which is too many points: raise the "
+            "spacing (`scene.particle_spacing`), or exclude such haze with `scene.region` or "
             "`scene.opacity_threshold`."
         )
     step = 2 * half / pieces
@@ -104,10 +105,10 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
 
 @dataclass(frozen=True)
 class Split:
-    """Gaussians in the place of larger ones.
+    """Gaussians that replace larger ones.
 
     Attributes:
-        source: Gaussian that each is of, shape (M,), the first N in their order.
+        source: The original Gaussian of each, shape (M,); the first N are in order.
         means: Centres [scene units], shape (M, 3).
         log_scales: Logarithms of the standard deviations [scene units], shape (M, 3).
         opacity: Opacities, shape (M,).
@@ -121,10 +122,10 @@ class Split:
 
 @torch.no_grad()
 def split_large(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor, size: float) -> Split:
-    """Gaussians no larger than a size in the place of larger ones; a training that goes on smooths what they show.
+    """Replace large Gaussians by ones no larger than a size; further training smooths the picture.
 
-    They stand where :func:`subdivide` puts points, on a lattice of at most 5/3 of the size, and are 0.6 of a step of
-    the lattice large, so that together they look nearly even.
+    Their centres are the points of :func:`subdivide`, on a lattice with steps of at most 5/3 of the size. Their size is
+    0.6 steps, so that together they look nearly uniform.
 
     Args:
         means: Centres [scene units], shape (N, 3).
@@ -134,7 +135,7 @@ def split_large(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tenso
         size: Largest standard deviation [scene units].
 
     Returns:
-        All Gaussians. Those of at most a quarter of full opacity stay as they are, whatever their size.
+        All Gaussians. Those with at most a quarter of full opacity do not change, whatever their size.
 
     Raises:
         ValueError: As :func:`subdivide`.
@@ -156,7 +157,7 @@ def _reach(opacity: Tensor) -> Tensor:
 
 
 def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:
-    """For each row of (N, 3) all integers from minus to plus its entries: which row, (L,), and the integers, (L, 3)."""
+    """For each row of (N, 3) all integers from minus to plus its entries: the row, (L,), and the integers, (L, 3)."""
     sizes = 2 * out + 1
     length = sizes.prod(-1)
     row = torch.repeat_interleave(torch.arange(len(out)), length)
@@ -167,9 +168,9 @@ def _lattice(out: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _thin(points: Tensor, order: Tensor, taken: Tensor, distance: float) -> Tensor:
-    """Indices of points that are at least a distance from those taken, and about as far from each other.
+    """Indices of points that are at least a distance from those already taken, and about as far from each other.
 
-    Of several in one cell of a grid the first by ``order`` is tried; where it is too close to what is taken, the next.
+    Of several in one cell of a grid the first by ``order`` is tried; if it is too close to those taken, the next one.
     """
     if len(points) == 0:
         return torch.zeros(0, dtype=torch.long)
@@ -188,7 +189,7 @@ def _thin(points: Tensor, order: Tensor, taken: Tensor, distance: float) -> Tens
 
 
 def _first_in_cell(points: Tensor, ranked: Tensor, size: float, shift: float) -> Tensor:
-    """Of ranked indices of points those that come first in their cell of a grid, still ranked."""
+    """Those of the ranked indices that come first in their cell of a grid, still ranked."""
     cell = torch.floor(points[ranked] / size + shift).long()
     cell -= cell.amin(0) if len(cell) else 0
     extent = cell.amax(0) + 1 if len(cell) else cell.new_ones(3)

@@ -20,10 +20,10 @@ _VIRIDIS = (
 
 
 def colormap(values: Tensor) -> Tensor:
-    """Colours from dark violet at 0 over green to yellow at 1 (viridis); values beyond take the ends' colours.
+    """Colours from dark violet at 0 through green to yellow at 1 (viridis); values outside are clamped.
 
     Args:
-        values: Shape (...); NaN takes the colour of 0.
+        values: Shape (...); NaN gets the colour of 0.
 
     Returns:
         Colours in [0, 1], shape (..., 3).

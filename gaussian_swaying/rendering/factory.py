@@ -1,4 +1,4 @@
-"""Which renderer draws on a device."""
+"""The renderer for a device."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gaussian_swaying.rendering.protocol import SplatRenderer
 def make_renderer(device: torch.device | str) -> SplatRenderer:
     """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
 
-    Where gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
+    If gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
     """
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 

@@ -16,14 +16,14 @@ from gaussian_swaying.rendering.protocol import (
 
 
 def gsplat_works() -> bool:
-    """Whether gsplat's CUDA kernels are there or can be compiled, which takes about a minute the first time."""
+    """Whether gsplat's CUDA kernels exist or can be compiled, which takes about a minute the first time."""
     if not torch.cuda.is_available():
         return False
     try:
         from gsplat.cuda._backend import _C
     except ModuleNotFoundError:  # another version of gsplat, which keeps its kernels elsewhere
         return True
-    except Exception:  # the compiler failed; what it says is on the terminal
+    except Exception:  # the compiler failed; its messages are on the terminal
         return False
     return _C is not None
 
@@ -45,7 +45,7 @@ def render_gsplat(
         means: Centres [scene units], on a CUDA device, shape (N, 3).
         covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
         opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as they are to be seen, shape (N, 3).
+        colors: Colours as displayed, shape (N, 3).
         camera: The camera.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
@@ -69,7 +69,7 @@ def render_gsplat(
     if means.shape[0] == 0:
         pixels = means.new_zeros(camera.height, camera.width, 5)
         return _compose(pixels[..., :4], pixels[..., 4:], background, dtype)
-    # gsplat drops what has opacity below 1/255, but would draw a mean or covariance that is not finite.
+    # gsplat skips opacities below 1/255, but would draw a mean or covariance that is not finite.
     finite = finite_gaussians(means, covariances, opacities, colors)
     opacities = torch.where(finite, opacities, 0.0)
     view = camera.to(means.device, torch.float32)
@@ -107,10 +107,10 @@ def rasterize_splat(
     eps2d: float = 0.3,
     absgrad: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``gsplat.rasterization`` for one camera, put together from gsplat's functions.
+    """``gsplat.rasterization`` for one camera, built from gsplat's functions.
 
-    The same picture and gradients. ``rasterization`` inverts the camera's matrix to find the eye, for which the host
-    waits in the middle of a step; here the camera says where its eye is.
+    Picture and gradients are the same. ``rasterization`` inverts the camera's matrix to find the eye, and the host
+    waits for that in the middle of a step. Here the camera provides its eye.
 
     Args:
         means: Centres [scene units], float32 on a CUDA device, shape (N, 3).
@@ -221,8 +221,8 @@ class GsplatRenderer(nn.Module):
     ) -> SplatOutput:
         """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`.
 
-        In float32. Harmonics and covariances are left to gsplat's kernels, which differentiate them too; Gaussians
-        that are not finite are not looked for.
+        Computed in float32. gsplat's kernels evaluate and differentiate harmonics and covariances. Gaussians that are
+        not finite are not filtered out.
         """
         if means.device.type != "cuda":
             raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")

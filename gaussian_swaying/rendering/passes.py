@@ -1,7 +1,7 @@
-"""Pictures beside the colour: depth, normals and scalars on the surface, as numbers and as colours.
+"""Pictures other than colour: depth, normals and scalars on the surface, as numbers and as colours.
 
-Gaussians are blended from front to back, so each of these is the mean over the Gaussians seen at a pixel, by their
-weights. A pixel in which they cover less than half has no value.
+Gaussians are blended from front to back, so each value is the weighted mean over the Gaussians seen at a pixel. A pixel
+covered by less than half has no value.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from gaussian_swaying.rendering.protocol import RenderOutput
 
 PASSES = ("color", "depth", "normal", "force")
 COVERED = 0.5
-"""Opacity of a pixel from which it has a depth, a normal or a force."""
+"""Smallest opacity of a pixel with a depth, a normal or a force."""
 MAX_STEPS = 65535
-"""Largest number of a picture of 16 bits."""
+"""Largest number in a 16-bit picture."""
 
 
 def mean_depth(picture: RenderOutput) -> Tensor:
-    """Depth along the optical axis [scene units], 0 where nothing is, shape (H, W)."""
+    """Depth along the optical axis [scene units], 0 for empty pixels, shape (H, W)."""
     covered = picture.alpha >= COVERED
     return torch.where(covered, picture.depth / picture.alpha.clamp_min(COVERED), 0.0)[..., 0]
 
 
 def depth_steps(depth: Tensor, step: float) -> Tensor:
-    """Depth as whole numbers for a picture of 16 bits: 0 where nothing is, otherwise 1 to 65535.
+    """Depth as whole numbers for a 16-bit picture: 0 for empty pixels, otherwise 1 to 65535.
 
     Args:
-        depth: Depth, 0 where nothing is, shape (...).
+        depth: Depth, 0 for empty pixels, shape (...).
         step: Depth of one step, in the same unit.
 
     Returns:
@@ -41,10 +41,10 @@ def depth_steps(depth: Tensor, step: float) -> Tensor:
 
 
 def depth_colors(depth: Tensor, near: float, far: float) -> Tensor:
-    """Colours of a depth: yellow at ``near`` or before, violet at ``far`` or beyond, black where nothing is.
+    """Colours of a depth: yellow up to ``near``, violet from ``far`` on, black for empty pixels.
 
     Args:
-        depth: Depth, 0 where nothing is, shape (H, W).
+        depth: Depth, 0 for empty pixels, shape (H, W).
         near: Nearest depth of the scale.
         far: Farthest depth of the scale.
 
@@ -55,7 +55,7 @@ def depth_colors(depth: Tensor, near: float, far: float) -> Tensor:
 
 
 def facing(normals: Tensor, view: Tensor) -> Tensor:
-    """Normals turned towards the eye, as patches have no outside.
+    """Normals flipped towards the eye, since patches have no outside.
 
     Args:
         normals: Shape (N, 3).
@@ -68,7 +68,7 @@ def facing(normals: Tensor, view: Tensor) -> Tensor:
 
 
 def normal_colors(blended: Tensor, alpha: Tensor, rotation: Tensor) -> Tensor:
-    """Colours of normals: (n + 1) / 2 in red, green and blue, black where nothing is.
+    """Colours of normals: (n + 1) / 2 in red, green and blue, black for empty pixels.
 
     Args:
         blended: Blended normals in scene axes, shape (H, W, 3).
@@ -84,7 +84,7 @@ def normal_colors(blended: Tensor, alpha: Tensor, rotation: Tensor) -> Tensor:
 
 
 def scalar_colors(blended: Tensor, alpha: Tensor, largest: float) -> Tensor:
-    """Colours of a blended scalar: violet at 0, yellow at ``largest`` and above, black where nothing is.
+    """Colours of a blended scalar: violet at 0, yellow at ``largest`` and above, black for empty pixels.
 
     Args:
         blended: Blended values, shape (H, W).

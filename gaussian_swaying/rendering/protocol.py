@@ -1,4 +1,4 @@
-"""What every renderer takes and returns."""
+"""The interface of renderers."""
 
 import math
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Renderer(Protocol):
             means: Centres [scene units], shape (N, 3).
             covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
             opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
-            colors: Colours as they are to be seen (no spherical harmonics), shape (N, 3).
+            colors: Colours as displayed (no spherical harmonics), shape (N, 3).
             camera: The camera, on any device and in any precision.
             background: Colour behind the Gaussians, shape (3,); black when None.
 
@@ -58,12 +58,13 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScreenGaussians:
-    """Where Gaussians are on the screen: what decides in training which of them to split, copy or remove.
+    """Gaussians on the screen. Training uses this to decide which of them to split, copy or remove.
 
     Attributes:
-        means2d: Centres [pixels], in the graph of the picture, shape (V, 2), or (1, N, 2) without ``index``.
+        means2d: Centres [pixels], part of the autograd graph of the picture, shape (V, 2), or (1, N, 2) without
+            ``index``.
         radii: Half width and height [pixels] of each, 0 for one that is not drawn, shape of ``means2d``.
-        index: Index of each among the N Gaussians, shape (V,), or None if all are there.
+        index: Index of each among the N Gaussians, shape (V,), or None if all are listed.
         width: Image width [pixels].
         height: Image height [pixels].
     """
@@ -75,7 +76,7 @@ class ScreenGaussians:
     height: int
 
     def info(self) -> dict[str, Any]:
-        """The same under the names that the strategies of gsplat 1.5 look for."""
+        """The same with the names that the strategies of gsplat 1.5 expect."""
         return {
             "means2d": self.means2d,
             "radii": self.radii,
@@ -102,7 +103,7 @@ class SplatOutput:
 
 
 class SplatRenderer(Renderer, Protocol):
-    """Renderer that also draws Gaussians as they are stored, for training."""
+    """Renderer that also draws Gaussians in storage form, for training."""
 
     def render_splat(
         self,
@@ -125,14 +126,14 @@ class SplatRenderer(Renderer, Protocol):
             sh: Spherical harmonics coefficients, shape (N, K, 3) with K = 1, 4, 9 or 16.
             camera: The camera, on any device and in any precision.
             background: Colour behind the Gaussians, shape (3,); black when None.
-            absgrad: Whether the backward pass is to leave sums of absolute gradients in ``screen.means2d.absgrad``
-                (Ye et al. 2024, "AbsGS").
+            absgrad: Whether the backward pass stores sums of absolute gradients in ``screen.means2d.absgrad`` (Ye et
+                al. 2024, "AbsGS").
 
         Returns:
             The picture, on the device and in the precision of ``means``.
 
         Raises:
-            ValueError: If ``absgrad`` is asked of a renderer that has none.
+            ValueError: If ``absgrad`` is set and the renderer does not support it.
         """
         ...
 
@@ -161,7 +162,7 @@ def check_gaussians(
 
 
 def finite_gaussians(means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-    """Return which Gaussians have only finite values, shape (N,), without a wait for the GPU and in few kernels."""
+    """Return which Gaussians have only finite values, shape (N,), in few kernels and without waiting for the GPU."""
     with torch.no_grad():
         values = torch.cat([means, covariances.flatten(-2), opacities[:, None], colors], dim=-1)
         return torch.linalg.vector_norm(values, math.inf, dim=-1) < math.inf  # NaN is not less either

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
 
 REST_FLOOR = 0.1
-"""Relative shading raises the factors of the moving and of the rest normal to at least this before it divides them."""
+"""Relative shading clamps the factors of the moving and the rest normal to at least this before it divides them."""
 
 
 def _lambert(normal: Tensor, light: Tensor, two_sided: bool) -> Tensor:
@@ -24,7 +24,7 @@ def _lambert(normal: Tensor, light: Tensor, two_sided: bool) -> Tensor:
 
 
 def _relative(factor: Tensor, rest_factor: Tensor) -> Tensor:
-    """Return the ratio of two factors, both raised to at least ``REST_FLOOR``: exactly 1 where they are equal."""
+    """Return the ratio of two factors, both clamped to at least ``REST_FLOOR``: exactly 1 where they are equal."""
     return factor.clamp_min(REST_FLOOR) / rest_factor.clamp_min(REST_FLOOR)
 
 
@@ -41,17 +41,16 @@ def diffuse_shading(
     .. math::
         L_o = s\,c, \qquad s = a + (1 - a) \max(0, \mathbf{n} \cdot \mathbf{L})
 
-    (arXiv 2512.01306, "Lightweight Shading", with a = 0 there). Captured colours already hold the light of the
-    capture. With ``rest_normal`` the factor is therefore
-    :math:`\max(s, 0.1) / \max(s_\text{rest}, 0.1)`, which leaves the picture of the rest shape as it was captured and
-    never divides by zero where the rest shape faces away from the light.
+    (arXiv 2512.01306, "Lightweight Shading", with a = 0 there). Captured colours already contain the light of the
+    capture. With ``rest_normal`` the factor is therefore :math:`\max(s, 0.1) / \max(s_\text{rest}, 0.1)`, so the rest
+    shape looks as captured, and there is no division by zero where it faces away from the light.
 
     Args:
         color: Colours, shape (..., 3).
         normal: Unit normals, shape (..., 3).
         light: Unit vector towards the light, in the frame of the normals, shape (3,).
         two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|`, for normals without a known outside.
-        ambient: Part a of the light that comes from everywhere, in [0, 1].
+        ambient: Share a of ambient light, in [0, 1].
         rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
 
     Returns:
@@ -95,8 +94,8 @@ def phong_shading(
         \qquad \mathbf{r} = 2 (\mathbf{n} \cdot \mathbf{L})\, \mathbf{n} - \mathbf{L}
 
     (arXiv 2512.01306, "Lightweight Shading"). The highlight is white and is the same for **n** and **-n**. With
-    ``rest_normal`` the factor of the colour is divided by that of the rest normal, both raised to at least 0.1, and
-    the highlight of the rest normal is subtracted, which leaves the picture of the rest shape as it was captured.
+    ``rest_normal`` the factor of the colour is divided by that of the rest normal, both clamped to at least 0.1, and
+    the highlight of the rest normal is subtracted, so the rest shape looks as captured.
 
     Args:
         color: Colours, shape (..., 3).
@@ -182,8 +181,8 @@ class DiffuseShader(Shader):
 
     Args:
         light: Direction towards the light in the metric frame (z up), of any length.
-        two_sided: Shade both sides of the surface alike.
-        ambient: Part of the light that comes from everywhere, in [0, 1].
+        two_sided: Shade both sides of the surface in the same way.
+        ambient: Share of ambient light, in [0, 1].
         relative: Shade relative to the rest shape, which then looks as captured.
 
     Raises:
@@ -240,7 +239,7 @@ class PhongShader(Shader):
         k_d: Diffuse coefficient, not negative.
         k_s: Specular coefficient, not negative.
         shininess: Exponent of the highlight, positive.
-        two_sided: Shade both sides of the surface alike.
+        two_sided: Shade both sides of the surface in the same way.
         relative: Shade relative to the rest shape, which then looks as captured.
 
     Raises:

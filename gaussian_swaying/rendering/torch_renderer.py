@@ -26,13 +26,13 @@ from gaussian_swaying.rendering.protocol import (
 )
 
 MIN_ALPHA = 1.0 / 255.0
-"""A Gaussian adds nothing to a pixel where its alpha is smaller."""
+"""A Gaussian is skipped at pixels where its alpha is smaller."""
 MAX_ALPHA = 0.999
 """Upper bound of alpha, so that the transmittance stays positive."""
 MIN_TRANSMITTANCE = 1e-4
-"""A pixel is finished before the Gaussian that would take its transmittance to this value or below."""
+"""A pixel stops before the Gaussian that would lower its transmittance to this value or below."""
 _SLACK = 0.01
-"""Added to pixel extents [pixels], against round-off; the exact test is on alpha."""
+"""Added to pixel extents [pixels] because of round-off; the exact test is on alpha."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,9 +66,9 @@ def project_gaussians(
         \Sigma' = J W \Sigma W^\top J^\top + \epsilon I, \qquad
         J = \frac{1}{z} \begin{pmatrix} f_x & 0 & -f_x \hat x \\ 0 & f_y & -f_y \hat y \end{pmatrix}.
 
-    A Gaussian is left out if it is not finite, its centre is in front of the near plane, its opacity is below 1/255
-    or the ellipse where its alpha reaches 1/255 misses the image. That ellipse has
-    :math:`\sqrt{2 \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
+    A Gaussian is left out if it is not finite, if its centre is in front of the near plane, if its opacity is below
+    1/255, or if the ellipse where its alpha reaches 1/255 is outside the image. That ellipse has :math:`\sqrt{2
+    \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
 
     Args:
         means: Centres [scene units], shape (N, 3).
@@ -78,7 +78,7 @@ def project_gaussians(
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
     Returns:
-        The V Gaussians left, by depth; Gaussians of equal depth keep their order.
+        The V remaining Gaussians, sorted by depth; Gaussians of equal depth keep their order.
     """
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     (fx, fy), (cx, cy) = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
@@ -162,7 +162,7 @@ def _row_spans(projected: ProjectedGaussians, width: int, height: int, limit: in
         \tfrac12 d^\top \Sigma'^{-1} d = \frac{\sigma_{yy}}{2 \det \Sigma'}
         \Bigl(d_x - \frac{\sigma_{xy}}{\sigma_{yy}} d_y\Bigr)^2 + \frac{d_y^2}{2 \sigma_{yy}},
 
-    which gives the run of pixels with alpha of at least 1/255, however thin and slanted the ellipse is, and has no
+    which gives the run of pixels with alpha of at least 1/255, for any thin and slanted ellipse, and without
     cancellation.
     """
     xx, xy, yy = projected.covariances2d.unbind(-1)
@@ -210,7 +210,7 @@ def composite_gaussians(
         features: Values to blend, shape (V, D).
         width: Image width [pixels].
         height: Image height [pixels].
-        max_pairs: About how many pairs of a Gaussian and a pixel are in memory at a time (autograd keeps them all).
+        max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time (autograd keeps them all).
 
     Returns:
         Blended features, shape (H, W, D), and opacity :math:`\sum_k T_k \alpha_k`, shape (H, W, 1).
@@ -228,7 +228,7 @@ def composite_gaussians(
             with torch.no_grad():
                 local = torch.arange(end - start, dtype=torch.int32, device=running.device)
                 span = local.repeat_interleave(spans.count[start:end])
-                # Pixels from the start of the span: a running number, less that of the span's first pair.
+                # Pixels from the start of the span: the index of the pair minus that of the span's first pair.
                 step = torch.arange(len(span), dtype=torch.int32, device=running.device)
                 step -= (before[start:end] - before[start]).int().index_select(0, span)
                 pixel = step + spans.pixel[start:end].index_select(0, span)
@@ -281,11 +281,11 @@ def render_torch(
         means: Centres [scene units], shape (N, 3).
         covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
         opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as they are to be seen, shape (N, 3).
+        colors: Colours as displayed, shape (N, 3).
         camera: The camera.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
-        max_pairs: About how many pairs of a Gaussian and a pixel are in memory at a time.
+        max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time.
 
     Returns:
         The picture, on the device and in the precision of ``means``.
@@ -311,7 +311,7 @@ class TorchRenderer(nn.Module):
 
     Args:
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
-        max_pairs: About how many pairs of a Gaussian and a pixel are in memory at a time; bounds the memory and does
+        max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time; bounds the memory and does
             not change the picture beyond round-off.
 
     Raises:
@@ -349,9 +349,9 @@ class TorchRenderer(nn.Module):
     ) -> SplatOutput:
         """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`."""
         if absgrad:
-            raise ValueError("TorchRenderer has no absolute gradients: leave `absgrad` off, or train on a GPU.")
+            raise ValueError("TorchRenderer has no absolute gradients: turn `absgrad` off, or train on a GPU.")
         camera = camera.to(means.device, means.dtype)
-        # along with the projection, so that only what is drawn gets a colour
+        # after the projection, so that only visible Gaussians get a colour
         covariances = covariance(quats, log_scales)
         finite = finite_gaussians(means, covariances, opacities, sh.flatten(1))
         projected = project_gaussians(means, covariances, torch.where(finite, opacities, 0.0), camera, self.eps2d)

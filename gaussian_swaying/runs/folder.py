@@ -95,7 +95,7 @@ def _check_free(folder: Path, real: Path, ours: Iterable[str], remedy: str) -> N
     foreign = [name for name in ours if os.path.lexists(real / name)]
     if foreign:
         raise ValueError(
-            f"The output folder {folder} contains {', '.join(foreign)}, not made by a run, which would be "
+            f"The output folder {folder} contains {', '.join(foreign)} of something else, which would be "
             f"overwritten: {remedy}."
         )
 

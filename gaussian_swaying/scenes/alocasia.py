@@ -15,9 +15,9 @@ from gaussian_swaying.scenes.stage import cast, floor
 
 
 class AlocasiaScene(ProceduralScene):
-    """An alocasia (elephant's ear) about 1.1 m tall in a pot on a floor at z = 0, z up, its earth at 0.20 m.
+    """An alocasia (elephant's ear) about 1.1 m tall, in a pot on a floor at z = 0, z up; the soil is at 0.20 m.
 
-    Bent stalks that carry one broad blade of 38 cm each.
+    Each bent stalk has one broad blade of 38 cm.
 
     Args:
         spacing: Distance between Gaussians [m].
@@ -50,7 +50,7 @@ class AlocasiaScene(ProceduralScene):
         return to_cloud(join(parts))
 
     def _blade(self, top: torch.Tensor, way: torch.Tensor, up: torch.Tensor, size: float) -> Patches:
-        """A blade whose stalk meets it a fifth of its length from the back."""
+        """A blade attached to its stalk at a fifth of its length from the back."""
         blade = leaf(
             0.38, 0.25, self.spacing / size, taper=(0.42, 0.95), droop=0.22, fold=0.22,
             colour=(0.12, 0.34, 0.16), vein=(0.62, 0.74, 0.50), veins=6,

@@ -15,13 +15,13 @@ from gaussian_swaying.scenes.stage import cast, floor
 
 
 class FicusScene(ProceduralScene):
-    """A ficus tree 2 m tall in a pot, z up, the pot standing on a floor at z = 0 and its earth at z = 0.30 m.
+    """A ficus tree 2 m tall, z up, in a pot on a floor at z = 0; the soil is at z = 0.30 m.
 
-    The trunk rises from the earth to z = 1.25 m and carries branches, twigs and leaves of 8 cm.
+    The trunk rises from the soil to z = 1.25 m and has branches, twigs and leaves of 8 cm.
 
     Args:
-        spacing: Distance between Gaussians [m]; a leaf has at least one, and on trunk and branches they
-            are never farther apart than 3 and 4.5 cm, so that these stay stiff on a coarse grid.
+        spacing: Distance between Gaussians [m]; a leaf has at least one. On the trunk and branches it is at most 3 and
+            4.5 cm, so that they stay stiff on a coarse grid.
         leaves: Number of leaves.
         seed: Seed of the growth.
     """
@@ -60,7 +60,7 @@ class FicusScene(ProceduralScene):
                 twig = bezier(torch.stack([root, 0.5 * (root + tip) + 0.02 * lift, tip]), 7)
                 parts.append(tube(twig, torch.linspace(0.006, 0.003, 7), max(h, 0.012), bark))
                 twigs.append(twig[1:])
-        # leaves sit on points of the twigs and point away from the trunk, hanging a little
+        # leaves are attached to points of the twigs and point away from the trunk, drooping a little
         spots = torch.cat(twigs)
         spot = spots[(draw.uniform(0, 1, self.leaves) * len(spots)).long().clamp(max=len(spots) - 1)]
         middle = torch.tensor([0.0, 0.0, 1.15], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""A flag and what holds it."""
+"""A flag and its stand."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ METAL, GOLD, CLOTH, ROPE = (0.62, 0.64, 0.67), (0.90, 0.68, 0.22), (0.86, 0.86, 
 
 
 class FlagOnStandScene(ProceduralScene):
-    """A :class:`~gaussian_swaying.scenes.procedural.FlagScene` with what holds it, so that its pins can be seen.
+    """A :class:`~gaussian_swaying.scenes.procedural.FlagScene` with a stand, so that its pins are visible.
 
-    The stand lies outside the box of the flag, [0, width] x [-0.005, 0.005] x [0, height] before it is turned, which a
-    configuration gives as ``scene.region`` so that only the flag moves.
+    The stand is outside the box of the flag, [0, width] x [-0.005, 0.005] x [0, height] before it is turned. A
+    configuration sets this box as ``scene.region`` so that only the flag moves.
 
     Args:
         width: Length of the flag along x [m].
@@ -74,7 +74,7 @@ class FlagOnStandScene(ProceduralScene):
         return ellipsoid(center, radii, min(self._step, 0.5 * max(radii)), GOLD)
 
     def _pole(self) -> list[Patches]:
-        """A pole that goes down out of sight, with the hem of the flag around it."""
+        """A pole that continues down out of the picture, with the hem of the flag around it."""
         height = self.flag.height
         pole = self._bar((-0.024, 0.0, -2.0 * height), (-0.024, 0.0, 1.06 * height), 0.016, METAL)
         hem = self._bar((-0.024, 0.0, 0.0), (-0.024, 0.0, height), 0.021, CLOTH)

@@ -21,7 +21,7 @@ WOOD = (
 
 
 class LeavesScene(ProceduralScene):
-    """A leafy branch about 1.8 m long in the x-z plane, z up, whose bare wood goes on to the left of x = -0.9 m.
+    """A leafy branch about 1.8 m long in the x-z plane, z up. Left of x = -0.9 m it continues without leaves.
 
     A straight branch with four straight twigs (:data:`WOOD`) and leaves of 17 cm.
 
@@ -51,7 +51,7 @@ class LeavesScene(ProceduralScene):
         for piece, count in zip(ends, counts.tolist(), strict=True):
             if count > 0:
                 parts.append(self._leaves(draw, piece, count))
-        # on from the cut, out of the picture: what stands behind the pins, without leaves
+        # from the cut out of the picture: the wood behind the pins, without leaves
         parts.append(tube([[-2.4, 0.05, -0.30], [-0.90, 0.0, 0.0]], [0.030, 0.016], max(h, 0.01), (0.36, 0.26, 0.18)))
         return to_cloud(join(parts), overlap=0.45)
 
@@ -60,7 +60,7 @@ class LeavesScene(ProceduralScene):
         place = (torch.arange(count, dtype=torch.float64) + draw.uniform(0.2, 0.8, count)) / count
         place = 0.12 + 0.88 * place
         spot = torch.lerp(piece[0], piece[1], place[:, None])
-        # to either side of the wood in turn, a little forwards, and round about it
+        # alternately to both sides of the wood, slightly forwards, and around it
         y = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
         side = torch.nn.functional.normalize(torch.linalg.cross(y, along), dim=-1)
         sign = 1 - 2 * (torch.arange(count) % 2)[:, None].double()

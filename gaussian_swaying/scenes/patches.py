@@ -18,7 +18,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
 
-LIGHT = (-0.4, -0.7, 0.6)  # towards the light that is baked into the colours
+LIGHT = (-0.4, -0.7, 0.6)  # direction towards the light that is baked into the colours
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Patches:
         return Patches(center + move, across, along, self.colour)
 
     def painted(self, colour: Sequence[float] | Tensor, where: Tensor | None = None) -> Patches:
-        """The patches in one colour (3,) or in one colour each (N, 3); with ``where`` (N,) only those it picks."""
+        """The patches in one colour (3,) or in one colour each (N, 3); with ``where`` (N,) only the selected ones."""
         new = torch.as_tensor(colour, dtype=torch.float64).expand(len(self), 3)
         return replace(self, colour=new if where is None else torch.where(where[:, None], new, self.colour))
 
@@ -86,7 +86,7 @@ def to_cloud(
     Args:
         patches: Surface.
         overlap: Standard deviation of a Gaussian as a share of the edge of its patch.
-        ambient: Part of the baked light that comes from everywhere, in [0, 1].
+        ambient: Share of ambient light in the baked light, in [0, 1].
         two_sided: Bake the same light into both sides, as for leaves and cloth.
         opacity: Opacity of every Gaussian, between 0 and 1.
 
@@ -173,7 +173,7 @@ def resample(path: Tensor, count: int) -> Tensor:
 
 
 def frames_along(path: Tensor) -> Tensor:
-    """Axes (K, 3, 3) along a polyline (K, 3) that turn as little as possible; the columns are two normals, tangent."""
+    """Axes (K, 3, 3) along a polyline (K, 3) that rotate as little as possible; columns: two normals, tangent."""
     tangent = torch.nn.functional.normalize(torch.gradient(path, dim=0)[0], dim=-1)
     helper = torch.nn.functional.one_hot(tangent[0].abs().argmin(), 3).to(path)
     first = torch.nn.functional.normalize(torch.linalg.cross(tangent[0], helper), dim=-1)
@@ -191,7 +191,7 @@ def tube(
     spacing: float,
     colour: Sequence[float] = (0.4, 0.3, 0.2),
 ) -> Patches:
-    """A round tube about a polyline, of at least three patches around; open at its ends unless the radius is 0 there.
+    """A round tube around a polyline, at least three patches per ring; the ends are open unless the radius is 0.
 
     Args:
         path: Points of the centre line [m], shape (K, 3).
@@ -224,7 +224,7 @@ def revolution(
     """A solid of revolution about z: the surface that a profile sweeps.
 
     Args:
-        profile: Radius and height [m], shape (K, 2). The outside is to the right of the way the profile takes.
+        profile: Radius and height [m], shape (K, 2). The outside is to the right of the direction of the profile.
         spacing: Distance between Gaussians [m].
         colour: RGB in [0, 1].
 
@@ -315,7 +315,7 @@ def copies(template: Patches, axes: Tensor, size: Tensor, origin: Tensor, tint: 
 
 
 def facing(direction: Tensor, up: Tensor) -> Tensor:
-    """Rotations (M, 3, 3) that take y to a direction (M, 3) and z as near to ``up`` (M, 3) as they can."""
+    """Rotations (M, 3, 3) that take y to a direction (M, 3) and z as near to ``up`` (M, 3) as possible."""
     y = torch.nn.functional.normalize(direction, dim=-1)
     x = torch.nn.functional.normalize(torch.linalg.cross(y, up), dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)

@@ -1,4 +1,4 @@
-"""What the generated plants share: leaves, pots and seeded randomness."""
+"""Parts of the generated plants: leaves, pots and seeded random numbers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def leaf(
     Args:
         length: Length [m].
         width: Largest width [m].
-        spacing: Distance between Gaussians [m]; at least one Gaussian carries the leaf.
+        spacing: Distance between Gaussians [m]; a leaf has at least one Gaussian.
         taper: The exponents p and q.
         droop: How far the tip hangs below the plane, as a share of the length.
         fold: How far the rim rises above the midrib, as a share of the half width.
@@ -95,7 +95,7 @@ def leaf_area(length: float, width: float, taper: tuple[float, float] = (0.55, 0
 def pot(
     height: float, foot: float, rim: float, spacing: float, colour: Sequence[float] = (0.72, 0.36, 0.22)
 ) -> Patches:
-    """A flower pot on z = 0 with earth in it, its lip a tenth of its height.
+    """A flower pot on z = 0 with soil in it; its lip is a tenth of its height.
 
     Args:
         height: Height [m].
@@ -105,7 +105,7 @@ def pot(
         colour: RGB of the pot.
 
     Returns:
-        The patches; the earth lies at 0.92 of the height.
+        The patches; the soil is at 0.92 of the height.
     """
     lip, wall = 1.08 * rim, 0.92 * rim
     outside = [[foot, 0.0], [0.97 * rim, 0.86 * height], [lip, 0.87 * height], [lip, height], [wall, height]]

@@ -1,4 +1,4 @@
-"""Splats generated in code, so that everything runs with nothing downloaded."""
+"""Splats generated in code, so that everything runs without downloads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 
-_MOST = 50_000_000  # Gaussians, some 100 GB of them
+_MOST = 50_000_000  # Gaussians, about 100 GB
 
 
 class ProceduralScene(ABC):
@@ -38,10 +38,10 @@ class GivenScene(ProceduralScene):
 
 
 class FlagScene(ProceduralScene):
-    """A rectangular flag in the x-z plane, its pole side at x = 0, its lower edge at z = 0, in metres.
+    """A rectangular flag in the x-z plane with its pole side at x = 0 and its lower edge at z = 0, in metres.
 
-    One layer of disc-shaped Gaussians on a square lattice with a small ripple, so that a flag at rest does not sit
-    exactly edge-on to a wind along x.
+    One layer of disc-shaped Gaussians on a square lattice with a small ripple, so that a flag at rest is not exactly
+    edge-on to a wind along x.
 
     Args:
         width: Length along x [m].

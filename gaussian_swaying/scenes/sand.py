@@ -34,10 +34,10 @@ OPEN = 3  # layers of grains that the wind reaches: they share the area of the s
 class SandScene(ProceduralScene):
     """A bear of sand lying on a beach, 2.3 m from head to foot, z up, the bear on z = 0.
 
-    Dry sand has no cohesion, so the bear is heaped up of mounds (:data:`MOUNDS`) nowhere steeper than ``slope``, which
+    Dry sand has no cohesion, so the bear is made of mounds (:data:`MOUNDS`) that are nowhere steeper than ``slope`` and
     stand by themselves. It is solid. The wind reaches :data:`OPEN` layers of grains, which share the area of the
-    surface, so that it finds grains to take where it has taken some; deeper ones are specks on a lattice, too small to
-    be seen or to feel the wind.
+    surface. So where the wind has blown grains away, there are more. Deeper grains are specks on a lattice, too small
+    to be seen or to feel the wind.
 
     Args:
         spacing: Distance between Gaussians [m], on the surface and inside.
@@ -88,7 +88,7 @@ class SandScene(ProceduralScene):
             skin = skin.painted(0.75 * colour, self._in(x, y, 0.42 * side, -0.76, 0.12))
         step = min(max(h, 0.03), 0.12)
         beach = floor(step, (0.66, 0.55, 0.39), flat=2.2, fade=(3.0, 9.0), ambient=0.35)
-        # a little below, or it would cover the grains that lie on it: Gaussians are drawn in the order of their centres
+        # slightly below, or it would cover the grains on it: Gaussians are drawn in the order of their centres
         parts = [skin, beach.mapped(shift=(0.0, 0.1, -1.6 * step))]
         if self.interior:
             layers = torch.arange(int(float(z.max()) / h) + 1, dtype=torch.float64) * h + 0.5 * h
@@ -96,7 +96,7 @@ class SandScene(ProceduralScene):
             inside = layers[level] < z[column] - 0.9 * h
             column, level = column[inside], level[inside]
             center = torch.stack([x[column], y[column], layers[level]], -1)
-            center[:, :2] += 0.5 * h * (level % 2)[:, None]  # between those of the layers above and below
+            center[:, :2] += 0.5 * h * (level % 2)[:, None]  # between the grains of the layers above and below
             near = (z[column] - layers[level] < (OPEN - 0.1) * h)[:, None]
             edge = torch.where(near, g, 0.02 * h).double()
             along_x, along_y = torch.eye(3, dtype=torch.float64)[:2]

@@ -1,4 +1,4 @@
-"""Solids generated in code: Gaussians on the surface of a body, and if asked for throughout it."""
+"""Solids generated in code: Gaussians on the surface of a body, and optionally inside it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FIGURE = (
     (-0.18, -0.26, 0.10, 0.12),
     (0.18, -0.26, 0.10, 0.12),
 )
-_BLEND = 0.02  # radius over which the balls of the figure run into each other, for a height of 1
+_BLEND = 0.02  # radius over which the balls of the figure blend into each other, for a height of 1
 
 
 def ball_distance(points: Tensor, radius: float) -> Tensor:
@@ -46,7 +46,7 @@ def torus_distance(points: Tensor, ring: float, tube: float) -> Tensor:
 
 
 def figure_distance(points: Tensor, height: float) -> Tensor:
-    """About the signed distance to a seated bear on the plane z = 0, as :func:`ball_distance`."""
+    """Approximate signed distance to a seated bear on the plane z = 0, as :func:`ball_distance`."""
     balls = torch.tensor(FIGURE, dtype=points.dtype) * height
     each = torch.linalg.vector_norm(points[..., None, :] - balls[:, :3], dim=-1) - balls[:, 3]
     blend = _BLEND * height
@@ -56,14 +56,14 @@ def figure_distance(points: Tensor, height: float) -> Tensor:
 class SolidScene(ProceduralScene):
     """A solid body with flat Gaussians on its surface, their shortest axes along the true normals, z up.
 
-    The Gaussians of the surface are the points of a jittered lattice next to it, moved onto it. Those inside, if asked
-    for, are the other points of the lattice, as large as the first; their normals are those of the nearest surface.
+    The Gaussians on the surface are the nearby points of a jittered lattice, moved onto it. The Gaussians inside, if
+    wanted, are the other points of the lattice, with the same size and the normals of the nearest surface.
 
     Args:
         shape: ``figure`` (a seated bear), ``ball``, ``box`` (2 : 1.6 : 1.2) or ``torus`` (tube of 0.3 of the ring).
         size: Height of the figure, diameter of the ball, longest side of the box, outer diameter of the torus [m].
         spacing: Distance between Gaussians [m], at most a quarter of the size.
-        gaussians: ``throughout``, or ``shell`` for a hollow splat as captures are.
+        gaussians: ``throughout``, or ``shell`` for a hollow splat, as captures are.
         overlap: Standard deviation of a Gaussian as a share of the spacing.
         jitter: How far points of the lattice are moved at random, from 0 to 1 times the spacing.
         seed: Seed of the jitter.
@@ -86,7 +86,7 @@ class SolidScene(ProceduralScene):
         if spacing > 0.25 * size:
             raise ValueError(f"Expected `generator.spacing` to be at most a quarter of the size, but got {spacing} m.")
         if not 0 <= jitter <= 1:
-            raise ValueError(f"Expected `generator.jitter` to lie from 0 to 1, but got {jitter}.")
+            raise ValueError(f"Expected `generator.jitter` to be from 0 to 1, but got {jitter}.")
         self.shape, self.size, self.spacing, self.gaussians = shape, float(size), float(spacing), gaussians
         self.overlap, self.jitter, self.seed = float(overlap), float(jitter), int(seed)
 
@@ -113,7 +113,7 @@ class SolidScene(ProceduralScene):
         points += self.jitter * h * (torch.rand(points.shape, generator=draw, dtype=torch.float64) - 0.5)
         distance = self.distance(points)
         skin = points[distance.abs() < 0.5 * h]
-        for _ in range(8):  # onto the surface; once is enough for a true distance away from edges
+        for _ in range(8):  # onto the surface; for a true distance and away from edges once is enough
             skin = skin - self.distance(skin)[:, None] * self.normal(skin)
         means, normals = skin, self.normal(skin)
         if self.gaussians == "throughout":
@@ -133,7 +133,7 @@ class SolidScene(ProceduralScene):
         )
 
     def normal(self, points: Tensor) -> Tensor:
-        """Unit gradient of the distance at points (N, 3), by central differences; +z where it vanishes."""
+        """Unit gradient of the distance at points (N, 3), by central differences; +z where it is zero."""
         step = 1e-6 * self.size
         offsets = step * torch.eye(3, dtype=torch.float64)
         slope = [self.distance(points + offset) - self.distance(points - offset) for offset in offsets]
@@ -144,7 +144,7 @@ class SolidScene(ProceduralScene):
 
 
 def _quat_from_z(normals: Tensor) -> Tensor:
-    """Quaternions wxyz (N, 4) of the shortest turns that take +z to unit vectors (N, 3); about x for -z."""
+    """Quaternions wxyz (N, 4) of the smallest rotations that take +z to unit vectors (N, 3); about x for -z."""
     x, y, z = normals.unbind(-1)
     quats = torch.stack([1 + z, -y, x, torch.zeros_like(x)], dim=-1)
     flip = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=normals.dtype)

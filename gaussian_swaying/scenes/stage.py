@@ -1,4 +1,4 @@
-"""What the generated scenes stand on: a floor that fades into the background, with soft shadows."""
+"""The floor of the generated scenes, which fades into the background and has soft shadows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gaussian_swaying.scenes.plant_parts import Draw
 
 SKY = (0.75, 0.82, 0.90)  # the background of these scenes
 _REACH = 14.0  # radius of the floor [m]
-_GROWTH = 0.07  # rings grow wider by this share of their radius, as distance makes them smaller
+_GROWTH = 0.07  # the width of a ring as a share of its radius, since distant rings look smaller
 _OVERLAP = 1.5
 Shadow = tuple[float, float, float, float]  # x, y, radius [m], and how much darker its middle is, from 0 to 1
 
@@ -30,16 +30,17 @@ def floor(
     sky: Sequence[float] = SKY,
     ambient: float = 0.45,
 ) -> Patches:
-    """A round floor at z = 0 that faces up and runs into the colour of the sky.
+    """A round floor at z = 0 that faces up and fades into the colour of the sky.
 
     Args:
         spacing: Distance between Gaussians near the middle [m], which grows with the distance from it.
         colour: RGB near the middle.
         shadows: Soft round shadows.
-        flat: Radius within which the distance between Gaussians does not grow [m], so that none covers what lies there.
-        fade: Distances from the middle at which it begins and has become the colour of the sky [m].
+        flat: Radius within which the distance between Gaussians does not grow [m], so that none covers an object there.
+        fade: Distances from the middle at which the fading starts and ends [m].
         sky: RGB of the background.
-        ambient: That of :func:`~gaussian_swaying.scenes.patches.to_cloud`, whose light must not darken the sky.
+        ambient: That of :func:`~gaussian_swaying.scenes.patches.to_cloud`; the colours make up for its light at the
+            horizon.
 
     Returns:
         The patches, ring by ring.
@@ -65,6 +66,6 @@ def floor(
 
 
 def cast(point: Sequence[float] | Tensor, radius: float, depth: float) -> Shadow:
-    """The shadow on the floor of something round about a point (3,) [m], under the light that is in the colours."""
+    """The shadow on the floor of something round at a point (3,) [m], under the light baked into the colours."""
     x, y, z = (float(value) for value in point)
     return (x - LIGHT[0] / LIGHT[2] * z, y - LIGHT[1] / LIGHT[2] * z, radius, depth)

@@ -28,10 +28,10 @@ RED, CREAM, DARK = (0.72, 0.10, 0.09), (0.90, 0.87, 0.80), (0.13, 0.13, 0.14)
 
 
 class TelephoneScene(ProceduralScene):
-    """A red telephone on a tiled wall, z up, seen from -y: the handset is off the hook and hangs on a coiled cord.
+    """A red telephone on a tiled wall, z up, seen from -y. The handset is off the hook and hangs on a coiled cord.
 
-    The wall is the plane y = 0.10 m; the telephone ends at z = 0. The cord hangs below it to z = -0.37 m, and from its
-    end the handset, to z = -0.81 m.
+    The wall is the plane y = 0.10 m; the telephone ends at z = 0. The cord hangs below it to z = -0.37 m, and the
+    handset hangs from the cord to z = -0.81 m.
 
     Args:
         spacing: Distance between Gaussians along the cord [m]; elsewhere at least 8 mm.
@@ -51,7 +51,7 @@ class TelephoneScene(ProceduralScene):
         return to_cloud(join(parts), overlap=0.5, two_sided=False)
 
     def cord(self) -> Patches:
-        """The coiled cord: straight for some centimetres at its ends."""
+        """The coiled cord, straight for some centimetres at its ends."""
         hang = bezier([[-0.03, 0.01, 0.01], [-0.05, -0.02, -0.10], [-0.10, -0.06, -0.24], [-0.10, -0.06, -0.37]], 121)
         count = 20 * self.turns + 1
         line = resample(hang, count)

@@ -31,8 +31,8 @@ PETALS = ((0.93, 0.42, 0.52), (0.97, 0.80, 0.30), (0.95, 0.93, 0.90), (0.72, 0.3
 class VaseScene(ProceduralScene):
     """A vase 0.30 m tall with a bunch of flowers, on a round chequered cloth, z up, the table top at z = 0.
 
-    The mouth of the vase is at z = 0.30 m, the flowers reach to 0.62 m. The cloth has a radius of 0.34 m on the table
-    and hangs 0.14 m over its edge.
+    The mouth of the vase is at z = 0.30 m, and the flowers reach up to 0.62 m. The cloth has a radius of 0.34 m on the
+    table and hangs 0.14 m over its edge.
 
     Args:
         spacing: Distance between Gaussians [m].
@@ -58,7 +58,7 @@ class VaseScene(ProceduralScene):
         return to_cloud(join(parts))
 
     def _cloth(self, h: float) -> Patches:
-        """A disc on the table that goes over into a wavy hem; its chequers are 7 cm."""
+        """A disc on the table with a wavy hem over the edge; its squares are 7 cm."""
         table, reach = 0.34, 0.48
 
         def surface(v: Tensor, u: Tensor) -> Tensor:

@@ -227,7 +227,7 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
     for options, words in (
         ({"data.init_args.path": "nowhere"}, "nowhere does not exist"),
         ({"data": json.dumps(data)}, ""),
-        ({"ckpt_path": broken}, "checksum does not fit its content"),
+        ({"ckpt_path": broken}, "checksum does not match its content"),
         ({"ckpt_path": folder / "csv"}, "it is a folder"),
         ({"ckpt_path": last}, "has seen 3 images already, and `trainer.max_steps` asks for 3"),
         ({"trainer.precision": "16-mixed"}, "precision"),

@@ -270,11 +270,11 @@ def test_files_are_converted(tmp_path):
     assert len(read_splat(tmp_path / "a.splat")["means"]) == 20
     frames = tmp_path / "ply"
     frames.mkdir()
-    with pytest.raises(ValueError, match=r"holds no \.ply"):
+    with pytest.raises(ValueError, match=r"contains no \.ply"):
         convert(frames, tmp_path / "film.usdc")
     for k in range(3):
         write_ply(frames / f"{k:05d}.ply", _moved(cloud, 0.1 * k))
-    with pytest.raises(ValueError, match="folder of 3 frames, which only USD can hold"):
+    with pytest.raises(ValueError, match="folder of 3 frames, which only USD supports"):
         convert(frames, tmp_path / "b.splat")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         convert(tmp_path / "a.ply", tmp_path / "no" / "a.splat")

@@ -288,7 +288,7 @@ def test_open_surfaces_enclose_nothing():
     ball = _ball(0.5)
     bowl = ball[0][:, 2] < -0.1
     for points, normals in ((flag, across), (ball[0][bowl], ball[1][bowl])):
-        with pytest.raises(ValueError, match=r"Expected `filling` to find an inside.*leave out `filling`"):
+        with pytest.raises(ValueError, match=r"Expected `filling` to find an inside.*remove `filling`"):
             _fill(points, normals, votes=0.9)
     with pytest.raises(ValueError, match="find an inside"):
         _fill(flag, across)

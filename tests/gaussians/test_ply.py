@@ -378,5 +378,5 @@ def test_a_file_that_is_longer_than_its_header_says_is_warned_of(tmp_path):
     write_ply(tmp_path / "flag.ply", _cloud())
     with (tmp_path / "flag.ply").open("ab") as file:
         file.write(bytes(28))
-    with pytest.warns(UserWarning, match="28 bytes follow that its header does not tell of"):
+    with pytest.warns(UserWarning, match="28 bytes follow that its header does not mention"):
         assert len(read_ply(tmp_path / "flag.ply")) == 7

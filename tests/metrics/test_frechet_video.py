@@ -166,7 +166,7 @@ def test_value_range_and_bytes(make):
         metric.update(given.flip(0), real=False)
     torch.testing.assert_close(bytes_.compute(), unit.compute(), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(signed.compute(), unit.compute(), rtol=1e-4, atol=1e-6)
-    with pytest.raises(ValueError, match=r"values from 0 to 1, but they are from 0 to 25\d: set `value_range`"):
+    with pytest.raises(ValueError, match=r"values from 0 to 1, but they range from 0 to 25\d: set `value_range`"):
         unit.update(video, real=True)
 
 
@@ -218,7 +218,7 @@ def test_the_network_follows_the_metric(make):
 
 
 def test_missing_weights(tmp_path):
-    with pytest.raises(ValueError, match=r"There is no file .*i3d\.pt: give `weights` .* none is downloaded"):
+    with pytest.raises(ValueError, match=r"There is no file .*i3d\.pt: set `weights` .* none is downloaded"):
         FrechetVideoDistance(tmp_path / "i3d.pt")
 
 
@@ -237,7 +237,7 @@ def test_network_with_another_output(make, network):
 
 
 def test_video_shorter_than_a_clip(make):
-    with pytest.raises(ValueError, match="A video has 3 frames, but a clip 4"):
+    with pytest.raises(ValueError, match="A video has 3 frames, but a clip needs 4"):
         make(clip_length=4).update(torch.rand(3, 3, 8, 8), real=True)
 
 

@@ -68,7 +68,7 @@ def test_a_zombie_holds_nothing(tmp_path):
 @pytest.mark.parametrize("change", [{"host": "elsewhere"}, {"space": "pid:[1]"}])
 def test_whether_a_process_elsewhere_lives_is_not_known(change, tmp_path):
     _lock_of(tmp_path, **change)
-    with pytest.raises(FolderLocked, match=rf"A run on the host .* remove .*{LOCK} if it runs no more"):
+    with pytest.raises(FolderLocked, match=rf"A run on the host .* remove .*{LOCK} if it is not running any more"):
         FolderLock(tmp_path)
 
 
@@ -232,6 +232,6 @@ def test_what_is_no_folder(tmp_path):
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "summary.json").symlink_to(tmp_path / "nothing")
-    with pytest.raises(ValueError, match=r"foreign holds summary.json of something else"):
+    with pytest.raises(ValueError, match=r"foreign contains summary.json of something else"):
         _claim(foreign, ["summary.json"])
     assert [path.name for path in foreign.iterdir()] == ["summary.json"]

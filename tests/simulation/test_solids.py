@@ -170,7 +170,7 @@ def test_physgaussians_volumes_count_the_filling():
 
 
 def test_an_open_surface_is_refused():
-    with pytest.raises(ValueError, match="leave out `filling`"):
+    with pytest.raises(ValueError, match="remove `filling`"):
         _scene(generator=FlagScene(spacing=0.05))
     with pytest.raises(ValueError, match=r"scene\.wind_on"):
         _scene(wind_on="inside")

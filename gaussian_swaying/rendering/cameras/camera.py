@@ -1,4 +1,4 @@
-"""Pinhole cameras in the OpenCV convention, and how to place one."""
+"""Pinhole cameras in the OpenCV convention, and functions that place one."""
 
 import math
 from collections.abc import Sequence
@@ -58,7 +58,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
-    _eye: Tensor | None = field(default=None, init=False, repr=False)  # of a camera that came from the host
+    _eye: Tensor | None = field(default=None, init=False, repr=False)  # kept when a camera is copied from the host
 
     def __post_init__(self) -> None:
         check_shape("world_to_camera", self.world_to_camera, 4, 4)
@@ -78,7 +78,7 @@ class Camera:
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Camera":
         """Return the camera with its matrices on another device or in another precision.
 
-        From the host to a GPU they go in one copy, which the host does not wait for.
+        They are copied from the host to a GPU in one go, and the host does not wait for it.
         """
         target = self.intrinsics.device if device is None else torch.device(device)
         parts, eye = (self.world_to_camera, self.intrinsics), self._eye
@@ -119,7 +119,7 @@ def look_at_camera(
     device: torch.device | str | None = None,
     dtype: torch.dtype | None = None,
 ) -> Camera:
-    """Camera at ``eye`` that has ``target`` at the image centre and ``up`` towards the top of the image.
+    """Camera at ``eye`` with ``target`` at the image centre and ``up`` towards the top of the image.
 
     Args:
         eye: Position of the camera [scene units], shape (3,).
@@ -155,7 +155,7 @@ def look_at_camera(
     right = _cross(forward, up_axis)
     across = math.hypot(*right)
     if across < 1e-6:
-        raise ValueError(f"Expected `up` not to lie along the line of sight, but got {list(up_axis)}.")
+        raise ValueError(f"Expected `up` not to be along the line of sight, but got {list(up_axis)}.")
     right = [item / across for item in right]
     axes = (right, _cross(forward, right), forward)
     rows = [[*axis, 0.0 - _dot(axis, eye_point)] for axis in axes]  # never -0.0
@@ -184,17 +184,17 @@ def orbit_camera(
 ) -> Camera:
     """Camera on a sphere around ``center`` that looks at ``center``.
 
-    Azimuth turns counter-clockwise about ``up``. For ``up = (0, 0, 1)`` the eye is on the +x side at azimuth 0, the
-    +y side at 90 and the -y side at -90. For any other ``up`` these directions are carried along by the minimal
-    rotation that takes +z to ``up`` (:func:`rotation_from_z`): for ``up = (0, -1, 0)`` the eye is on the +x side at
-    azimuth 0, the +z side at 90 and the -z side at -90.
+    Azimuth turns counter-clockwise about ``up``. For ``up = (0, 0, 1)`` the eye is on the +x side at azimuth 0, the +y
+    side at 90 and the -y side at -90. For any other ``up`` these directions are rotated by the minimal rotation that
+    takes +z to ``up`` (:func:`rotation_from_z`): for ``up = (0, -1, 0)`` the eye is on the +x side at azimuth 0, the +z
+    side at 90 and the -z side at -90.
 
     Args:
         center: Centre of the sphere [scene units], shape (3,).
         up: Direction seen upwards in the image, any length, shape (3,).
         radius: Distance of the eye from ``center`` [scene units].
         azimuth_degrees: Angle about ``up`` [degrees].
-        elevation_degrees: Angle above the plane across ``up`` [degrees], between -90 and 90 (both excluded).
+        elevation_degrees: Angle above the plane perpendicular to ``up`` [degrees], between -90 and 90 (both excluded).
         fov_y_degrees: Vertical field of view [degrees].
         width: Image width [pixels].
         height: Image height [pixels].
@@ -223,7 +223,7 @@ def orbit_camera(
 def resized_intrinsics(
     w: float, h: float, fx: float, fy: float, cx: float, cy: float, width: int | None, height: int | None
 ) -> tuple[Tensor, int, int]:
-    """Intrinsics of the same view in another number of pixels.
+    """Intrinsics of the same view with another image size.
 
     Args:
         w: Width that the intrinsics belong to [pixels].
@@ -232,8 +232,8 @@ def resized_intrinsics(
         fy: Focal length along the columns [pixels].
         cx: Column of the principal point [pixels].
         cy: Row of the principal point [pixels].
-        width: Wanted width [pixels]; by default the present one, or the one that keeps the aspect ratio.
-        height: Wanted height [pixels], likewise.
+        width: New width [pixels]; by default unchanged, or the one that keeps the aspect ratio.
+        height: New height [pixels], with the same default.
 
     Returns:
         Matrix in float64, shape (3, 3), width and height.

@@ -1,4 +1,4 @@
-"""Camera paths, which a configuration can name: the camera of each frame of a run."""
+"""Camera paths that a configuration can name. They give the camera of each frame of a run."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class CameraPath(ABC):
     """Base class of the camera paths that a configuration can name.
 
     Attributes:
-        captured: Whether the cameras stood where photographs were taken, be it within the object's box.
+        captured: Whether the cameras are those of photographs. Such cameras may be inside the object's box.
     """
 
     captured: bool = False
@@ -45,9 +45,9 @@ class CameraPath(ABC):
 
 
 class OrbitCamera(CameraPath):
-    """Camera that looks at the object from a sphere around it, and may travel about the up direction.
+    """Camera on a sphere around the object that looks at it and may move around the up direction.
 
-    See :func:`orbit_camera` for what azimuth and elevation mean.
+    See :func:`orbit_camera` for the definition of azimuth and elevation.
 
     Args:
         width: Image width [pixels].
@@ -57,7 +57,7 @@ class OrbitCamera(CameraPath):
         elevation: Angle above the horizontal plane [degrees], between -90 and 90 (both excluded).
         radius: Distance from the target, in multiples of the object's longest side.
         degrees_per_second: Speed of the azimuth [degrees/s].
-        target_offset: From the object's centre to the point looked at, along the scene's axes, in multiples of the
+        target_offset: Vector from the object's centre to the target, along the scene's axes, in multiples of the
             object's longest side.
         near: Near plane [scene units].
 
@@ -108,7 +108,7 @@ class OrbitCamera(CameraPath):
 
 
 class LookAtCamera(CameraPath):
-    """Camera that stands still at a given point.
+    """Fixed camera at a given point.
 
     Args:
         eye: Position [scene units], 3 numbers.

@@ -1,4 +1,4 @@
-"""Cameras that travel along a path given by a few keys."""
+"""Cameras that move along a path given by a few keys."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ INTERPOLATIONS = ("smooth", "linear")
 def interpolate_keys(
     times: Sequence[float], values: Sequence[Sequence[float]], time: float, interpolation: str = "smooth"
 ) -> list[float]:
-    """Values between keys; before the first and after the last they hold.
+    """Values between keys; constant before the first and after the last.
 
     ``smooth`` is the monotone cubic of Fritsch & Butland 1984 ("A method for constructing local monotone piecewise
-    cubic interpolants") with slope zero at both ends: each number and its rate are continuous for all time, and between
+    cubic interpolants") with slope zero at both ends. Each number and its rate are continuous at all times, and between
     two keys no number leaves the range of the two.
 
     Args:
@@ -65,7 +65,7 @@ def interpolate_keys(
 
 
 def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
-    """Slope of the smooth interpolant at a key: a weighted harmonic mean of the slopes beside it, zero at a turn."""
+    """Slope of the smooth interpolant at a key: weighted harmonic mean of the slopes on both sides, zero at an extremum."""
     if not 0 < k < len(times) - 1:
         return 0.0
     left, right = times[k] - times[k - 1], times[k + 1] - times[k]
@@ -78,12 +78,12 @@ def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
 
 @dataclass
 class CameraKey:
-    """Where a camera is at one time; what is null stays as in the key before.
+    """A camera at one time; null values stay as in the key before.
 
     Args:
         time: Time [s].
         eye: Position [scene units], 3 numbers; or give ``azimuth``, ``elevation`` and ``radius``.
-        azimuth: Angle about the up direction [degrees], as of OrbitCamera; more than 360 goes round.
+        azimuth: Angle about the up direction [degrees], as for OrbitCamera; may exceed 360 for full turns.
         elevation: Angle above the horizontal plane [degrees], between -90 and 90 (both excluded).
         radius: Distance from the target, in multiples of the object's longest side.
         target: Point at the image centre [scene units], 3 numbers; null in the first key for the object's centre.
@@ -100,12 +100,12 @@ class CameraKey:
 
 
 class KeyframedCamera(CameraPath):
-    """Camera that travels through keys: from eye to eye, or on a sphere about its target.
+    """Camera that moves through keys: from eye to eye, or on a sphere about its target.
 
     Args:
-        keys: Times and places, in order of time.
-        interpolation: ``smooth`` (no jerk at a key, at rest before the first and after the last, never beyond the keys)
-            or ``linear``.
+        keys: Times and positions, sorted by time.
+        interpolation: ``smooth`` (continuous speed, at rest before the first key and after the last, no overshoot) or
+            ``linear``.
         up: Direction seen upwards in the image where the keys give an ``eye``, 3 numbers; that of the scene when None.
         width: Image width [pixels].
         height: Image height [pixels].
@@ -114,7 +114,7 @@ class KeyframedCamera(CameraPath):
 
     Raises:
         TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range, the times do not increase, or a key says neither or both of eye and
+        ValueError: If a number is out of range, the times do not increase, or the keys give neither or both of eye and
             angles.
 
     Example:
@@ -137,7 +137,7 @@ class KeyframedCamera(CameraPath):
     ) -> None:
         check_choice("interpolation", interpolation, INTERPOLATIONS)
         if not keys:
-            raise ValueError("Expected `keys` to hold at least one key with a time and a place.")
+            raise ValueError("Expected `keys` to hold at least one key with a time and a position.")
         self.times = [check_vector("keys.time", [key.time], 1)[0] for key in keys]
         if any(a >= b for a, b in pairwise(self.times)):
             raise ValueError(f"Expected the times of `keys` to increase, but got {self.times}.")
@@ -200,5 +200,5 @@ def _filled(values: list[Any], first: Any) -> list[Any]:
 
 def _carried_on(name: str, values: list[Any]) -> list[Any]:
     if values[0] is None:
-        raise ValueError(f"The first of the `keys` lacks `{name}`: later keys may leave it out, the first may not.")
+        raise ValueError(f"The first of the `keys` has no `{name}`: only later keys may leave it out.")
     return _filled(values, None)

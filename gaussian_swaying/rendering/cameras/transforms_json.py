@@ -22,16 +22,16 @@ def camera_from_transforms(
 
     ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). The intrinsics come from
     ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
-    the frame wins over the one at the top of the file. Missing ``cx`` and ``cy`` are the image centre, missing
-    ``fl_y`` makes square pixels (or comes from ``camera_angle_y``). Lens distortion (``k1``, ``p1``, ...) is ignored:
-    undistort the images first.
+    the frame takes precedence over one at the top of the file. If ``cx`` and ``cy`` are missing, the image centre is
+    used. If ``fl_y`` is missing, it comes from ``camera_angle_y``, or pixels are square. Lens distortion (``k1``,
+    ``p1``, ...) is ignored: undistort the images first.
 
     Args:
         path: The file.
         frame: Index in its list ``frames``, from 0.
         width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
             the one that keeps the file's aspect ratio when only ``height`` is given.
-        height: Height of the image to render [pixels], likewise.
+        height: Height of the image to render [pixels], with the same defaults.
         near: Near plane [scene units].
 
     Returns:
@@ -39,8 +39,8 @@ def camera_from_transforms(
 
     Raises:
         TypeError: If ``frame``, ``width`` or ``height`` is not an integer.
-        ValueError: If the file is missing, is not JSON, lacks a field or has a bad one. The message names the file,
-            the field and the remedy.
+        ValueError: If the file is missing or not JSON, or if a field is missing or bad. The message names the file, the
+            field and the remedy.
     """
     if isinstance(frame, bool) or not isinstance(frame, int):
         raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
