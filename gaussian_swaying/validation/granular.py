@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.mpm.boundary import Boundary, Nodes, Plane
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters

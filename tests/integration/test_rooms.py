@@ -101,7 +101,6 @@ def test_no_file_is_long():
         "mpm.solver",
         "mpm.fused",
         "mpm.transfer_triton",
-        "mpm.boundary",
         "simulation.pipeline",
     }  # being split
     one_concept |= {"simulation.physgaussian.convert", "training.module", "validation.granular"}

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.runs.seal import check_seal, seal
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
