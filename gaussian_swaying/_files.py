@@ -45,14 +45,14 @@ def kind_of(path: Path) -> str | None:
         return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "special file")
     except (FileNotFoundError, NotADirectoryError):
         return "link to nothing" if os.path.islink(path) else None
-    except OSError:
-        if not os.path.islink(path):
+    except OSError as error:
+        if isinstance(error, PermissionError) or not os.path.islink(path):
             raise
         return "link to itself"
 
 
-def check_regular(path: Path) -> None:
-    """Raise ValueError if there is something under the path that is no regular file."""
+def check_not_taken(path: Path) -> None:
+    """Raise ValueError if something that is no regular file has the name of one that a run writes or reads."""
     kind = kind_of(path)
     if kind not in (None, "file"):
         raise ValueError(f"Expected {path} to be a file, but it is a {kind}: move it away.")

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from gaussian_swaying._files import check_regular, kind_of, write_json
+from gaussian_swaying._files import check_not_taken, kind_of, write_json
 from gaussian_swaying.runs.lock import FolderLock
 
 MARKER = "run.json"
@@ -141,6 +141,6 @@ def check_names(folder: Path, files: Iterable[str], folders: Iterable[str]) -> N
             raise ValueError(f"Expected {folder / name} to be a folder, but it is a {kind}: move it away.")
         for path in (folder / name).iterdir() if kind else ():
             if _FRAME.fullmatch(path.name):
-                check_regular(path)
+                check_not_taken(path)
     for name in files:
-        check_regular(folder / name)
+        check_not_taken(folder / name)

@@ -7,7 +7,7 @@ import os
 import re
 from pathlib import Path
 
-from gaussian_swaying._files import check_regular
+from gaussian_swaying._files import check_not_taken
 
 _TRAILER = re.compile(rb"\ngaussian_swaying sha256 ([0-9a-f]{64})\n")
 _LENGTH = len(b"\ngaussian_swaying sha256 \n") + 64
@@ -39,7 +39,7 @@ def check_seal(path: Path) -> None:
         FileNotFoundError: If there is no such file.
         ValueError: If it is no regular file, has no checksum, or its content is not the one that was sealed.
     """
-    check_regular(path)
+    check_not_taken(path)
     size = max(os.path.getsize(path) - _LENGTH, 0)
     with path.open("rb") as file:
         file.seek(size)
