@@ -39,7 +39,7 @@ def area_vector(F, n):
 
 @triton.jit
 def deform_patch(F, n, area, max_ratio):
-    """Unit normal and area after a deformation, as ``patches.deform_patch``; the area grows to ``max_ratio`` at most."""
+    """Unit normal and area after a deformation, as ``patches.deform_patch``; no area grows beyond ``max_ratio``."""
     vector, det = area_vector(F, n)
     size = tl.sqrt(dot3(vector, vector))
     flat = size == 0
