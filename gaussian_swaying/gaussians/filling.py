@@ -268,11 +268,6 @@ class Filling:
     gaussian_volume: Tensor
     on_surface: Tensor
 
-    @property
-    def total_volume(self) -> float:
-        """Volume of the solid [m³]."""
-        return float(self.volume.sum() + self.gaussian_volume.sum())
-
 
 def share_volume(owner: Tensor, filled: Tensor, element: float) -> tuple[Tensor, Tensor]:
     """Share the volume of each element equally among the points in it.

@@ -199,7 +199,6 @@ def test_an_elastic_run_computes_no_svd_and_no_return_map(law, formulation, monk
     for home, name in (
         (linalg, "spectrum"),
         (law_module, "spectrum"),
-        (linalg, "symmetric_eigen"),
         (dispatch.LawDispatch, "return_map"),
         (torch.linalg, "svd"),
         (torch.linalg, "eigh"),
