@@ -400,14 +400,14 @@ class InteriorFilling:
         return Filling(position, volume, gaussian_volume, on_surface)
 
 
-def grid_around(means: Tensor, spacing: float, margin: int = 6) -> tuple[Tensor, tuple[int, int, int]]:
-    """Lower corner [m] (3,) and resolution of a grid around points (N, 3) with a margin of some cells.
+def grid_around(means: Tensor, spacing: float) -> tuple[Tensor, tuple[int, int, int]]:
+    """Lower corner [m] (3,) and resolution of a grid around points (N, 3) with six cells to spare on each side.
 
     Raises:
         ValueError: If it would have more than ``MAX_CELLS`` cells.
     """
     low, high = means.amin(0), means.amax(0)
-    size = ((high - low) / spacing).ceil() + 1 + 2 * margin
+    size = ((high - low) / spacing).ceil() + 1 + 2 * 6
     if float(size.prod()) > MAX_CELLS:
         raise ValueError(
             f"Expected `filling.spacing` to give at most {MAX_CELLS:,} cells, but {spacing:.3g} m gives "
