@@ -15,7 +15,7 @@ from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.captures.capture_camera import CaptureCamera
-from gaussian_swaying.mpm.boundaries.boundary import RegionInFrame
+from gaussian_swaying.geometry.regions import RegionInFrame
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera

@@ -9,33 +9,20 @@ in which they have more than a share of the mass.
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeVar
 
 from torch import Tensor, nn
 
 from gaussian_swaying._graphs import Recordable
-from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import RegionInFrame
 
 CLOCK = 1e-9  # round-off of a time that many substeps were added to [s]
-
-
-class FrameLike(Protocol):
-    """The part of ``SimFrame`` that boundaries need."""
-
-    def point_to_sim(self, points: Tensor) -> Tensor:
-        """Scene coordinates (..., 3) to metres, z up."""
-        ...
-
-    def point_to_scene(self, points: Tensor) -> Tensor:
-        """Metres, z up (..., 3) to scene coordinates."""
-        ...
-
-    def direction_to_sim(self, directions: Tensor) -> Tensor:
-        """Directions (..., 3) turned into the z-up frame."""
-        ...
+_Kind = TypeVar("_Kind", bound="Boundary")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,27 +55,6 @@ class Nodes:
         return self.share > self.threshold
 
 
-class RegionInFrame(Region):
-    """A region given in axes and units of its own, asked about points in others: metres with z up, or scene units."""
-
-    axes = " in the axes of the region"
-
-    def __init__(self, region: Region, frame: FrameLike) -> None:
-        self.region, self.frame = region, frame
-        self.recordable = region.recordable
-
-    def contains(self, points: Tensor) -> Tensor:
-        """Whether each point (..., 3) [m, z up] lies inside; bool, shape (...)."""
-        return self.region.contains(self.frame.point_to_scene(points))
-
-    def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
-        """Least and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
-        return self.region.bounds(self.frame.point_to_scene(points.reshape(-1, 3)))
-
-    def __repr__(self) -> str:
-        return repr(self.region)
-
-
 class Boundary(Recordable, nn.Module, ABC):
     """Base of all conditions.
 
@@ -114,9 +80,17 @@ class Boundary(Recordable, nn.Module, ABC):
         if not self.start < self.end:
             raise ValueError(f"Expected `end` to be later than `start` ({self.start} s), but got {self.end} s.")
 
-    def in_frame(self, frame: FrameLike) -> Boundary:
+    def in_frame(self, frame: SimFrame) -> Boundary:
         """The same condition with its geometry brought from scene units to metres, z up."""
         return self
+
+    def copy_in(self: _Kind, frame: SimFrame, **tensors: Tensor) -> _Kind:
+        """A copy whose ``region``, if it has one, is asked in metres, and that has other tensors of its own."""
+        moved = copy.copy(self)
+        moved._buffers = {**self._buffers, **tensors}
+        if "region" in vars(self):
+            vars(moved)["region"] = RegionInFrame(vars(self)["region"], frame)
+        return moved
 
     def particle_mask(self, rest_position: Tensor) -> Tensor | None:
         """Particles that the condition holds, from their rest positions (..., P, 3); None if it holds none."""

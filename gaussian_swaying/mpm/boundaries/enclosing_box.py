@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_vector
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, FrameLike, Nodes
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.boundaries.plane import Plane
 
 
@@ -48,7 +49,7 @@ class EnclosingBox(Boundary):
             planes.append(Plane(high, [-d for d in direction], kind, friction, start, end))
         self.planes = nn.ModuleList(planes)
 
-    def in_frame(self, frame: FrameLike) -> EnclosingBox:
+    def in_frame(self, frame: SimFrame) -> EnclosingBox:
         """The box in metres, z up."""
         moved = copy.copy(self)
         moved._modules = {"planes": nn.ModuleList([p.in_frame(frame) for p in self.planes])}  # type: ignore[operator]

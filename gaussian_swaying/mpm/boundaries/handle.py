@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 
@@ -10,8 +9,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import FrameLike, Nodes, RegionInFrame
+from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 
 
@@ -57,12 +57,9 @@ class Handle(PinnedRegion):
         self.axis: Tensor
         self.pivot: Tensor
 
-    def in_frame(self, frame: FrameLike) -> Handle:
+    def in_frame(self, frame: SimFrame) -> Handle:
         """The handle with its region and pivot in metres."""
-        moved = copy.copy(self)
-        moved.region = RegionInFrame(self.region, frame)
-        moved._buffers = dict(self._buffers) | {"pivot": frame.point_to_sim(self.pivot)}
-        return moved
+        return self.copy_in(frame, pivot=frame.point_to_sim(self.pivot))
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Take the held nodes along."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import FrameLike, Nodes, RegionInFrame
+from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.particle_boundary import ParticleBoundary
 
 
@@ -47,12 +46,6 @@ class Impulse(ParticleBoundary):
         # particles of each scene of the batch, once they are known
         self.register_buffer("count", torch.ones((), dtype=torch.float64), persistent=False)
         self.count: Tensor
-
-    def in_frame(self, frame: FrameLike) -> Impulse:
-        """The impulse with its region asked in metres."""
-        moved = copy.copy(self)
-        moved.region, moved._buffers = RegionInFrame(self.region, frame), dict(self._buffers)
-        return moved
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:
         """Particles inside the region at rest, which are counted too; ValueError if there are none."""

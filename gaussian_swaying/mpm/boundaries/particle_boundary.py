@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
 from torch import Tensor
 
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, FrameLike, RegionInFrame
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
 
 
 class ParticleBoundary(Boundary):
@@ -17,11 +16,9 @@ class ParticleBoundary(Boundary):
         super().__init__(start, end)
         self.region = region
 
-    def in_frame(self, frame: FrameLike) -> Boundary:
+    def in_frame(self, frame: SimFrame) -> Boundary:
         """The condition with its region asked in metres."""
-        moved = copy.copy(self)
-        moved.region = RegionInFrame(self.region, frame)
-        return moved
+        return self.copy_in(frame)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:
         """Particles inside the region at rest; ValueError if there are none."""

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, FrameLike, Nodes
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 
 
 def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float) -> Tensor:
@@ -73,11 +74,10 @@ class Plane(Boundary):
         self.point: Tensor
         self.normal: Tensor
 
-    def in_frame(self, frame: FrameLike) -> Plane:
+    def in_frame(self, frame: SimFrame) -> Plane:
         """The plane in metres, z up."""
-        moved = Plane([0, 0, 0], [0, 0, 1], self.kind, self.friction, self.start, self.end)
-        moved.point, moved.normal = frame.point_to_sim(self.point), frame.direction_to_sim(self.normal).clone()
-        return moved
+        normal = frame.direction_to_sim(self.normal).clone()
+        return self.copy_in(frame, point=frame.point_to_sim(self.point), normal=normal)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Stop the nodes at or behind the plane."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 
@@ -10,8 +9,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import FrameLike, Nodes, RegionInFrame
+from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 
 
@@ -60,14 +60,12 @@ class SequentialRelease(PinnedRegion):
         self.register_buffer("ends", ends)  # first and last, shape (2, 3)
         self.ends: Tensor | None
 
-    def in_frame(self, frame: FrameLike) -> SequentialRelease:
+    def in_frame(self, frame: SimFrame) -> SequentialRelease:
         """The release with its region, direction and points in metres, z up."""
-        moved = copy.copy(self)
-        moved.region = RegionInFrame(self.region, frame)
-        moved._buffers = dict(self._buffers) | {"direction": frame.direction_to_sim(self.direction).clone()}
+        tensors = {"direction": frame.direction_to_sim(self.direction).clone()}
         if self.ends is not None:
-            moved._buffers["ends"] = frame.point_to_sim(self.ends)
-        return moved
+            tensors["ends"] = frame.point_to_sim(self.ends)
+        return self.copy_in(frame, **tensors)
 
     def release_time(self, rest_position: Tensor) -> Tensor:
         """When the front passes each particle [s], shape (..., P), float64."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import Boundary, FrameLike, Nodes, RegionInFrame
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 
 
 class VelocityBox(Boundary):
@@ -39,11 +39,9 @@ class VelocityBox(Boundary):
         self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
         self.velocity: Tensor
 
-    def in_frame(self, frame: FrameLike) -> VelocityBox:
+    def in_frame(self, frame: SimFrame) -> VelocityBox:
         """The box with its region asked in metres."""
-        moved = copy.copy(self)
-        moved.region = RegionInFrame(self.region, frame)
-        return moved
+        return self.copy_in(frame)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Drive the nodes inside."""
