@@ -57,9 +57,7 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
                 raise
             lock.release()
     except OSError as error:
-        raise ValueError(
-            f"The output folder {folder} cannot be written ({error.strerror or error}): {remedy}."
-        ) from error
+        raise _not_writable(folder, error, remedy) from error
     raise ValueError(f"The output folder {folder} is being moved by other runs: {remedy}.")
 
 
@@ -73,9 +71,11 @@ def hold_folder(folder: Path, remedy: str) -> FolderLock:
     try:
         return FolderLock(_resolve(folder))
     except OSError as error:
-        raise ValueError(
-            f"The output folder {folder} cannot be written ({error.strerror or error}): {remedy}."
-        ) from error
+        raise _not_writable(folder, error, remedy) from error
+
+
+def _not_writable(folder: Path, error: OSError, remedy: str) -> ValueError:
+    return ValueError(f"The output folder {folder} cannot be written ({error.strerror or error}): {remedy}.")
 
 
 def _resolve(folder: Path) -> Path:

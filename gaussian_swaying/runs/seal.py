@@ -6,8 +6,11 @@ import hashlib
 import os
 import re
 from pathlib import Path
+from typing import Any
 
-from gaussian_swaying._files import check_not_taken
+import torch
+
+from gaussian_swaying._files import atomic, check_not_taken
 
 _TRAILER = re.compile(rb"\ngaussian_swaying sha256 ([0-9a-f]{64})\n")
 _LENGTH = len(b"\ngaussian_swaying sha256 \n") + 64
@@ -30,6 +33,13 @@ def seal(path: Path) -> None:
     digest = sha256(path)
     with path.open("ab") as file:
         file.write(b"\ngaussian_swaying sha256 " + digest.encode() + b"\n")
+
+
+def save_sealed(path: Path, value: Any) -> None:
+    """Write what ``torch.load`` reads, with its checksum, whole or not at all."""
+    with atomic(path) as temporary:
+        torch.save(value, temporary)
+        seal(temporary)
 
 
 def check_seal(path: Path) -> None:

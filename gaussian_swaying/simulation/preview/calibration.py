@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.pipeline import SimulationPipeline
+from gaussian_swaying.simulation.preview.shape import quantile
 
 SWAY = 0.10  # largest displacement that is wanted, as a share of the longest side
 SOFTEST, STIFFEST = 3e4, 1e6  # Pa; ten times the stiffness takes three times the substeps
@@ -241,9 +241,9 @@ def measure_motion(
             F = state.F_total.double()
             stretch = symmetric_eigenvalues(matmul3(F.mT, F)).clamp(min=0).sqrt()
             motion = Motion(
-                max(motion.share, _quantile(moved, MOVED) / side),
-                min(motion.stretch_min, _quantile(stretch.amin(-1), STRETCHED)),
-                max(motion.stretch_max, _quantile(stretch.amax(-1), 1 - STRETCHED)),
+                max(motion.share, quantile(moved, MOVED) / side),
+                min(motion.stretch_min, quantile(stretch.amin(-1), STRETCHED)),
+                max(motion.stretch_max, quantile(stretch.amax(-1), 1 - STRETCHED)),
             )
             if motion.share > limit:
                 return replace(motion, complete=False)
@@ -253,7 +253,3 @@ def measure_motion(
         torch.set_num_threads(threads)
         scene.points, wind.flows = points, flows
     return motion
-
-
-def _quantile(values: Tensor, share: float) -> float:
-    return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
