@@ -30,16 +30,14 @@ if TYPE_CHECKING:
     from gaussian_swaying.geometry.regions import Box, Cylinder, Sphere
     from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance, frechet_distance
-    from gaussian_swaying.mpm.boundary import (
-        Boundary,
-        EnclosingBox,
-        Handle,
-        Impulse,
-        PinnedRegion,
-        Plane,
-        SequentialRelease,
-        VelocityBox,
-    )
+    from gaussian_swaying.mpm.boundaries.boundary import Boundary
+    from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+    from gaussian_swaying.mpm.boundaries.handle import Handle
+    from gaussian_swaying.mpm.boundaries.impulse import Impulse
+    from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+    from gaussian_swaying.mpm.boundaries.plane import Plane
+    from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+    from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
     from gaussian_swaying.mpm.forces import Force
     from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
     from gaussian_swaying.mpm.laws.fluid import Fluid
@@ -123,16 +121,14 @@ _HOMES = {
         "FrechetVideoDistance",
         "frechet_distance",
     ),
-    "mpm.boundary": (
-        "Boundary",
-        "EnclosingBox",
-        "Handle",
-        "Impulse",
-        "PinnedRegion",
-        "Plane",
-        "SequentialRelease",
-        "VelocityBox",
-    ),
+    "mpm.boundaries.boundary": ("Boundary",),
+    "mpm.boundaries.enclosing_box": ("EnclosingBox",),
+    "mpm.boundaries.handle": ("Handle",),
+    "mpm.boundaries.impulse": ("Impulse",),
+    "mpm.boundaries.pinned_region": ("PinnedRegion",),
+    "mpm.boundaries.plane": ("Plane",),
+    "mpm.boundaries.sequential_release": ("SequentialRelease",),
+    "mpm.boundaries.velocity_box": ("VelocityBox",),
     "mpm.forces": ("Force",),
     "mpm.laws.fixed_corotated": ("FixedCorotated",),
     "mpm.laws.fluid": ("Fluid",),

@@ -13,13 +13,14 @@ from torch import Tensor
 VALUE_CHECKS = os.environ.get("GAUSSIAN_SWAYING_CHECKS", "0") == "1"
 
 
-def check_shape(name: str, tensor: Tensor, *shape: int | str | None) -> None:
-    """Check the trailing dimensions of a tensor; any leading batch dimensions are accepted.
+def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bool = True) -> None:
+    """Check the trailing dimensions of a tensor.
 
     Args:
         name: Name of the argument, for the message.
         tensor: Tensor to check.
         shape: Expected trailing sizes; a letter or None stands for any size.
+        batches: Whether any batch dimensions may lead.
 
     Raises:
         TypeError: If ``tensor`` is not a tensor.
@@ -29,7 +30,8 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None) -> None:
     if not isinstance(tensor, Tensor):
         raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
     actual = tuple(tensor.shape)
-    trailing = actual[len(actual) - len(shape) :] if len(actual) >= len(shape) else None
+    fits = len(actual) >= len(shape) if batches else len(actual) == len(shape)
+    trailing = actual[len(actual) - len(shape) :] if fits else None
     if trailing is None or any(isinstance(e, int) and e != a for e, a in zip(shape, trailing, strict=True)):
         expected = ", ".join("*" if s is None else str(s) for s in shape)
         comma = "," if len(shape) == 1 else ""
@@ -60,6 +62,15 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
     wanted = "not be negative" if allow_zero else "be positive"
     if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")
+
+
+def check_poisson_ratio(name: str, value: float) -> None:
+    """Raise ValueError unless ``value`` is a Poisson's ratio of an elastic solid that can be compressed."""
+    if not -1 < value < 0.5:
+        raise ValueError(
+            f"Expected `{name}` (Poisson's ratio) to lie between -1 and 0.5, both excluded, but got {value}: use 0.49 "
+            "for something like rubber."
+        )
 
 
 def check_finite(name: str, tensor: Tensor) -> None:

@@ -45,14 +45,14 @@ def kind_of(path: Path) -> str | None:
         return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "special file")
     except (FileNotFoundError, NotADirectoryError):
         return "link to nothing" if os.path.islink(path) else None
-    except OSError:
-        if not os.path.islink(path):
+    except OSError as error:
+        if isinstance(error, PermissionError) or not os.path.islink(path):
             raise
         return "link to itself"
 
 
-def check_regular(path: Path) -> None:
-    """Raise ValueError if there is something under the path that is no regular file."""
+def check_not_taken(path: Path) -> None:
+    """Raise ValueError if something that is no regular file has the name of one that a run writes or reads."""
     kind = kind_of(path)
     if kind not in (None, "file"):
         raise ValueError(f"Expected {path} to be a file, but it is a {kind}: move it away.")
@@ -69,10 +69,15 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write text in UTF-8, whole or not at all."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write JSON, whole or not at all; numbers that are NaN or infinite, which JSON does not have, become null."""
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
 
 
 def _without_nan(value: Any) -> Any:

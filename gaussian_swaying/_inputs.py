@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import stat
 import zipfile
 from pathlib import Path
 from typing import Any
+
+from gaussian_swaying._files import kind_of
 
 LARGEST_JSON = 1 << 28  # bytes; a capture of 10,000 images takes 10 MB
 LONGEST_NUMBER = 32  # digits of a whole number
@@ -27,19 +28,18 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
     """
     path = Path(path)
     try:
-        found = path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(f"{path} does not exist; check the path of {what}.") from None
+        kind = kind_of(path)
     except ValueError as error:  # a zero byte
         raise ValueError(f"{str(path)!r} is no path ({error}); check the path of {what}.") from None
-    if stat.S_ISDIR(found.st_mode):
+    if kind in (None, "link to nothing"):
+        raise FileNotFoundError(f"{path} does not exist; check the path of {what}.")
+    if kind == "folder":
         raise ValueError(f"{path} is a directory; give {what} inside it.")
-    if not stat.S_ISREG(found.st_mode):
-        raise ValueError(f"{path} is no regular file but a device or a pipe; save {what} first and give that.")
-    if largest is not None and found.st_size > largest:
-        raise ValueError(
-            f"{path} has {found.st_size:,} bytes, more than the {largest:,} that {what} may have; check the path."
-        )
+    if kind != "file":
+        raise ValueError(f"{path} is no regular file but a {kind}; save {what} first and give that.")
+    size = path.stat().st_size
+    if largest is not None and size > largest:
+        raise ValueError(f"{path} has {size:,} bytes, more than the {largest:,} that {what} may have; check the path.")
     return path
 
 

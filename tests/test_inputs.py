@@ -30,6 +30,17 @@ def test_a_pipe_and_a_device_are_no_files(tmp_path):
         check_regular(tmp_path / "file", largest=4)
 
 
+def test_links_are_followed(tmp_path):
+    (tmp_path / "file").write_bytes(b"12345")
+    for name, target in (("good", "file"), ("nowhere", "none"), ("round", "round")):
+        (tmp_path / name).symlink_to(tmp_path / target)
+    assert check_regular(tmp_path / "good", largest=5) == tmp_path / "good"
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
+        check_regular(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="no regular file but a link to itself"):
+        check_regular(tmp_path / "round")
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

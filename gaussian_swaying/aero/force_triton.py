@@ -3,22 +3,8 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import cofactor, cross3, dot3
-
-
-@triton.jit
-def deform_patch(F, n, area, max_ratio):
-    """Unit normal and area after a deformation, as ``gaussians.surface.deform_patch`` and ``capped_area``."""
-    cof = cofactor(F)
-    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
-    x = cof[0] * n[0] + cof[1] * n[1] + cof[2] * n[2]
-    y = cof[3] * n[0] + cof[4] * n[1] + cof[5] * n[2]
-    z = cof[6] * n[0] + cof[7] * n[1] + cof[8] * n[2]
-    size = tl.sqrt(x * x + y * y + z * z)
-    flat = size == 0
-    scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
-    normal = (tl.where(flat, n[0], x * scale), tl.where(flat, n[1], y * scale), tl.where(flat, n[2], z * scale))
-    return normal, tl.minimum(size, max_ratio) * area
+from gaussian_swaying.geometry.linalg_triton import cross3, dot3
+from gaussian_swaying.geometry.patches_triton import deform_patch
 
 
 @triton.jit

@@ -15,6 +15,9 @@ from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, rea
 
 _ATTEMPTS = 100
 
+_CANDIDATES = 8  # for each of the points at which the photos agree
+_WIDTH = 160  # to which the photos are reduced for them [pixels]
+
 
 def initial_points(
     capture: Capture,
@@ -105,9 +108,7 @@ def _clear(capture: Capture, center: Tensor, points: Tensor) -> Tensor:
     return torch.cat([(torch.cdist(part, eyes) >= limit).all(-1) for part in points.split(1 << 16)])
 
 
-def consistent_points(
-    capture: Capture, count: int, seed: int = 0, half_side: float | None = None, candidates: int = 8, width: int = 160
-) -> PointCloud:
+def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: float | None = None) -> PointCloud:
     """Points at which the photos agree on a colour: of random candidates, those whose colour varies least.
 
     In the spirit of space carving by photo-consistency (Kutulakos & Seitz 2000), without its test of occlusion. Half
@@ -119,8 +120,6 @@ def consistent_points(
         count: Number of points.
         seed: Of the random numbers.
         half_side: Half the side of the cube [scene units]; that of :func:`initial_points` by default.
-        candidates: Number of candidates for each point.
-        width: Width to which the photos are reduced [pixels].
 
     Returns:
         The points, with the mean of the colours that the photos show there.
@@ -130,8 +129,8 @@ def consistent_points(
     """
     center, reach = _view_cube(capture) if half_side is None else (_focus(capture), half_side)
     generator = torch.Generator().manual_seed(seed)
-    inner = candidates * (count - count // 2)
-    outer = candidates * (count // 2)
+    inner = _CANDIDATES * (count - count // 2)
+    outer = _CANDIDATES * (count // 2)
     near = 2 * torch.rand(inner, 3, generator=generator) - 1
     ray = torch.nn.functional.normalize(torch.randn(outer, 3, generator=generator), dim=-1)
     far = ray * 10.0 ** torch.rand(outer, 1, generator=generator)
@@ -140,15 +139,15 @@ def consistent_points(
     seen, total, squares = torch.zeros(len(points)), torch.zeros(len(points), 3), torch.zeros(len(points))
     for view in capture.split("train"):
         pixels = view.load()[..., :3].permute(2, 0, 1)[None].float() / 255
-        height = max(round(width * pixels.shape[2] / pixels.shape[3]), 1)
-        photo = torch.nn.functional.interpolate(pixels, (height, width), mode="area")[0]
+        height = max(round(_WIDTH * pixels.shape[2] / pixels.shape[3]), 1)
+        photo = torch.nn.functional.interpolate(pixels, (height, _WIDTH), mode="area")[0]
         camera = view.camera
         local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         depth = local[:, 2]
         scale = local[:, :2] / depth.clamp_min(1e-6)[:, None]
-        column = ((scale[:, 0] * camera.intrinsics[0, 0] + camera.intrinsics[0, 2]) * (width / camera.width)).floor()
+        column = ((scale[:, 0] * camera.intrinsics[0, 0] + camera.intrinsics[0, 2]) * (_WIDTH / camera.width)).floor()
         row = ((scale[:, 1] * camera.intrinsics[1, 1] + camera.intrinsics[1, 2]) * (height / camera.height)).floor()
-        inside = (depth > camera.near) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside = (depth > camera.near) & (column >= 0) & (column < _WIDTH) & (row >= 0) & (row < height)
         found = photo[:, row[inside].long(), column[inside].long()].T
         seen[inside] += 1
         total[inside] += found

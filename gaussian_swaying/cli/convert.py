@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying._files import atomic
+from gaussian_swaying._files import write_text
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
 from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
@@ -36,8 +36,7 @@ def write(options: argparse.Namespace) -> None:
     if options.output is None:
         print(text, end="")
     else:
-        with atomic(options.output) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_text(options.output, text)
         print(f"wrote {options.output}")
     for note in notes:
         print(f"note: {note}", file=sys.stderr)

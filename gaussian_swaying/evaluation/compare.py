@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying._files import atomic, write_json
+from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying._inputs import check_archive, read_json
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.captures.images import image_size, read_image
@@ -304,8 +304,7 @@ def evaluate(
         if not (video and result["size"]):
             made.unlink(missing_ok=True)  # that of an earlier comparison
         write_json(folder / "eval.json", result)
-        with atomic(folder / "eval.md") as temporary:
-            temporary.write_text(table(result), encoding="utf-8")
+        write_text(folder / "eval.md", table(result))
     except BaseException:
         with suppress(OSError):  # those that hold something stay
             for path in missing:

@@ -20,27 +20,23 @@ def comparison_picture(
     reference: Tensor,
     image: Tensor,
     labels: Sequence[str] = ("reference", "run"),
-    error_scale: float = ERROR_SCALE,
-    panel_width: int = PANEL_WIDTH,
 ) -> np.ndarray:
     """Reference, run and absolute error side by side, labelled.
 
-    The error is the mean over the colours, from dark blue (0) to yellow (``error_scale`` and more).
+    The error is the mean over the colours, from dark blue (0) to yellow (``ERROR_SCALE`` and more).
 
     Args:
         reference: Picture from 0 to 1, shape (H, W, 3).
         image: Picture of the run, of the same shape.
         labels: What is written above the two.
-        error_scale: Error at the bright end.
-        panel_width: Wider pictures are averaged down by the smallest whole number that makes them fit [pixels].
 
     Returns:
         Picture, uint8, shape (h + band, 3 w + gaps, 3).
     """
     from PIL import Image, ImageDraw, ImageFont
 
-    factor = math.ceil(reference.shape[1] / panel_width)
-    error = colormap((image - reference).abs().mean(-1) / error_scale)
+    factor = math.ceil(reference.shape[1] / PANEL_WIDTH)
+    error = colormap((image - reference).abs().mean(-1) / ERROR_SCALE)
     panels = [average_down(p.permute(2, 0, 1).float(), factor).permute(1, 2, 0) for p in (reference, image, error)]
     height, width = panels[0].shape[:2]
     band, gap = max(16, height // 14), 2
@@ -55,8 +51,8 @@ def comparison_picture(
     for number, label in enumerate((*labels, "absolute error")):
         draw.text((number * (width + gap) + pad, middle), label, (235, 235, 235), font, anchor="lm")
     end = whole.shape[1] - pad
-    end -= int(draw.textlength(f"{error_scale:g}", font))
-    draw.text((end, middle), f"{error_scale:g}", (235, 235, 235), font, anchor="lm")
+    end -= int(draw.textlength(f"{ERROR_SCALE:g}", font))
+    draw.text((end, middle), f"{ERROR_SCALE:g}", (235, 235, 235), font, anchor="lm")
     bar = end - pad // 2 - ramp.shape[1]
     picture.paste(Image.fromarray(bytes_of[3]), (bar, (band - len(ramp)) // 2))
     draw.text((bar - pad // 2, middle), "0", (235, 235, 235), font, anchor="rm")

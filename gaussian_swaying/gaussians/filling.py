@@ -268,11 +268,6 @@ class Filling:
     gaussian_volume: Tensor
     on_surface: Tensor
 
-    @property
-    def total_volume(self) -> float:
-        """Volume of the solid [m³]."""
-        return float(self.volume.sum() + self.gaussian_volume.sum())
-
 
 def share_volume(owner: Tensor, filled: Tensor, element: float) -> tuple[Tensor, Tensor]:
     """Share the volume of each element equally among the points in it.
@@ -407,14 +402,14 @@ class InteriorFilling:
         return Filling(position, volume, gaussian_volume, on_surface)
 
 
-def grid_around(means: Tensor, spacing: float, margin: int = 6) -> tuple[Tensor, tuple[int, int, int]]:
-    """Lower corner [m] (3,) and resolution of a grid around points (N, 3), with a margin in cells.
+def grid_around(means: Tensor, spacing: float) -> tuple[Tensor, tuple[int, int, int]]:
+    """Lower corner [m] (3,) and resolution of a grid around points (N, 3) with six cells to spare on each side.
 
     Raises:
         ValueError: If it would have more than ``MAX_CELLS`` cells.
     """
     low, high = means.amin(0), means.amax(0)
-    size = ((high - low) / spacing).ceil() + 1 + 2 * margin
+    size = ((high - low) / spacing).ceil() + 1 + 2 * 6
     if float(size.prod()) > MAX_CELLS:
         raise ValueError(
             f"Expected `filling.spacing` to give at most {MAX_CELLS:,} cells, but {spacing:.3g} m gives "

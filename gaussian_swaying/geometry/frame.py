@@ -139,11 +139,6 @@ class SimFrame:
         rotation = self._on(covariance.device, covariance.dtype)[1]
         return rotation @ covariance @ rotation.T * self.metres_per_unit**2
 
-    def covariance_to_scene(self, covariance: Tensor) -> Tensor:
-        """Covariances (..., 3, 3) in m², z up, to scene units and axes."""
-        rotation = self._on(covariance.device, covariance.dtype)[1]
-        return rotation.T @ covariance @ rotation / self.metres_per_unit**2
-
     def gradient_to_scene(self, F: Tensor) -> Tensor:
         """Deformation gradients (..., 3, 3) from the z-up frame to scene axes: Rᵀ F R, exactly I where F is."""
         if not self.turns:

@@ -198,28 +198,6 @@ def _matrix(columns: list[Tensor], shape: torch.Size) -> Tensor:
     return torch.stack(columns, dim=-1).transpose(0, 1).reshape(shape)
 
 
-def symmetric_eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues and eigenvectors of symmetric 3x3 matrices, by cyclic Jacobi rotations (Golub & Van Loan, 8.5).
-
-    A fixed number of sweeps and elementwise operations only, so that a GPU never waits. The eigenvectors are constant
-    in the gradient.
-
-    Args:
-        matrix: Symmetric, shape (..., 3, 3); only the upper triangle is read for the eigenvectors.
-
-    Returns:
-        Eigenvalues (..., 3), largest first, and eigenvectors (..., 3, 3) as columns, with determinant +1.
-    """
-    with torch.no_grad():
-        upper = matrix.detach().reshape(-1, 9).T.contiguous()
-        values, columns = _jacobi({(i, j): upper[3 * i + j] for i in range(3) for j in range(i, 3)})
-        _sort(values, columns)
-        axes = _matrix(columns, matrix.shape)
-    if torch.is_grad_enabled() and matrix.requires_grad:
-        return (axes * matmul3(matrix, axes)).sum(-2), axes
-    return torch.stack(values, dim=-1).reshape(matrix.shape[:-1]), axes
-
-
 class Spectrum(NamedTuple):
     r"""Principal stretches and axes of F = U diag(a) V^T, from :func:`spectrum`.
 

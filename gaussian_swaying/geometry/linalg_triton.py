@@ -12,6 +12,46 @@ TINY = tl.constexpr(1e-30)
 
 
 @triton.jit
+def load3(pointer, stride, index, mask):
+    """Three values, ``stride`` apart, from ``index`` on."""
+    return (
+        tl.load(pointer + index, mask, 0.0),
+        tl.load(pointer + stride + index, mask, 0.0),
+        tl.load(pointer + 2 * stride + index, mask, 0.0),
+    )
+
+
+@triton.jit
+def store3(pointer, stride, index, value, mask):
+    """The counterpart of :func:`load3`."""
+    for k in tl.static_range(3):
+        tl.store(pointer + k * stride + index, value[k], mask)
+
+
+@triton.jit
+def load9(pointer, stride, index, mask):
+    """Nine values, ``stride`` apart, from ``index`` on."""
+    return (
+        tl.load(pointer + index, mask, 0.0),
+        tl.load(pointer + stride + index, mask, 0.0),
+        tl.load(pointer + 2 * stride + index, mask, 0.0),
+        tl.load(pointer + 3 * stride + index, mask, 0.0),
+        tl.load(pointer + 4 * stride + index, mask, 0.0),
+        tl.load(pointer + 5 * stride + index, mask, 0.0),
+        tl.load(pointer + 6 * stride + index, mask, 0.0),
+        tl.load(pointer + 7 * stride + index, mask, 0.0),
+        tl.load(pointer + 8 * stride + index, mask, 0.0),
+    )
+
+
+@triton.jit
+def store9(pointer, stride, index, value, mask):
+    """The counterpart of :func:`load9`."""
+    for k in tl.static_range(9):
+        tl.store(pointer + k * stride + index, value[k], mask)
+
+
+@triton.jit
 def matmul(a, b):
     """A B."""
     return (

@@ -58,25 +58,10 @@ def deform_normal(deformation_gradient: Tensor, normals: Tensor) -> Tensor:
     return _unit_normal(vector, determinant(deformation_gradient, cof), normals)
 
 
-def deform_area(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -> Tensor:
-    r"""Patch areas after a deformation, :math:`a = \lVert \operatorname{cof}(F) N \rVert A` (Nanson's formula).
-
-    Args:
-        deformation_gradient: Total deformation gradient F, shape (..., 3, 3).
-        normals: Unit normals N at rest, shape (..., 3).
-        areas: Areas A at rest [scene units^2], shape (...).
-
-    Returns:
-        Shape (...).
-
-    Raises:
-        ValueError: If a tensor does not have the shape above.
-    """
-    return _cofactor_times(deformation_gradient, normals)[1].norm(dim=-1) * areas
-
-
 def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -> tuple[Tensor, Tensor]:
-    """Normals and areas after a deformation: :func:`deform_normal` and :func:`deform_area` from one cofactor matrix.
+    r"""Normals and areas after a deformation, from one cofactor matrix.
+
+    Normals as :func:`deform_normal`; areas :math:`a = \lVert \operatorname{cof}(F) N \rVert A` (Nanson's formula).
 
     Args:
         deformation_gradient: Total deformation gradient F, shape (..., 3, 3).

@@ -1,4 +1,4 @@
-"""What a picture needs of each patch after a deformation, in one kernel; the definitions are in ``surface``."""
+"""What a picture needs of each patch after a deformation, in one kernel; the definitions are in ``patches``."""
 
 from __future__ import annotations
 
@@ -7,32 +7,50 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, matmul, polar_rotation, transpose, where9
+from gaussian_swaying.geometry.linalg_triton import (
+    axpy9,
+    cofactor,
+    dot3,
+    load3,
+    load9,
+    matmul,
+    polar_rotation,
+    store3,
+    store9,
+    transpose,
+    where3,
+    where9,
+)
 
 BLOCK = 128
 
 
 @triton.jit
-def _load9(pointer, index, mask):
-    """A matrix, row by row."""
-    at = pointer + 9 * index
-    return (
-        tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0),
-        tl.load(at + 3, mask, 0.0), tl.load(at + 4, mask, 0.0), tl.load(at + 5, mask, 0.0),
-        tl.load(at + 6, mask, 0.0), tl.load(at + 7, mask, 0.0), tl.load(at + 8, mask, 0.0),
-    )  # fmt: skip
+def area_vector(F, n):
+    """cof(F) N, which is as long as the area has grown (Nanson's formula), and det F."""
+    c = cofactor(F)
+    vector = (
+        c[0] * n[0] + c[1] * n[1] + c[2] * n[2],
+        c[3] * n[0] + c[4] * n[1] + c[5] * n[2],
+        c[6] * n[0] + c[7] * n[1] + c[8] * n[2],
+    )
+    return vector, F[0] * c[0] + F[1] * c[1] + F[2] * c[2]
 
 
 @triton.jit
-def _store9(pointer, index, value, mask):
-    """The counterpart of ``_load9``."""
-    for k in tl.static_range(9):
-        tl.store(pointer + 9 * index + k, value[k], mask)
+def deform_patch(F, n, area, max_ratio):
+    """Unit normal and area after a deformation, as ``patches.deform_patch``; no area grows beyond ``max_ratio``."""
+    vector, det = area_vector(F, n)
+    size = tl.sqrt(dot3(vector, vector))
+    flat = size == 0
+    scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
+    normal = where3(flat, n, (vector[0] * scale, vector[1] * scale, vector[2] * scale))
+    return normal, tl.minimum(size, max_ratio) * area
 
 
 @triton.jit
 def _limited(drawn, rest, turn, solid, square):
-    """See ``surface.limit_deformed``; ``square`` is that of the largest stretch."""
+    """See ``covariances.limit_deformed``; ``square`` is that of the largest stretch."""
     size = rest[0] + rest[4] + rest[8]
     excess = (square - 1) * size
     over = drawn[0] + drawn[4] + drawn[8] - size
@@ -51,33 +69,24 @@ def _deform(
     """One patch per lane."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
-    f = _load9(F, index, mask)
-    a = _load9(covariance, index, mask)
+    f = load9(F, 1, 9 * index, mask)
+    a = load9(covariance, 1, 9 * index, mask)
     drawn = matmul(matmul(f, a), transpose(f))
     if LIMIT:
         drawn = _limited(drawn, a, polar_rotation(f), tl.load(solid + index, mask, 1) != 0, square)
-    _store9(covariance_out, index, drawn, mask)
-    n0 = tl.load(normal + 3 * index, mask, 0.0)
-    n1 = tl.load(normal + 3 * index + 1, mask, 0.0)
-    n2 = tl.load(normal + 3 * index + 2, mask, 0.0)
-    c = cofactor(f)
-    x = c[0] * n0 + c[1] * n1 + c[2] * n2
-    y = c[3] * n0 + c[4] * n1 + c[5] * n2
-    z = c[6] * n0 + c[7] * n1 + c[8] * n2
+    store9(covariance_out, 1, 9 * index, drawn, mask)
+    n = load3(normal, 1, 3 * index, mask)
+    v, det = area_vector(f, n)
     # scaled, so that squares cannot underflow
-    largest = tl.maximum(tl.abs(x), tl.maximum(tl.abs(y), tl.abs(z)))
+    largest = tl.maximum(tl.abs(v[0]), tl.maximum(tl.abs(v[1]), tl.abs(v[2])))
     flat = largest == 0
     scale = tl.where(flat, 1.0, largest)
-    scale = tl.where(f[0] * c[0] + f[1] * c[1] + f[2] * c[2] < 0, -scale, scale)
-    x = tl.where(flat, n0, x / scale)
-    y = tl.where(flat, n1, y / scale)
-    z = tl.where(flat, n2, z / scale)
-    size = tl.sqrt(x * x + y * y + z * z)
-    tl.store(normal_out + 3 * index, x / size, mask)
-    tl.store(normal_out + 3 * index + 1, y / size, mask)
-    tl.store(normal_out + 3 * index + 2, z / size, mask)
+    scale = tl.where(det < 0, -scale, scale)
+    v = where3(flat, n, (v[0] / scale, v[1] / scale, v[2] / scale))
+    size = tl.sqrt(dot3(v, v))
+    store3(normal_out, 1, 3 * index, (v[0] / size, v[1] / size, v[2] / size), mask)
     if TURN:
-        _store9(rotation_out, index, polar_rotation(f), mask)
+        store9(rotation_out, 1, 9 * index, polar_rotation(f), mask)
 
 
 def deform_all(
@@ -88,7 +97,7 @@ def deform_all(
     max_stretch: float | None = None,
     solid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """See ``surface.deform_all``; float32 on a GPU, without gradient."""
+    """See ``patches.deform_all``; float32 on a GPU, without gradient."""
     shape = deformation_gradient.shape[:-2]
     count = shape.numel()
     given = [deformation_gradient, covariances.expand(*shape, 3, 3), normals.expand(*shape, 3)]

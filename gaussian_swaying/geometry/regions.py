@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
+from gaussian_swaying.geometry.frame import SimFrame
 
 
 class Region(ABC):
@@ -237,3 +238,24 @@ def _corner(name: str, values: Sequence[float | None], unbounded: float) -> tupl
 def _check_region(name: str, region: Region) -> None:
     if not isinstance(region, Region) or isinstance(region, type):
         raise TypeError(f"Expected `{name}` to be a Region, but got {region!r}.")
+
+
+class RegionInFrame(Region):
+    """A region given in axes and units of its own, asked about points in others: metres with z up, or scene units."""
+
+    axes = " in the axes of the region"
+
+    def __init__(self, region: Region, frame: SimFrame) -> None:
+        self.region, self.frame = region, frame
+        self.recordable = region.recordable
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Whether each point (..., 3) [m, z up] lies inside; bool, shape (...)."""
+        return self.region.contains(self.frame.point_to_scene(points))
+
+    def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
+        """Least and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
+        return self.region.bounds(self.frame.point_to_scene(points.reshape(-1, 3)))
+
+    def __repr__(self) -> str:
+        return repr(self.region)

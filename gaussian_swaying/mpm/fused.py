@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.mpm import transfer_triton as kernels
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, TWIN_VALUES, Force, ForceTwin, added, divide, split
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of

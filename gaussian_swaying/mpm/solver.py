@@ -12,8 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
-from gaussian_swaying.mpm.boundary import CLOCK, Boundary, FrameLike, Impulse, Nodes
+from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary, Nodes
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
 from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
@@ -310,7 +312,7 @@ class MPMSolver(nn.Module):
         points: MaterialPoints,
         velocity: Tensor | None = None,
         margin: int = 4,
-        frame: FrameLike | None = None,
+        frame: SimFrame | None = None,
     ) -> MPMState:
         """Take the material at rest and return the state at time zero.
 

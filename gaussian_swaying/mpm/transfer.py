@@ -289,31 +289,6 @@ class _Product(torch.autograd.Function):
         return None, None, _Product.apply(*ctx.pair, grad.contiguous())
 
 
-def p2g(mass: Tensor, velocity: Tensor, affine: Tensor, stencil: Stencil) -> tuple[Tensor, Tensor]:
-    r"""Scatter particle mass and momentum to the grid with APIC (Jiang et al. 2015).
-
-    .. math::
-        m_i = \sum_p w_{ip} m_p, \qquad
-        (m \mathbf{v})_i = \sum_p w_{ip} m_p \bigl(\mathbf{v}_p + \mathbf{C}_p (\mathbf{x}_i - \mathbf{x}_p)\bigr)
-
-    Conserves mass, linear and angular momentum to round-off.
-
-    Args:
-        mass: Particle mass [kg], shape (..., P).
-        velocity: Particle velocity [m/s], shape (..., P, 3).
-        affine: Affine velocity [1/s], shape (..., P, 3, 3).
-        stencil: Support of each particle, with moments.
-
-    Returns:
-        Node mass [kg], shape (..., G), and node momentum [kg m/s], shape (..., G, 3).
-
-    Raises:
-        ValueError: If a particle tensor does not have the shape above.
-    """
-    momentum = scatter_momentum(mass, velocity, affine, None, None, stencil)
-    return momentum[..., 3], momentum[..., :3]
-
-
 def scatter_momentum(
     mass: Tensor,
     velocity: Tensor,
@@ -323,10 +298,11 @@ def scatter_momentum(
     stencil: Stencil,
     mls_scale: float | None = None,
 ) -> Tensor:
-    r"""One scatter of everything the ``updated`` grid update needs (paper, supplement, "MPM Algorithm").
+    r"""One scatter of everything the ``updated`` grid update needs (paper, supplement, "MPM Algorithm"), with APIC.
 
     :math:`\sum_p w_{ip} m_p (v_p + C_p (x_i - x_p)) + w_{ip}\, j_p - S_p \nabla w_{ip}` and the mass, with
-    :math:`j_p = \Delta t\, f_p` and :math:`S_p = \Delta t\, V^0_p \tau_p`.
+    :math:`j_p = \Delta t\, f_p` and :math:`S_p = \Delta t\, V^0_p \tau_p`. The first part (Jiang et al. 2015) conserves
+    mass, linear and angular momentum to round-off.
 
     Args:
         mass: Particle mass [kg], shape (..., P).
@@ -341,6 +317,9 @@ def scatter_momentum(
 
     Returns:
         Momentum [kg m/s] in columns 0 to 2 and mass [kg] in column 3, shape (..., G, 4).
+
+    Raises:
+        ValueError: If a particle tensor does not have the shape above.
     """
     count = mass.shape[-1]
     if (stencil.rows == 4) != (mls_scale is not None):

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import check_shape
 from gaussian_swaying.rendering.cameras.camera import Camera
 
 
@@ -143,22 +144,12 @@ def check_gaussians(
 ) -> None:
     """Raise TypeError or ValueError unless the arguments of a :class:`Renderer` have the documented shapes."""
     count = means.shape[0] if isinstance(means, Tensor) and means.dim() == 2 else "N"
-    wanted: tuple[tuple[str, Tensor | None, tuple[int | str, ...]], ...] = (
-        ("means", means, (count, 3)),
-        ("covariances", covariances, (count, 3, 3)),
-        ("opacities", opacities, (count,)),
-        ("colors", colors, (count, 3)),
-        ("background", background, (3,)),
-    )
-    for name, tensor, shape in wanted:
-        if name == "background" and tensor is None:
-            continue
-        if not isinstance(tensor, Tensor):
-            raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
-        actual = tuple(tensor.shape)
-        if len(actual) != len(shape) or any(isinstance(s, int) and s != a for s, a in zip(shape, actual, strict=True)):
-            expected = ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "")
-            raise ValueError(f"Expected `{name}` of shape ({expected}), but got {actual}.")
+    check_shape("means", means, count, 3, batches=False)
+    check_shape("covariances", covariances, count, 3, 3, batches=False)
+    check_shape("opacities", opacities, count, batches=False)
+    check_shape("colors", colors, count, 3, batches=False)
+    if background is not None:
+        check_shape("background", background, 3, batches=False)
 
 
 def finite_gaussians(means: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:

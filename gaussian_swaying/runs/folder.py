@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from gaussian_swaying._files import check_regular, kind_of, write_json
+from gaussian_swaying._files import check_not_taken, kind_of, write_json
 from gaussian_swaying.runs.lock import FolderLock
 
 MARKER = "run.json"
@@ -57,9 +57,7 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
                 raise
             lock.release()
     except OSError as error:
-        raise ValueError(
-            f"The output folder {folder} cannot be written ({error.strerror or error}): {remedy}."
-        ) from error
+        raise _not_writable(folder, error, remedy) from error
     raise ValueError(f"The output folder {folder} is being moved by other runs: {remedy}.")
 
 
@@ -73,9 +71,11 @@ def hold_folder(folder: Path, remedy: str) -> FolderLock:
     try:
         return FolderLock(_resolve(folder))
     except OSError as error:
-        raise ValueError(
-            f"The output folder {folder} cannot be written ({error.strerror or error}): {remedy}."
-        ) from error
+        raise _not_writable(folder, error, remedy) from error
+
+
+def _not_writable(folder: Path, error: OSError, remedy: str) -> ValueError:
+    return ValueError(f"The output folder {folder} cannot be written ({error.strerror or error}): {remedy}.")
 
 
 def _resolve(folder: Path) -> Path:
@@ -141,6 +141,6 @@ def check_names(folder: Path, files: Iterable[str], folders: Iterable[str]) -> N
             raise ValueError(f"Expected {folder / name} to be a folder, but it is a {kind}: move it away.")
         for path in (folder / name).iterdir() if kind else ():
             if _FRAME.fullmatch(path.name):
-                check_regular(path)
+                check_not_taken(path)
     for name in files:
-        check_regular(folder / name)
+        check_not_taken(folder / name)

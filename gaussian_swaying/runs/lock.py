@@ -14,7 +14,7 @@ import weakref
 from contextlib import suppress
 from pathlib import Path
 
-from gaussian_swaying._files import check_regular, temporary_name
+from gaussian_swaying._files import check_not_taken, temporary_name
 
 LOCK = ".gaussian_swaying.lock"
 
@@ -91,7 +91,7 @@ def _acquire(folder: Path, mine: bytes) -> None:
     for _ in range(10):  # try again if the lock is released meanwhile
         if _create(lock, mine):
             return
-        check_regular(lock)
+        check_not_taken(lock)
         try:
             theirs = lock.read_bytes()
         except FileNotFoundError:

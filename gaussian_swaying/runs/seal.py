@@ -6,8 +6,11 @@ import hashlib
 import os
 import re
 from pathlib import Path
+from typing import Any
 
-from gaussian_swaying._files import check_regular
+import torch
+
+from gaussian_swaying._files import atomic, check_not_taken
 
 _TRAILER = re.compile(rb"\ngaussian_swaying sha256 ([0-9a-f]{64})\n")
 _LENGTH = len(b"\ngaussian_swaying sha256 \n") + 64
@@ -32,6 +35,13 @@ def seal(path: Path) -> None:
         file.write(b"\ngaussian_swaying sha256 " + digest.encode() + b"\n")
 
 
+def save_sealed(path: Path, value: Any) -> None:
+    """Write what ``torch.load`` reads, with its checksum, whole or not at all."""
+    with atomic(path) as temporary:
+        torch.save(value, temporary)
+        seal(temporary)
+
+
 def check_seal(path: Path) -> None:
     """Raise ValueError unless a file ends with the checksum of everything before it.
 
@@ -39,7 +49,7 @@ def check_seal(path: Path) -> None:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a regular file, has no checksum, or its content has changed.
     """
-    check_regular(path)
+    check_not_taken(path)
     size = max(os.path.getsize(path) - _LENGTH, 0)
     with path.open("rb") as file:
         file.seek(size)

@@ -85,13 +85,6 @@ def leaf(
     return patches
 
 
-def leaf_area(length: float, width: float, taper: tuple[float, float] = (0.55, 0.85)) -> float:
-    """Area of the flat outline of :func:`leaf` [m²], from the beta function."""
-    p, q = taper
-    top = (p / (p + q)) ** p * (q / (p + q)) ** q
-    return length * width / top * math.exp(math.lgamma(p + 1) + math.lgamma(q + 1) - math.lgamma(p + q + 2))
-
-
 def pot(
     height: float, foot: float, rim: float, spacing: float, colour: Sequence[float] = (0.72, 0.36, 0.22)
 ) -> Patches:

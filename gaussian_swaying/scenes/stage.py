@@ -27,7 +27,6 @@ def floor(
     *,
     flat: float = 0.0,
     fade: tuple[float, float] = (1.2, 5.0),
-    sky: Sequence[float] = SKY,
     ambient: float = 0.45,
 ) -> Patches:
     """A round floor at z = 0 that faces up and fades into the colour of the sky.
@@ -38,7 +37,6 @@ def floor(
         shadows: Soft round shadows.
         flat: Radius within which the distance between Gaussians does not grow [m], so that none covers an object there.
         fade: Distances from the middle at which the fading starts and ends [m].
-        sky: RGB of the background.
         ambient: That of :func:`~gaussian_swaying.scenes.patches.to_cloud`; the colours make up for its light at the
             horizon.
 
@@ -59,7 +57,7 @@ def floor(
     lit = ambient + (1 - ambient) * LIGHT[2] / math.hypot(*LIGHT)
     far = ((torch.hypot(x, y) - fade[0]) / (fade[1] - fade[0])).clamp(0, 1)
     far = (far * far * (3 - 2 * far))[:, None]
-    distant = torch.tensor(sky, dtype=torch.float64) / lit
+    distant = torch.tensor(SKY, dtype=torch.float64) / lit
     # larger than their cells, so that the floor shows no lattice
     ground = replace(ground, across=_OVERLAP * ground.across, along=_OVERLAP * ground.along)
     return ground.painted(paint * (1 - far) + distant * far)

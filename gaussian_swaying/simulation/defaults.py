@@ -15,7 +15,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.preview.suggest import particle_spacing, suggest_spacing

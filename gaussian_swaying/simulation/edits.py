@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_poisson_ratio, check_positive, check_vector
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
@@ -52,10 +52,8 @@ class Edit:
         for name in ("E", "density"):
             if getattr(self, name) is not None:
                 check_positive(f"edits.{name}", getattr(self, name))
-        if self.nu is not None and not -1 < self.nu < 0.5:
-            raise ValueError(
-                f"Expected `edits.nu` (Poisson's ratio) to lie between -1 and 0.5, both excluded, but got {self.nu}."
-            )
+        if self.nu is not None:
+            check_poisson_ratio("edits.nu", self.nu)
         if self.color is not None and not all(0 <= part <= 1 for part in check_vector("edits.color", self.color)):
             raise ValueError(f"Expected `edits.color` to lie in [0, 1], but got {self.color}.")
         if not 0 <= self.detail <= 1:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_poisson_ratio, check_positive, check_vector
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
@@ -79,11 +79,8 @@ class Material:
             for name in ("E", "density", "thickness"):
                 if getattr(entry, name) is not None:
                     check_positive(f"material.{name}", getattr(entry, name))
-            if entry.nu is not None and not -1 < entry.nu < 0.5:
-                raise ValueError(
-                    f"Expected `material.nu` (Poisson's ratio) to lie between -1 and 0.5, both excluded, but got "
-                    f"{entry.nu}: use 0.49 for something like rubber."
-                )
+            if entry.nu is not None:
+                check_poisson_ratio("material.nu", entry.nu)
 
 
 class Scene:

@@ -19,8 +19,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundary import RegionInFrame
+from gaussian_swaying.geometry.regions import Region, RegionInFrame
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState

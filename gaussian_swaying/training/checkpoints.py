@@ -10,8 +10,8 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from gaussian_swaying._files import atomic, kind_of
-from gaussian_swaying.runs.seal import check_seal, seal
+from gaussian_swaying._files import kind_of
+from gaussian_swaying.runs.seal import check_seal, save_sealed
 from gaussian_swaying.training.densification import PARAMETERS
 
 _FIELDS = {"densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen"}
@@ -60,9 +60,7 @@ class SealedCheckpoints(TorchCheckpointIO):
         """Write a checkpoint with its checksum, whole or not at all."""
         file = Path(path)
         file.parent.mkdir(parents=True, exist_ok=True)
-        with atomic(file) as temporary:
-            torch.save(checkpoint, temporary)
-            seal(temporary)
+        save_sealed(file, checkpoint)
 
     def load_checkpoint(
         self,

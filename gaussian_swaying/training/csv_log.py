@@ -10,7 +10,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
-from gaussian_swaying._files import check_regular, write_table
+from gaussian_swaying._files import check_not_taken, write_table
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
@@ -23,7 +23,7 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
     Raises:
         ValueError: If the path is no regular file.
     """
-    check_regular(path)
+    check_not_taken(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
     whole = True

@@ -19,7 +19,7 @@ _SSIM_SIGMA = 1.5
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 _MIN_OPACITY = 1e-7
 _PADDINGS = ("valid", "reflect", "zeros")
-_REDUCTIONS = ("mean", "sum", "none")
+_REDUCTIONS = ("mean", "sum")
 
 
 def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
@@ -70,9 +70,7 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
     return similarity.reshape(*image.shape[:-3], channels, *similarity.shape[-2:]).movedim(-3, -1)
 
 
-def photometric_loss(
-    image: Tensor, target: Tensor, ssim_weight: float = 0.2, padding: str = "valid", reduction: str = "mean"
-) -> Tensor:
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, padding: str = "valid") -> Tensor:
     r"""Distance of two pictures, :math:`(1 - w)\,\lvert I - \hat I \rvert + w\,(1 - \mathrm{SSIM})` with w = 0.2.
 
     Kerbl et al. 2023, equation 7: the :math:`\mathcal L_\mathrm{rgb}` of Gaussian Swaying.
@@ -82,26 +80,18 @@ def photometric_loss(
         target: Photo, of the same shape.
         ssim_weight: Weight w of the structural part, 0 to 1.
         padding: See :func:`ssim_map`. With ``valid``, each part is the mean over the pixels that it is defined for.
-        reduction: ``mean``, ``sum`` over pixels and channels, or ``none``. The last two need another ``padding`` than
-            ``valid``, so that both parts have a value for each pixel, unless ``ssim_weight`` is 0.
 
     Returns:
-        A number, or shape (..., H, W, C) with ``none``.
+        A number.
 
     Raises:
         ValueError: If shapes or options are not those above.
     """
-    check_choice("reduction", reduction, _REDUCTIONS)
     _check_pictures(image, target)
-    difference = (image - target).abs()
+    difference = (image - target).abs().mean()
     if ssim_weight == 0.0:
-        return _reduce(difference, reduction)
-    dissimilarity = 1.0 - ssim_map(image, target, padding)
-    if reduction == "mean":
-        return torch.lerp(difference.mean(), dissimilarity.mean(), ssim_weight)
-    if padding == "valid":
-        raise ValueError(f"Expected `padding` to be reflect or zeros with reduction={reduction!r}, but got 'valid'.")
-    return _reduce(torch.lerp(difference, dissimilarity, ssim_weight), reduction)
+        return difference
+    return torch.lerp(difference, (1.0 - ssim_map(image, target, padding)).mean(), ssim_weight)
 
 
 def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", reduction: str = "mean") -> Tensor:
@@ -112,10 +102,10 @@ def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", re
         a: Ratio from which on a Gaussian counts as elongated.
         ratio: ``paper`` divides the largest by the second largest scale, so that discs are free; ``max_min`` (Xie et
             al. 2024, "PhysGaussian") divides the largest by the smallest, which asks for balls.
-        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
-        A number, 0 without Gaussians, or shape (N,) with ``none``.
+        A number, 0 without Gaussians.
 
     Raises:
         ValueError: If ``log_scales`` has another shape or an option is none of those above.
@@ -141,10 +131,10 @@ def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
 
     Args:
         opacities: Opacities from 0 to 1, shape (N,); values below 1e-7 count as that, where the gradient is zero.
-        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
-        A number, 0 without Gaussians, or shape (N,) with ``none``.
+        A number, 0 without Gaussians.
 
     Raises:
         ValueError: If ``reduction`` is none of those above.
@@ -160,10 +150,10 @@ def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> 
     Args:
         log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         b: Scale from which on a Gaussian counts as large [scene units].
-        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
-        A number [scene units], 0 without Gaussians, or shape (N,) with ``none``.
+        A number [scene units], 0 without Gaussians.
 
     Raises:
         ValueError: If ``log_scales`` has another shape or ``reduction`` is none of those above.
@@ -174,8 +164,6 @@ def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> 
 
 
 def _reduce(values: Tensor, reduction: str) -> Tensor:
-    if reduction == "none":
-        return values
     return values.mean() if reduction == "mean" and values.numel() else values.sum()
 
 
@@ -249,7 +237,7 @@ class AnisotropyLoss(LossTerm):
     Args:
         a: Ratio from which on a Gaussian counts as elongated, at least 1.
         ratio: ``paper`` (largest over second largest scale) or ``max_min``.
-        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``, which a training cannot take.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Raises:
         ValueError: If an argument is not one of those.
@@ -272,7 +260,7 @@ class OpacityEntropyLoss(LossTerm):
     """Entropy of the opacities, see :func:`opacity_entropy_loss`.
 
     Args:
-        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``, which a training cannot take.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Raises:
         ValueError: If ``reduction`` is none of those.
@@ -297,7 +285,7 @@ class SizeLoss(LossTerm):
 
     Args:
         b: Scale from which on a Gaussian counts as large [scene units].
-        reduction: ``mean`` or ``sum`` over the Gaussians, or ``none``, which a training cannot take.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Raises:
         ValueError: If ``b`` is negative, or ``reduction`` is none of those.
@@ -379,8 +367,8 @@ class TotalLoss(nn.Module):
         for name, value in values.items():
             if value.dim():
                 raise ValueError(
-                    f"Expected the term `{name}` to be a number, but got shape {tuple(value.shape)}: set its "
-                    "`reduction` to mean or sum."
+                    f"Expected the term `{name}` to be a number, but got shape {tuple(value.shape)}: return the mean "
+                    "or the sum."
                 )
         total = sum(self.weights[name] * value for name, value in values.items())
         assert isinstance(total, Tensor)  # one weight at least is not zero

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import Boundary, PinnedRegion
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.validation.settings import Axial, Result, Settings, block, fit_sinusoid, follow
 

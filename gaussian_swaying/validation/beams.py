@@ -8,7 +8,8 @@ import torch
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import Boundary, PinnedRegion
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.validation.settings import Axial, Result, Settings, block, follow
 
 HEIGHT, YOUNG, DENSITY = 1.0, 1e4, 1.0  # thickness [m], [Pa], [kg/m³]; only b and L / h matter

@@ -10,7 +10,7 @@ from gaussian_swaying.aero.wind import SineSway, WindField
 from gaussian_swaying.geometry.linalg import singular_values
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.diagnostics import TearingGauge
 from gaussian_swaying.validation.settings import Result, Run, Settings, follow

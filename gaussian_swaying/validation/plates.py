@@ -10,7 +10,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.aero.force import LAWS, AeroForce
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.mpm.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.validation.settings import Axial, Result, Settings, follow, lattice
 

@@ -69,7 +69,6 @@ def test_covariances_follow_the_points(up):
     frame = SimFrame.fit(_points(), up, longest_side=1.0)
     covariance = torch.cov(_points().T)
     torch.testing.assert_close(frame.covariance_to_sim(covariance), torch.cov(frame.point_to_sim(_points()).T))
-    torch.testing.assert_close(frame.covariance_to_scene(frame.covariance_to_sim(covariance)), covariance)
 
 
 @pytest.mark.parametrize("up", UPS)
@@ -80,7 +79,7 @@ def test_deforming_in_the_scene_is_deforming_in_metres(up):
     covariance, F = factor @ factor.mT, factor + torch.eye(3, dtype=torch.float64)
     in_scene = frame.gradient_to_scene(F)
     in_metres = F @ frame.covariance_to_sim(covariance) @ F.mT
-    torch.testing.assert_close(in_scene @ covariance @ in_scene.mT, frame.covariance_to_scene(in_metres))
+    torch.testing.assert_close(frame.covariance_to_sim(in_scene @ covariance @ in_scene.mT), in_metres)
 
 
 @pytest.mark.parametrize("up", UPS)
@@ -121,7 +120,7 @@ def test_a_second_conversion_copies_nothing(up):
     matrices = torch.rand(50, 3, 3)
     names = ["point_to_sim", "point_to_scene", "displacement_to_scene", "direction_to_sim", "direction_to_scene"]
     calls = [(name, points) for name in names]
-    calls += [(name, matrices) for name in ("covariance_to_sim", "covariance_to_scene", "gradient_to_scene")]
+    calls += [(name, matrices) for name in ("covariance_to_sim", "gradient_to_scene")]
     calls = [(name, value, value.cuda()) for name, value in calls]
     for name, _, value in calls:
         getattr(frame, name)(value)

@@ -11,7 +11,6 @@ from gaussian_swaying.geometry.linalg import (
     singular_values,
     spectrum,
     svd3,
-    symmetric_eigen,
     symmetric_eigenvalues,
 )
 
@@ -155,37 +154,6 @@ def test_spectrum_of_degenerate_matrices(device, dtype, name):
         torch.testing.assert_close(spectrum(F).rotation, eye, rtol=0, atol=tol)
 
 
-@pytest.mark.parametrize("decades", [0, 2, 6])
-def test_symmetric_eigen(device, dtype, decades):
-    """Indefinite matrices, with repeated and with zero eigenvalues too."""
-    q = torch.linalg.qr(_graded(device, torch.float64, 0))[0]
-    values = torch.linalg.svdvals(_graded(device, torch.float64, decades)) * torch.tensor([1.0, -1, 1], device=device)
-    values[::5, 2] = 0
-    S = (q @ values.diag_embed() @ q.mT).to(dtype)
-    found, axes = symmetric_eigen(S)
-    size = S.double().abs().amax((-1, -2), keepdim=True)
-    tol = JACOBI * torch.finfo(dtype).eps
-    torch.testing.assert_close(axes.mT @ axes, _eye(dtype, device).expand_as(axes), rtol=0, atol=tol)
-    assert float((torch.linalg.det(axes) - 1).abs().max()) < tol
-    assert float(((axes @ found.diag_embed() @ axes.mT - S).double() / size).abs().max()) < tol
-    expected = torch.linalg.eigvalsh(S.double()).flip(-1)
-    assert float(((found.double() - expected) / size[..., 0]).abs().max()) < tol
-    assert bool((found[:, :-1] >= found[:, 1:]).all())
-    F = _graded(device, dtype, decades, count=20000)
-    S = F.mT @ F
-    found, axes = symmetric_eigen(S)  # in float32 the squares of what the rotations leave underflow
-    size = S.abs().amax((-1, -2), keepdim=True)
-    assert float(((axes @ found.diag_embed() @ axes.mT - S) / size).abs().max()) < tol
-
-
-def test_symmetric_eigen_of_zero_and_its_gradient(dtype):
-    values, axes = symmetric_eigen(torch.zeros(3, 3, dtype=dtype))
-    assert bool((values == 0).all())
-    torch.testing.assert_close(axes, torch.eye(3, dtype=dtype))
-    G = torch.tensor([[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]], dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: symmetric_eigen(0.5 * (x + x.mT))[0], G)
-
-
 def test_shapes():
     for shape in [(), (0,), (4,), (2, 0), (2, 3)]:
         F = (torch.eye(3) + 0.1 * torch.rand(*shape, 3, 3)).requires_grad_()
@@ -194,7 +162,6 @@ def test_shapes():
         result = from_principal(parts, lambda a: a.square())
         assert result.shape == parts.rotation.shape == F.shape
         result.sum().backward()
-        assert symmetric_eigen(F.detach().mT @ F.detach())[1].shape == F.shape
 
 
 def _log_sum(a):

@@ -9,15 +9,13 @@ import torch
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
-from gaussian_swaying.mpm.boundary import (
-    EnclosingBox,
-    Handle,
-    Impulse,
-    PinnedRegion,
-    Plane,
-    SequentialRelease,
-    VelocityBox,
-)
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.recording.trajectory import load_trajectory

@@ -5,7 +5,7 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 

@@ -18,16 +18,14 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Box, Everything
-from gaussian_swaying.mpm.boundary import (
-    Boundary,
-    EnclosingBox,
-    Handle,
-    Impulse,
-    PinnedRegion,
-    Plane,
-    SequentialRelease,
-    VelocityBox,
-)
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.forces import Force, ForceTwin
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
@@ -1365,7 +1363,7 @@ class OwnLaw(FixedCorotated):
         (lambda points: (dataclasses.replace(points, laws=(OwnLaw(),)), {}), "the law OwnLaw has no fused form"),
         (lambda points: (points, {"formulation": "updated", "deterministic": True}), "sums have no fixed order"),
     ],
-    ids=["float64", "own law", "deterministic"],
+    ids=["float64", "custom law", "deterministic"],
 )
 def test_what_the_kernels_cannot_do(kernel_device, change, reason):
     """``auto`` does it in torch, ``triton`` says why not."""

@@ -11,7 +11,7 @@ from torch.utils._pytree import tree_iter
 from gaussian_swaying.aero.force import aero_force
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver

@@ -6,7 +6,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, bounding_grid
-from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, gather, p2g, scatter, scatter_momentum
+from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, gather, scatter, scatter_momentum
 
 DX = 0.1
 GRID = GridSpec(DX, (0, 0, 0), (10, 10, 10))
@@ -21,6 +21,12 @@ def _particles(device, dtype, *batch, count=64):
         draw[..., 4:7] - 0.5,
         draw[..., 7:].unflatten(-1, (3, 3)) - 0.5,
     )
+
+
+def p2g(mass, velocity, affine, stencil):
+    """Mass and momentum of the nodes, without impulses."""
+    found = scatter_momentum(mass, velocity, affine, None, None, stencil)
+    return found[..., 3], found[..., :3]
 
 
 def _moment(position, momentum):

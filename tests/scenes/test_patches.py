@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.scenes.patches import box, copies, disc, ellipsoid, facing, join, revolution, to_cloud, tube
-from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, leaf_area, pot, tints
+from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, pot, tints
 
 EXACT = 1e-12
 
@@ -59,7 +59,7 @@ def test_a_disc_faces_up():
 
 
 @pytest.mark.parametrize("spacing", [0.2, 0.02, 0.004])
-def test_a_flat_leaf_has_the_area_of_its_outline(spacing):
+def test_a_flat_leaf_has_the_area_of_its_outline(spacing, leaf_area):
     """Rows are as wide as the blade on average, so the area is the outline's even with a single Gaussian."""
     patches = leaf(0.1, 0.05, spacing, droop=0.0, fold=0.0)
     assert float(patches.area.sum()) == pytest.approx(leaf_area(0.1, 0.05), rel=1e-3)

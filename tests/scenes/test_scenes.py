@@ -16,7 +16,6 @@ from gaussian_swaying.scenes import (
     VaseScene,
 )
 from gaussian_swaying.scenes.patches import baked
-from gaussian_swaying.scenes.plant_parts import leaf_area
 from gaussian_swaying.scenes.stage import SKY, cast, floor
 
 SCENES = [AlocasiaScene, FicusScene, LeavesScene, SandScene, TelephoneScene, VaseScene]
@@ -68,7 +67,7 @@ def test_even_a_coarse_scene_keeps_its_size(scene):
     assert float((coarse.amax(0) - high).abs().max()) < 0.25
 
 
-def test_the_leaves_cover_the_area_of_their_outlines():
+def test_the_leaves_cover_the_area_of_their_outlines(leaf_area):
     """Sizes are drawn from 0.75 to 1.15 and blades are bent by some percent, so within a tenth of the mean."""
     many, few = (LeavesScene(leaves=n, spacing=0.02).generate() for n in (300, 100))
     areas = [

@@ -13,7 +13,7 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.regions import Box, Not, Sphere
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene

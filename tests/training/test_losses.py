@@ -83,11 +83,9 @@ def test_photometric_loss_is_the_weighted_sum():
     torch.testing.assert_close(photometric_loss(x, y), expected)
     torch.testing.assert_close(photometric_loss(x, y, ssim_weight=0.0), (x - y).abs().mean())
     assert float(photometric_loss(x, x)) == pytest.approx(0.0, abs=1e-12)
-    unreduced = photometric_loss(x, y, padding="zeros", reduction="none")
-    assert unreduced.shape == x.shape
-    torch.testing.assert_close(unreduced.mean(), photometric_loss(x, y, padding="zeros"))
-    with pytest.raises(ValueError, match="reflect or zeros with reduction='none'"):
-        photometric_loss(x, y, reduction="none")
+    padded = 0.8 * (x - y).abs() + 0.2 * (1 - ssim_map(x, y, "zeros"))
+    assert padded.shape == x.shape
+    torch.testing.assert_close(padded.mean(), photometric_loss(x, y, padding="zeros"))
 
 
 def test_photometric_gradient():
@@ -95,13 +93,18 @@ def test_photometric_gradient():
     assert torch.autograd.gradcheck(lambda p: photometric_loss(p, y), x.requires_grad_(), fast_mode=True)
 
 
+def _of_each(loss, values):
+    """The loss of each Gaussian alone."""
+    return torch.stack([loss(one) for one in values.split(1)])
+
+
 @pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 2, 0], [2, 1, 0]])
 def test_anisotropy_by_hand(order):
     """The paper's ratio leaves discs alone, PhysGaussian's does not."""
     scales = torch.tensor([[0.3, 0.2, 0.001], [0.2, 0.2, 0.001], [0.21, 0.2, 0.2]], dtype=torch.float64)[:, order].log()
-    literal = anisotropy_loss(scales, reduction="none")
+    literal = _of_each(anisotropy_loss, scales)
     torch.testing.assert_close(literal, torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64))
-    spread = anisotropy_loss(scales, ratio="max_min", reduction="none")
+    spread = _of_each(lambda one: anisotropy_loss(one, ratio="max_min"), scales)
     torch.testing.assert_close(spread, torch.tensor([298.9, 198.9, 0.0], dtype=torch.float64))
     torch.testing.assert_close(anisotropy_loss(scales), literal.mean())
     torch.testing.assert_close(anisotropy_loss(scales, reduction="sum"), literal.sum())
@@ -109,7 +112,7 @@ def test_anisotropy_by_hand(order):
 
 def test_entropy_by_hand():
     values = torch.tensor([0.0, 1.0, 0.5, 1 / math.e], dtype=torch.float64, requires_grad=True)
-    result = opacity_entropy_loss(values, reduction="none")
+    result = _of_each(opacity_entropy_loss, values)
     expected = torch.tensor([0.0, 0.0, 0.5 * math.log(2), 1 / math.e], dtype=torch.float64)
     torch.testing.assert_close(result, expected, rtol=1e-9, atol=2e-6)
     result.sum().backward()
@@ -120,7 +123,7 @@ def test_entropy_by_hand():
 
 def test_size_by_hand():
     scales = torch.tensor([[0.001, 0.010, 0.002], [0.008, 0.001, 0.001]], dtype=torch.float64).log()
-    torch.testing.assert_close(size_loss(scales, reduction="none"), torch.tensor([0.002, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(_of_each(size_loss, scales), torch.tensor([0.002, 0.0], dtype=torch.float64))
     assert size_loss(scales, b=0.0).item() == pytest.approx(0.009)
 
 
@@ -144,7 +147,7 @@ def test_modules_are_their_functions():
         (OpacityEntropyLoss(), opacity_entropy_loss(inputs.opacities)),
         (SizeLoss(0.01), size_loss(inputs.log_scales, 0.01)),
         (AnisotropyLoss(reduction="sum"), anisotropy_loss(inputs.log_scales, reduction="sum")),
-        (OpacityEntropyLoss("none"), opacity_entropy_loss(inputs.opacities, "none")),
+        (OpacityEntropyLoss("sum"), opacity_entropy_loss(inputs.opacities, "sum")),
         (SizeLoss(reduction="sum"), size_loss(inputs.log_scales, reduction="sum")),
         (MeanOpacityLoss(), torch.tensor(0.5)),
         (MeanScaleLoss(), torch.tensor(0.017)),
@@ -162,8 +165,15 @@ def test_total_with_the_weights_of_the_paper():
     assert terms["anisotropy"].item() == pytest.approx(0.4, abs=1e-6)
 
 
+class _Each(LossTerm):
+    """A term that is no number."""
+
+    def forward(self, inputs):
+        return inputs.opacities
+
+
 class Steps(LossTerm):
-    """A term of a user's own."""
+    """A custom term."""
 
     def forward(self, inputs):
         return inputs.means.new_tensor(float(inputs.step))
@@ -187,10 +197,10 @@ def test_total_with_a_term_of_ones_own():
         (lambda: AnisotropyLoss(0.5), "`a` to be at least 1"),
         (lambda: AnisotropyLoss(ratio="min_max"), "paper, max_min"),
         (lambda: SizeLoss(-1.0), "`b`"),
-        (lambda: SizeLoss(reduction="max"), "mean, sum, none"),
-        (lambda: AnisotropyLoss(reduction="max"), "mean, sum, none"),
-        (lambda: OpacityEntropyLoss("max"), "mean, sum, none"),
-        (lambda: TotalLoss({"size": SizeLoss(reduction="none")})(_inputs()), "`size` to be a number.*`reduction`"),
+        (lambda: SizeLoss(reduction="max"), "one of mean, sum"),
+        (lambda: AnisotropyLoss(reduction="max"), "one of mean, sum"),
+        (lambda: OpacityEntropyLoss("max"), "one of mean, sum"),
+        (lambda: TotalLoss({"each": _Each()})(_inputs()), "`each` to be a number.*the mean or the sum"),
     ],
 )
 def test_bad_terms(make, words):

@@ -22,7 +22,11 @@ from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSw
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.linalg import determinant, singular_values
 from gaussian_swaying.geometry.regions import Box, Everything
-from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, VelocityBox
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
 from gaussian_swaying.mpm.laws.foam import Foam

@@ -22,6 +22,7 @@ from bench.tables import (
     speed_plot,
     training,
 )
+from gaussian_swaying._files import write_text
 
 TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, runs, speed, training)
 """The modules that register the slots."""
@@ -66,7 +67,7 @@ def refill(results: Path, only: str | None = None) -> None:
         return
     records = record.read(results)
     for path, text in fill(docs, records, only).items():
-        record.write_whole(path, text)
+        write_text(path, text)
         print(f"wrote {path}")
     for pattern, draw in PLOTS.items():
         if found := [row for name, row in records.items() if fnmatch(name, pattern)]:

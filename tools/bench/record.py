@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gaussian_swaying._files import write_text
 from gaussian_swaying._provenance import describe_device, versions
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,18 +26,11 @@ def start(device: str) -> tuple[torch.device, Row]:
     return found, {"device": describe_device(found), "versions": versions(), "seed": 0}
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a file so that it is always complete, even if the process is killed."""
-    draft = path.with_name(path.name + ".part")
-    draft.write_text(text)
-    os.replace(draft, path)
-
-
 def write(folder: Path, name: str, result: Row, quiet: bool = False) -> None:
     """Write a record into the folder of the results, without paths of this machine."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    write_whole(path, json.dumps(result, indent=2).replace(str(ROOT) + "/", "") + "\n")
+    write_text(path, json.dumps(result, indent=2).replace(str(ROOT) + "/", "") + "\n")
     if not quiet:
         print(f"wrote {path}")
 

@@ -6,19 +6,8 @@ is here. ``LAWS`` lists the classes by name.
 
 from __future__ import annotations
 
-from importlib import import_module
-from inspect import isabstract
-from pkgutil import iter_modules
-
+from gaussian_swaying._folders import classes_of
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
-_FILES = [import_module(f"{__name__}.{found.name}") for found in iter_modules(__path__) if not found.ispkg]
-
-LAWS: dict[str, type[ConstitutiveLaw]] = {
-    name: value
-    for file in _FILES
-    for name, value in vars(file).items()
-    if isinstance(value, type) and issubclass(value, ConstitutiveLaw) and value.__module__ == file.__name__
-    if not isabstract(value)
-}
+LAWS: dict[str, type[ConstitutiveLaw]] = classes_of(__name__, __path__, ConstitutiveLaw)
 """The laws of this package by name."""

@@ -16,8 +16,9 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import RegionInFrame
 from gaussian_swaying.geometry.rotations import rotation_from_z
-from gaussian_swaying.mpm.boundary import Boundary, RegionInFrame
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera

@@ -11,11 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.preview.shape import quantile
 from gaussian_swaying.simulation.preview.suggest import Suggestion
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -242,9 +242,9 @@ def measure_motion(
             F = state.F_total.double()
             stretch = symmetric_eigenvalues(matmul3(F.mT, F)).clamp(min=0).sqrt()
             motion = Motion(
-                max(motion.share, _quantile(moved, MOVED) / side),
-                min(motion.stretch_min, _quantile(stretch.amin(-1), STRETCHED)),
-                max(motion.stretch_max, _quantile(stretch.amax(-1), 1 - STRETCHED)),
+                max(motion.share, quantile(moved, MOVED) / side),
+                min(motion.stretch_min, quantile(stretch.amin(-1), STRETCHED)),
+                max(motion.stretch_max, quantile(stretch.amax(-1), 1 - STRETCHED)),
             )
             if motion.share > limit:
                 return replace(motion, complete=False)
@@ -254,10 +254,6 @@ def measure_motion(
         torch.set_num_threads(threads)
         scene.points, wind.flows = points, flows
     return motion
-
-
-def _quantile(values: Tensor, share: float) -> float:
-    return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
 
 
 def calibrated_suggestion(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:

@@ -19,6 +19,7 @@ from gaussian_swaying.simulation.preview.shape import DIRECTIONS, FEWEST, bounds
 
 SEEN = 0.6  # share of the photos in which the object lies
 SNAP = 8.0  # an up direction this close to an axis is taken as the axis [degrees]
+_MOST_PLANES = 3  # backdrops to look for
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ def looked_at(points: Tensor, view: CapturedFrom) -> Tensor:
     return mask
 
 
-def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: float, most: int = 3) -> list[Backdrop]:
+def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: float) -> list[Backdrop]:
     """Walls, floors and tables behind what photos show.
 
     A backdrop is a plane, as thick as 6 % of the longest side, that holds at least 15 % of the visible area in front of
@@ -221,7 +222,6 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
         eyes: Where the cameras stood [scene units], shape (C, 3).
         reach: How far to a side photos reach [scene units].
         cell: Coordinates of the regions are rounded to a hundredth of it [scene units].
-        most: How many planes to look at.
 
     Returns:
         The backdrops, the largest first.
@@ -233,7 +233,7 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
     left = torch.ones(len(points), dtype=torch.bool)  # neither in a backdrop nor behind one
     tried = torch.zeros_like(left)
     found: list[Backdrop] = []
-    for _ in range(most):
+    for _ in range(_MOST_PLANES):
         plane = _largest_plane(where, weight, left & ~tried, half)
         if plane is None:
             break

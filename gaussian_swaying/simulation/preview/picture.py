@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.geometry.regions import Box, Region
-from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera
 from gaussian_swaying.simulation.preview.framing import SOLID, nearby, whole_box
 from gaussian_swaying.simulation.preview.ticks import draw_ticks, project

@@ -384,10 +384,10 @@ def given_region(
 # ---- sizes
 
 
-def particle_spacing(points: Tensor, sample: int = 4000) -> float:
-    """Distance to the nearest other point that 90 % of the points stay below, from an even sample."""
+def particle_spacing(points: Tensor) -> float:
+    """Distance to the nearest other point that 90 % of the points stay below, from an even sample of some 4,000."""
     check_shape("points", points, None, 3)
-    step = max(1, len(points) // sample)
+    step = max(1, len(points) // 4000)
     distance, _ = nearest_neighbours(points, 2, points[::step])
     return quantile(distance[:, 1], 0.9)
 

@@ -13,9 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._files import atomic
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.runs.seal import check_seal, seal
+from gaussian_swaying.runs.seal import check_seal, save_sealed
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
 
 _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": dict}
@@ -23,9 +22,7 @@ _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": di
 
 def write_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
     """Write a checkpoint with its checksum, whole or not at all."""
-    with atomic(path) as temporary:
-        torch.save(checkpoint, temporary)
-        seal(temporary)
+    save_sealed(path, checkpoint)
 
 
 def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:

@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from gaussian_swaying._files import check_regular, kind_of
+from gaussian_swaying._files import check_not_taken, kind_of
 from gaussian_swaying.gaussians.export import read_usd_frame
 from gaussian_swaying.simulation.recording.trajectory import check_trajectory
 
@@ -35,7 +35,7 @@ def check_pictures(folder: Path, place: str, frames: int, video: str | None = No
         if kind_of(path) is None:
             missing.append(path)
             continue
-        check_regular(path)
+        check_not_taken(path)
         try:
             with Image.open(path, formats=["PNG"]) as image:
                 look = (image.size, image.mode)

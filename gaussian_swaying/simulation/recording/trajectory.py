@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying._files import atomic, check_regular
+from gaussian_swaying._files import atomic, check_not_taken
 from gaussian_swaying._inputs import check_archive
 
 _MEMBER = re.compile(r"(position|F)_(\d{5})\.npy")
@@ -65,7 +65,7 @@ def check_trajectory(shards: Path, target: Path, frames: int, particles: int | N
     """
     found: dict[str, set[int]] = {"position": set(), "F": set()}
     for source in _sources(shards, target):
-        check_regular(source)
+        check_not_taken(source)
         try:
             with zipfile.ZipFile(source) as archive:
                 for member in archive.infolist():

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.mpm.boundary import Boundary, Nodes, Plane
+from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState

@@ -15,7 +15,12 @@ from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import EnclosingBox, Handle, PinnedRegion, Plane, SequentialRelease, VelocityBox
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.laws.foam import Foam
 from gaussian_swaying.mpm.laws.metal import Metal
 from gaussian_swaying.mpm.laws.plasticine import Plasticine

@@ -11,7 +11,9 @@ import yaml
 from gaussian_swaying.aero.wind import FlowKey, WindField
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
-from gaussian_swaying.mpm.boundary import Impulse, PinnedRegion, Plane
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene

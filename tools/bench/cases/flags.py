@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from bench.record import ROOT
+from bench.tables.figure import save_figure
 from gaussian_swaying.evaluation.compare import compare_run
 
 sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts that import each other from their own folder
@@ -249,9 +250,7 @@ def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -
             if row == 0:
                 axis.set_title(f"{0.04 * frame:.2f} s")
     drawn.tight_layout()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    drawn.savefig(target, dpi=110)
-    plt.close(drawn)
+    save_figure(drawn, target)
     return True
 
 

@@ -13,7 +13,7 @@ import torch
 
 from gaussian_swaying.aero.force import aero_force
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.boundary import PinnedRegion
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.validation.flags import HEIGHT, WIDTH, flag_points
 from gaussian_swaying.validation.settings import Settings
 

@@ -15,8 +15,8 @@ from bench.tables.rows import Row, order, select
 PAGE = "validation.md"
 
 
-def _value(value: Any, form: str = ".3g") -> str:
-    return "-" if value is None else f"{value:{form}}" if isinstance(value, (int, float)) else str(value)
+def _value(value: Any) -> str:
+    return "-" if value is None else f"{value:.3g}" if isinstance(value, (int, float)) else str(value)
 
 
 def rows_table(name: str) -> Callable[[Callable[[list[Row]], list[str]]], Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bench.cases.accuracy import SINGLE, VARIANTS
+from bench.tables.figure import save_figure
 from bench.tables.rows import Row, select
 
 
@@ -41,6 +42,4 @@ def _plot(rows: list[Row], path: Path) -> None:
         axis.minorticks_off()
     axes[0].set_ylabel("relative error")
     axes[0].legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save_figure(figure, path)

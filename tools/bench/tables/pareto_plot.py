@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.cases.pareto import PROBLEMS, front, is_default, proven
+from bench.tables.figure import save_figure
 
 Row = dict[str, Any]
 
@@ -57,6 +58,4 @@ def _plot(rows: list[Row], path: Path) -> None:
     axes.flat[0].plot([], [], "o", color="gray", markerfacecolor="none", label="CFL 0.8: beyond the proven limit")
     axes.flat[0].plot([], [], "k*", label="default")
     axes.flat[0].legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save_figure(figure, path)

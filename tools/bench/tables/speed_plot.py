@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from bench.tables.figure import save_figure
+
 Row = dict[str, Any]
 
 
@@ -63,6 +65,4 @@ def _plot(result: Row, path: Path) -> None:
     figure.suptitle(f"{result['device']}, sheet in wind", fontsize=10)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save_figure(figure, path)

@@ -1,4 +1,4 @@
-"""A law from outside the package: one file, named by its class path in a YAML, and a twin for the kernels."""
+"""A custom law, from outside the package: one file, named by its class path in a YAML, and a twin for the kernels."""
 
 import importlib
 import sys
@@ -104,7 +104,7 @@ def saint(tmp_path, monkeypatch):
 
 
 def _run(folder, law):
-    """Two frames of a flag of nine by six Gaussians held at its left edge."""
+    """Two frames of a flag of twelve by eight Gaussians held at its left edge."""
     pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
     changes = {
         "material": {"law": law},
@@ -121,7 +121,7 @@ def _run(folder, law):
     return stored["material"]["law"], positions
 
 
-def test_a_law_of_ones_own_runs_from_a_yaml(tmp_path, saint):
+def test_a_custom_law_runs_from_a_yaml(tmp_path, saint):
     assert "Saint" not in LAWS
     written, moved = _run(tmp_path / "one", {"class_path": "saint_law.Saint", "init_args": {"factor": 2.0}})
     assert written == {"class_path": "saint_law.Saint", "init_args": {"factor": 2.0}}

@@ -1,0 +1,115 @@
+"""What a boundary condition is: it holds, stops or drives grid nodes within a window of time.
+
+A condition changes nodal velocities after the momentum update. Where a node "is" depends on the formulation: a lattice
+point in ``updated``, the centre of the mass that it carries in ``total``.
+
+A condition that holds particles holds the nodes that carry them: in ``updated`` all that they touch, in ``total`` those
+in which they have more than a share of the mass.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TypeVar
+
+from torch import Tensor, nn
+
+from gaussian_swaying._graphs import Recordable
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import RegionInFrame
+
+CLOCK = 1e-9  # round-off of a time that many substeps were added to [s]
+_Kind = TypeVar("_Kind", bound="Boundary")
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """What a boundary may know about the grid nodes besides their velocity.
+
+    Attributes:
+        time: Time at the start of the substep [s], scalar float64 tensor.
+        dt: Substep [s], a number or a scalar float64 tensor.
+        position: Where the nodes are [m], shape (..., G, 3), for a boundary with ``needs_position``.
+        lattice: Where the lattice points are [m], shape (..., G, 3), for one with ``needs_lattice``: in ``total`` they
+            have moved with the material, and a velocity that is affine in them moves it rigidly up to its border.
+        share: Share of each node's mass that belongs to the particles of the boundary, shape (..., G), if it has any.
+        threshold: Share above which such a node is held.
+        held_mass: Mass of those particles [kg], shape (...).
+    """
+
+    time: Tensor
+    dt: float | Tensor
+    position: Tensor | None = None
+    lattice: Tensor | None = None
+    share: Tensor | None = None
+    threshold: float = 0.0
+    held_mass: Tensor | None = None
+
+    @property
+    def held(self) -> Tensor:
+        """Nodes that the particles of the boundary hold, bool, shape (..., G)."""
+        assert self.share is not None
+        return self.share > self.threshold
+
+
+class Boundary(Recordable, nn.Module, ABC):
+    """Base of all conditions.
+
+    Args:
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s]; None for never.
+
+    Attributes:
+        needs_position: Whether :meth:`forward` looks at where nodes are.
+        needs_lattice: Whether it looks at where lattice points are.
+        held_share: Share of a node's mass above which the particles of :meth:`particle_mask` hold it in ``total``; None
+            if the condition acts on particles without holding nodes.
+    """
+
+    needs_position = False
+    needs_lattice = False
+    held_share: float | None = None
+
+    def __init__(self, start: float = 0.0, end: float | None = None) -> None:
+        super().__init__()
+        self.start = float(start)
+        self.end = math.inf if end is None else float(end)
+        if not self.start < self.end:
+            raise ValueError(f"Expected `end` to be later than `start` ({self.start} s), but got {self.end} s.")
+
+    def in_frame(self, frame: SimFrame) -> Boundary:
+        """The same condition with its geometry brought from scene units to metres, z up."""
+        return self
+
+    def copy_in(self: _Kind, frame: SimFrame, **tensors: Tensor) -> _Kind:
+        """A copy whose ``region``, if it has one, is asked in metres, and that has other tensors of its own."""
+        moved = copy.copy(self)
+        moved._buffers = {**self._buffers, **tensors}
+        if "region" in vars(self):
+            vars(moved)["region"] = RegionInFrame(vars(self)["region"], frame)
+        return moved
+
+    def particle_mask(self, rest_position: Tensor) -> Tensor | None:
+        """Particles that the condition holds, from their rest positions (..., P, 3); None if it holds none."""
+        return None
+
+    def release_time(self, rest_position: Tensor) -> Tensor | None:
+        """Time at which each particle is let go [s], shape (..., P); None if only ``end`` counts."""
+        return None
+
+    def active(self, time: Tensor) -> Tensor:
+        """Whether the condition acts at a time [s]; scalar bool tensor, so that no GPU has to wait."""
+        now = time + CLOCK
+        return (now >= self.start) & (now < self.end)
+
+    @abstractmethod
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        """Return the node velocity (..., G, 3) [m/s] with the condition applied.
+
+        Args:
+            velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
+            nodes: What else is known about them.
+        """

@@ -1,0 +1,66 @@
+"""A push on a part of the material."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_vector
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.particle_boundary import ParticleBoundary
+
+
+class Impulse(ParticleBoundary):
+    """Pushes the particles of a region: a knock, or a force for some time.
+
+    The impulse is spread evenly over the window and over the mass of the region; it arrives whole whatever the substep.
+
+    Args:
+        region: Where the pushed particles rest, in scene units.
+        impulse: Impulse on the region as a whole [N s], z up.
+        start: Time from which it acts [s].
+        end: Time from which it no longer acts [s].
+        per_particle: Whether ``impulse`` is that on each particle, so that the whole grows with their number.
+    """
+
+    recordable = True
+
+    def __init__(
+        self,
+        region: Region,
+        impulse: Sequence[float],
+        start: float = 0.0,
+        end: float = 0.04,
+        per_particle: bool = False,
+    ) -> None:
+        super().__init__(region, start, end)
+        if not math.isfinite(self.end):
+            raise ValueError(f"Expected `end` of the Impulse to be a finite time, but got {end}.")
+        self.register_buffer("impulse", torch.tensor(check_vector("impulse", impulse), dtype=torch.float64))
+        self.impulse: Tensor
+        self.per_particle = bool(per_particle)
+        # particles of each scene of the batch, once they are known
+        self.register_buffer("count", torch.ones((), dtype=torch.float64), persistent=False)
+        self.count: Tensor
+
+    def particle_mask(self, rest_position: Tensor) -> Tensor:
+        """Particles inside the region at rest, which are counted too; ValueError if there are none."""
+        mask = super().particle_mask(rest_position)
+        if self.per_particle:
+            self.count = mask.sum(-1).to(self.impulse)
+        return mask
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        """Add the part of the impulse that falls into the substep."""
+        assert nodes.share is not None
+        assert nodes.held_mass is not None
+        overlap = (nodes.time + nodes.dt).clamp(max=self.end) - nodes.time.clamp(min=self.start)
+        part = (overlap.clamp(min=0) / (self.end - self.start)).to(velocity)
+        # a scene of the batch without any such particle has no share to push
+        per_mass = nodes.share / nodes.held_mass.clamp(min=torch.finfo(velocity.dtype).tiny)[..., None]
+        whole = self.impulse if not self.per_particle else self.count[..., None, None] * self.impulse
+        return velocity + per_mass[..., None] * (part * whole.to(velocity))

@@ -1,0 +1,84 @@
+"""A part of the material that is held and let go bit by bit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_vector
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+
+
+class SequentialRelease(PinnedRegion):
+    """Holds the particles of a region and lets them go one after the other, as a front passes over them.
+
+    Args:
+        region: Where the held particles rest, in scene units.
+        direction: Direction in which the front travels, in scene axes.
+        start: Time at which the front meets the first particle [s]; before it all are held.
+        end: Time at which it passes the last one [s].
+        held_share: Share of the nodal mass in ``total``, between 0 and 1.
+        first: Point that the front meets at ``start``, in scene units, in place of the first particle.
+        last: Point that it passes at ``end``, likewise; given together with ``first``, and farther along ``direction``.
+    """
+
+    recordable = True
+
+    def __init__(
+        self,
+        region: Region,
+        direction: Sequence[float] = (0.0, 0.0, 1.0),
+        start: float = 0.0,
+        end: float = 1.0,
+        held_share: float = 0.07,
+        first: Sequence[float] | None = None,
+        last: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__(region, held_share, start, end)
+        if not math.isfinite(self.end):
+            raise ValueError(f"Expected `end` of the SequentialRelease to be a finite time, but got {end}.")
+        if not any(check_vector("direction", direction)):
+            raise ValueError("Expected `direction` of the SequentialRelease not to be zero.")
+        self.register_buffer("direction", torch.tensor([float(c) for c in direction], dtype=torch.float64))
+        self.direction: Tensor
+        if (first is None) != (last is None):
+            raise ValueError("Give both `first` and `last` of the SequentialRelease, or neither.")
+        ends = None
+        if first is not None and last is not None:
+            ends = torch.tensor([check_vector("first", first), check_vector("last", last)], dtype=torch.float64)
+            if not float((ends[1] - ends[0]) @ self.direction) > 0:
+                raise ValueError(
+                    f"Expected `last` of the SequentialRelease farther along `direction` than `first`, but got "
+                    f"{list(last)} and {list(first)}."
+                )
+        self.register_buffer("ends", ends)  # first and last, shape (2, 3)
+        self.ends: Tensor | None
+
+    def in_frame(self, frame: SimFrame) -> SequentialRelease:
+        """The release with its region, direction and points in metres, z up."""
+        tensors = {"direction": frame.direction_to_sim(self.direction).clone()}
+        if self.ends is not None:
+            tensors["ends"] = frame.point_to_sim(self.ends)
+        return self.copy_in(frame, **tensors)
+
+    def release_time(self, rest_position: Tensor) -> Tensor:
+        """When the front passes each particle [s], shape (..., P), float64."""
+        mask = self.region.contains(rest_position)
+        along = (rest_position.double() * self.direction.to(rest_position.device)).sum(-1)
+        if self.ends is None:
+            low = along.where(mask, math.inf).amin(-1, keepdim=True)
+            high = along.where(mask, -math.inf).amax(-1, keepdim=True)
+        else:
+            low, high = (self.ends.to(along) @ self.direction.to(along)).unbind()
+        part = (along - low) / (high - low).clamp(min=torch.finfo(torch.float64).tiny)
+        return self.start + part * (self.end - self.start)
+
+    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        """Hold the nodes of those not yet released."""
+        return torch.where(nodes.held[..., None], torch.zeros_like(velocity), velocity)

@@ -1,0 +1,84 @@
+"""Small bodies, and short runs of them."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+
+def _block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):
+    axis = (torch.arange(per_side, dtype=torch.float64) + 0.5) * side / per_side
+    position = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    return MaterialPoints.create(
+        position + torch.tensor(low, dtype=torch.float64),
+        volume=(side / per_side) ** 3,
+        density=100.0,
+        youngs_modulus=e,
+        poisson_ratio=0.3,
+    )
+
+
+def _run_for(formulation, boundaries, points, seconds, velocity=None, gravity=(0, 0, -9.8), dx=0.1, damping=0.0):
+    solver = MPMSolver(dx=dx, formulation=formulation, boundaries=boundaries, gravity=gravity, damping=damping)
+    state = solver.init_state(points, velocity)
+    for _ in range(round(seconds / 0.02)):
+        steps = solver.substeps(state, 0.02)
+        state = solver.rollout(solver.fit_grid(state, 0.02), 0.02 / steps, steps)
+    assert not bool(state.lost.any())
+    return state
+
+
+def _lone(places, **material):
+    """Particles without neighbours: no stencil meets another."""
+    position = torch.tensor(places, dtype=torch.float64)
+    given = {"volume": 1e-3, "density": 100.0, "youngs_modulus": 1e3, "poisson_ratio": 0.3}
+    return MaterialPoints.create(position, **(given | material))
+
+
+def _march(solver, points, dt, steps, velocity=None, frame=None):
+    """All states from the first to the last, on a grid that has room."""
+    states = [solver.init_state(points, velocity, margin=12, frame=frame)]
+    for _ in range(steps):
+        states.append(solver.step(states[-1], dt))
+    assert not bool(states[-1].lost.any())
+    return states
+
+
+def _rotation(axis, angle):
+    """Rodrigues' rotation matrix."""
+    x, y, z = torch.tensor(axis, dtype=torch.float64) / math.sqrt(sum(c * c for c in axis))
+    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    return torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+@pytest.fixture
+def block():
+    """A cube of particles."""
+    return _block
+
+
+@pytest.fixture
+def run_for():
+    """The state after some seconds, on a grid that follows."""
+    return _run_for
+
+
+@pytest.fixture
+def lone():
+    """Particles without neighbours."""
+    return _lone
+
+
+@pytest.fixture
+def march():
+    """All states from the first to the last."""
+    return _march
+
+
+@pytest.fixture
+def rotation():
+    """Rodrigues' rotation matrix."""
+    return _rotation

@@ -1,0 +1,121 @@
+"""A handle moves and turns what it holds."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Box, Sphere
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+FORMULATIONS = ["total", "updated"]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_handle_carries_its_particles_and_the_others_follow(formulation, block, march):
+    """At rest before the window; then exactly velocity * t; let go after it."""
+    points = block()
+    rest, velocity = points.position, torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)
+    top = rest[:, 2] > 0.3
+    handle = Handle(Box([None, None, 0.3], [None] * 3), velocity.tolist(), held_share=0.0, start=0.0099, end=0.0499)
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
+    dt = 2e-3
+    states = march(solver, points, dt, 50)
+    for k in (1, 4, 5):
+        assert float(states[k].velocity.abs().max()) == 0.0
+    for k in (6, 15, 25):  # substeps 5 to 24 begin within the window
+        expected = rest[top] + velocity * dt * (k - 5)
+        torch.testing.assert_close(states[k].position[top], expected, rtol=0, atol=1e-13)
+        torch.testing.assert_close(states[k].velocity[top], velocity.expand_as(rest[top]), rtol=0, atol=1e-13)
+    first, last = (states[k].velocity[~top].mean(0) for k in (6, 25))
+    assert float(last @ velocity) > max(2 * float(first @ velocity), 0.3 * float(velocity @ velocity))
+    bottom = rest[:, 2] < 0.1
+    assert float((states[6].velocity[bottom]).abs().max()) < 0.01 * float(velocity.norm())
+    released = states[26:]
+    assert float((released[0].velocity[top] - velocity).abs().max()) > 1e-3
+    momenta = torch.stack([solver.momenta(state)["linear"] for state in released])
+    torch.testing.assert_close(momenta, momenta[:1].expand_as(momenta), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_handle_holds_nothing_outside_its_region(formulation, block, run_for):
+    points = MaterialPoints.join([block(), block(low=(2, 0, 0))])
+    handle = Handle(Box([-1, -1, -1], [1, 1, 1]), [0.5, 0.0, 0.0], [0.0, 0.0, 2.0])
+    state = run_for(formulation, [handle], points, 0.1, gravity=(0, 0, 0))
+    far = points.position[:, 0] > 1
+    assert float(state.velocity[far].abs().max()) == 0.0
+    assert float((state.position - points.position)[~far].norm(dim=-1).min()) > 1e-3
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_handle_turns_twice_without_growing(formulation, block, march, rotation):
+    """720 degrees in 160 substeps. A tangent velocity would swell the block by (1 + 0.0785²)^80 = 1.64."""
+    points = block(per_side=3, side=0.3)
+    axis, pivot = [1.0, 2.0, -2.0], torch.tensor([0.1, 0.3, 0.2], dtype=torch.float64)
+    rate, substeps = 3.0, 160
+    spin = [rate * c / 3 for c in axis]
+    handle = Handle(Sphere([0, 0, 0], 9.0), angular_velocity=spin, pivot=pivot.tolist())
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle])
+    dt = 4 * math.pi / rate / substeps
+    states = march(solver, points, dt, substeps)
+    arm = points.position - pivot
+    for k in (20, 50, 160):  # a quarter turn, 225 degrees, two turns
+        turn = rotation(axis, rate * dt * k)
+        torch.testing.assert_close(states[k].position, pivot + arm @ turn.T, rtol=0, atol=1e-12)
+        torch.testing.assert_close(states[k].F_elastic, turn.expand(27, 3, 3), rtol=0, atol=1e-11)
+    torch.testing.assert_close(states[160].position, points.position, rtol=0, atol=1e-12)
+    assert float((states[20].position - points.position).norm(dim=-1).max()) > 0.2
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_handle_pivot_travels(formulation, block, march, rotation):
+    """Turning and moving from a start later than zero: x = pivot + v t + R(t) (x0 - pivot)."""
+    points = block(per_side=3, side=0.3)
+    pivot, velocity = torch.tensor([[0.4, 0.0, 0.1], [0.5, -1.0, 0.25]], dtype=torch.float64)
+    handle = Handle(Sphere([0, 0, 0], 9.0), velocity.tolist(), [0.0, 0.0, -5.0], pivot.tolist(), start=0.1, end=9.0)
+    dt = 5e-3
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
+    states = march(solver, points, dt, 80)
+    first = next(k for k, state in enumerate(states) if float(state.time) >= 0.1)
+    assert torch.equal(states[first].position, points.position)
+    for k in (first + 1, 80):
+        seconds = dt * (k - first)
+        turn = rotation([0.0, 0.0, -1.0], 5.0 * seconds)
+        expected = pivot + velocity * seconds + (points.position - pivot) @ turn.T
+        torch.testing.assert_close(states[k].position, expected, rtol=0, atol=1e-12)
+    assert float(states[80].time) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_handle_in_a_frame_that_scales_and_turns(formulation, block, march, rotation):
+    """Region and pivot in scene units and axes; velocities in m/s, z up, and unscaled."""
+    scene = torch.stack([block(per_side=3, side=0.6).position, block((3, 0, 0), 0.6, per_side=3).position])
+    scene = scene.reshape(-1, 3) + 7.0
+    frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
+    position = frame.point_to_sim(scene)
+    points = MaterialPoints.create(position, volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    pivot, velocity = [7.1, 7.2, 6.5], torch.tensor([0.2, 0.4, -0.6], dtype=torch.float64)
+    handle = Handle(Box([6, 6, 6], [8, 8, 8]), velocity.tolist(), [0.0, 0.0, 4.0], pivot)
+    solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
+    dt, steps = 4e-3, 50
+    state = march(solver, points, dt, steps, frame=frame)[-1]
+    near = scene[:, 0] < 8
+    assert int(near.sum()) == 27
+    turn = rotation([0.0, 0.0, 1.0], 4.0 * dt * steps)
+    centre = frame.point_to_sim(torch.tensor(pivot, dtype=torch.float64))
+    expected = centre + velocity * dt * steps + (position[near] - centre) @ turn.T
+    torch.testing.assert_close(state.position[near], expected, rtol=0, atol=1e-12)
+    assert torch.equal(state.position[~near], position[~near])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_handle_without_any_motion_is_a_pin(formulation, block, run_for):
+    points, region = block(), Box([None, None, 0.3], [None] * 3)
+    handle = run_for(formulation, [Handle(region)], points, 0.1)
+    pin = run_for(formulation, [PinnedRegion(region)], points, 0.1)
+    assert torch.equal(handle.position, pin.position)
+    assert torch.equal(handle.F_elastic, pin.F_elastic)
