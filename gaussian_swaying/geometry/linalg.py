@@ -91,8 +91,8 @@ def _nearest_rotation(matrix: Tensor, iterations: int) -> Tensor:
         zeta = ratio.clamp(min=torch.finfo(x.dtype).tiny).pow(0.25)
         x = 0.5 * (zeta * x + inverse_transpose / zeta)
     reflected = (determinant(x) < 0)[..., None, None]
-    # a check on a GPU would make the host wait, and a compiled graph cannot branch on it
-    if x.device.type == "cpu" and not torch.compiler.is_compiling() and not bool(reflected.any()):
+    # asking a GPU would make the host wait
+    if x.device.type == "cpu" and not bool(reflected.any()):
         return x
     stretch = matmul3(x.mT, matrix)
     axis = _weakest_axis(0.5 * (stretch + stretch.mT))

@@ -6,26 +6,26 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
-from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary, Nodes
-from gaussian_swaying.mpm.boundaries.impulse import Impulse
-from gaussian_swaying.mpm.damping import damped_substep, kelvin_voigt_pk1
+from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
+from gaussian_swaying.mpm.formulations import FORMULATIONS
+from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.recompute import recompute
-from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
-from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
-from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, g2p, gather, scatter, scatter_momentum
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.mpm.timestep import kick_time, substeps_per_frame
 
 if TYPE_CHECKING:
-    from gaussian_swaying.mpm.fused import FusedSolver
+    from gaussian_swaying.mpm.triton.fused import Fused
 
 WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
@@ -60,9 +60,6 @@ class MPMSolver(nn.Module):
         transfer: How substeps are computed. ``torch`` is the definition, on any device and with gradients; ``triton``
             has a whole substep in two kernels on a CUDA device, in float32 and without gradients; ``auto`` takes
             triton where it can.
-        compile: Compile stress and transfers with ``torch.compile``. The first substeps then take a minute or so, and
-            some again when the grid first changes or gradients are first asked for, but not for another ``dt``. No
-            second derivatives, and no ``checkpoint``.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -88,159 +85,129 @@ class MPMSolver(nn.Module):
         deterministic: bool = False,
         boundaries: Sequence[Boundary] = (),
         transfer: str = "auto",
-        compile: bool = False,
     ) -> None:
         super().__init__()
         check_choice("transfer", transfer, TRANSFERS)
-        if compile and transfer == "triton":
-            raise ValueError("The kernels of `transfer: triton` are compiled anyway: leave out `compile`.")
         check_positive("dx", dx)
-        check_choice("formulation", formulation, ("total", "updated"))
+        check_choice("formulation", formulation, tuple(FORMULATIONS))
         check_positive("damping", damping, allow_zero=True)
         check_positive("stiffness_damping", stiffness_damping, allow_zero=True)
-        if mls and formulation != "updated":
-            raise ValueError(
-                "`mls` is a variant of the updated formulation: set `formulation` to updated, or `mls` to false."
-            )
         check_positive("cfl", cfl)
         if substep is not None:
             check_positive("substep", substep)
         check_positive("max_nodes", max_nodes)
-        self.dx, self.formulation, self.damping, self.cfl = float(dx), formulation, float(damping), float(cfl)
-        self.stiffness_damping, self.mls, self.deterministic = float(stiffness_damping), mls, deterministic
-        self.substep, self.max_nodes, self.compiled = substep, int(max_nodes), bool(compile)
-        self.transfer = transfer
-        self.gravity = check_vector("gravity", gravity)
-        # float64 on the device: no copy in a step, full precision in a float64 run
-        self.register_buffer("_gravity", torch.tensor(self.gravity, dtype=torch.float64), persistent=False)
-        self._gravity: Tensor
+        self.settings = Settings(
+            dx=float(dx),
+            gravity=check_vector("gravity", gravity),
+            damping=float(damping),
+            stiffness_damping=float(stiffness_damping),
+            max_nodes=int(max_nodes),
+            mls=mls,
+            deterministic=deterministic,
+        )
+        self.formulation, self.cfl, self.substep, self.transfer = formulation, float(cfl), substep, transfer
+        FORMULATIONS[formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
         # the same in metres; in a tuple, as these copies are no part of the module's state
         self._framed: tuple[Boundary, ...] | None = None
-        self._points: MaterialPoints | None = None
-        self._laws: LawDispatch | None = None
-        self._static: dict[str, Tensor] = {}
-        self._stencil: Stencil | None = None
-        self._fused: FusedSolver | None = None
+        self._bound: Formulation | None = None
+        self._fused: Fused | None = None
         self._fused_obstacle: str | None = None
-        self._grid = GridSpec(self.dx, (0, 0, 0), (0, 0, 0))
+
+    # ---- what was given
+
+    @property
+    def dx(self) -> float:
+        """Grid spacing [m]."""
+        return self.settings.dx
+
+    @property
+    def gravity(self) -> tuple[float, ...]:
+        """Acceleration [m/s²], z up."""
+        return self.settings.gravity
+
+    @property
+    def damping(self) -> float:
+        """Rate at which velocities decay [1/s]."""
+        return self.settings.damping
+
+    @property
+    def stiffness_damping(self) -> float:
+        """Time by which the stress looks ahead [s]."""
+        return self.settings.stiffness_damping
+
+    @property
+    def max_nodes(self) -> int:
+        """Largest grid [nodes]."""
+        return self.settings.max_nodes
+
+    @property
+    def mls(self) -> bool:
+        """Whether stress term and update of F are those of MLS-MPM."""
+        return self.settings.mls
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether sums on a GPU have a fixed order."""
+        return self.settings.deterministic
+
+    @property
+    def neighbours_fixed(self) -> bool:
+        """Whether particles keep the neighbours that they have at rest: they cannot tear, flow or leave the grid."""
+        return FORMULATIONS[self.formulation].neighbours_fixed
 
     # ---- the object at rest
 
     @property
+    def bound(self) -> Formulation:
+        """The formulation, bound to the material given to :meth:`init_state`."""
+        if self._bound is None:
+            raise RuntimeError("The solver has no material yet: call `init_state(points)` first.")
+        return self._bound
+
+    @property
     def points(self) -> MaterialPoints:
         """The material given to :meth:`init_state`."""
-        if self._points is None:
-            raise RuntimeError("The solver has no material yet: call `init_state(points)` first.")
-        return self._points
+        return self.bound.body.points
 
     @property
     def laws(self) -> LawDispatch:
         """The laws of the material given to :meth:`init_state`, bound to its particles."""
-        if self._laws is None:
-            raise RuntimeError("The solver has no material yet: call `init_state(points)` first.")
-        return self._laws
-
-    @property
-    def stencil(self) -> Stencil:
-        """The stencil of the particles at rest, in the ``total`` formulation."""
-        if self._stencil is None:
-            raise RuntimeError("The solver has no fixed stencil: it is of the total formulation and needs a material.")
-        return self._stencil
-
-    @property
-    def _acting(self) -> Sequence[Boundary]:
-        """The boundary conditions, in metres."""
-        return _conditions(self.boundaries) if self._framed is None else self._framed
-
-    @property
-    def total_lagrangian(self) -> bool:
-        """Whether stencils stay at the rest positions."""
-        return self.formulation == "total"
+        return self.bound.body.laws
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MPMSolver:
         super()._apply(fn, recurse)
         for boundary in self._framed or ():
             boundary._apply(fn)
-        if self._points is not None:
-            self._bind(self._points.map(fn))
+        if self._bound is not None:
+            self._bind(self.points.map(fn))
         return self
 
     def _bind(self, points: MaterialPoints) -> None:
-        """Take the material and compute what never changes: its laws and, in ``total``, stencil and mass."""
-        laws = LawDispatch(points)
-        if self.total_lagrangian and laws.plastic:
-            raise ValueError(
-                f"The law {laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
-                "`solver.formulation` to updated, or choose an elastic law."
-            )
-        self._points, self._laws, self._static, self._fused = points, laws, {}, None
-        self._fused_obstacle = self._why_not_fused()
-        self._stress = self._built(laws.pk1 if self.total_lagrangian else laws.kirchhoff)
-        self._scatter_momentum, self._g2p = self._built(scatter_momentum), self._built(g2p)
-        static, position, conditions = self._static, points.position, self._acting
-        for k, boundary in enumerate(conditions):
-            mask = boundary.particle_mask(position.detach())
-            if mask is None:
-                continue
-            static[f"pinned_mass_{k}"] = torch.where(mask, points.mass, 0.0)
-            static[f"held_mass_{k}"] = static[f"pinned_mass_{k}"].sum(-1)
-            release = boundary.release_time(position.detach())
-            if release is not None:
-                static[f"release_{k}"] = release
-        if not self.total_lagrangian:
-            return
-        grid = self._bounding_grid(position, margin=0)
-        snap = torch.finfo(position.dtype).eps ** 0.5
-        stencil = bspline_stencil(position, grid, False, snap, deterministic=self.deterministic, fixed=True)
-        mass = scatter(stencil, points.mass[..., None, None])[..., 0]
-        self._stencil = stencil
-        # sparse products cannot be compiled, and are faster
-        sparse = stencil.matrices is not None
-        self._scatter = scatter if sparse else self._built(scatter)
-        self._gather = gather if sparse else self._built(gather)
-        static["node_mass"] = mass
-        static["node_inverse_mass"] = _safe_inverse(mass)
-        if any(b.needs_position for b in conditions):
-            first_moment = scatter(stencil, (points.mass[..., None] * position)[..., None, :])
-            static["node_rest"] = first_moment * static["node_inverse_mass"][..., None]
-        for k, boundary in enumerate(conditions):
-            if f"pinned_mass_{k}" not in static:
-                continue
-            share = self._share(k, stencil, static["node_inverse_mass"], None)
-            threshold = boundary.held_share
-            if threshold is not None and not bool((share > threshold).any()):
-                count = int((static[f"pinned_mass_{k}"] > 0).sum())
-                raise ValueError(
-                    f"The pin {k} holds {count} particles but no grid node: none of them has more than "
-                    f"{threshold:g} of the mass of a node; enlarge `region` of the {type(boundary).__name__} or lower "
-                    "its `held_share`."
-                )
-            if f"release_{k}" not in static:
-                static[f"share_{k}"] = share
-        self._grid = grid
+        """Take the material and compute what never changes."""
+        conditions = _conditions(self.boundaries) if self._framed is None else self._framed
+        self._bound = self._fused = None
+        bound = FORMULATIONS[self.formulation](Body(points, conditions), self.settings)
+        self._fused_obstacle = self._why_not_fused(bound)
+        self._bound = bound
 
-    def _built(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A pure function as it is, or compiled; the substep is no argument of any, so that it may change."""
-        return torch.compile(function, fullgraph=True) if self.compiled else function
-
-    def _why_not_fused(self) -> str | None:
+    def _why_not_fused(self, bound: Formulation) -> str | None:
         """Why the Triton kernels cannot be used, whatever the state; None if they can."""
         if self.transfer == "torch":
             return "`transfer` is torch"
-        if self.compiled:
-            return "`compile` is set"
         try:
-            from gaussian_swaying.mpm import fused
+            twin = bound.twin()
         except ImportError as error:
             obstacle: str | None = f"Triton cannot be imported ({error})"
         else:
-            obstacle = fused.unsupported(self)
+            obstacle = f"the {bound.name} formulation has no kernels"
+            if twin is not None:
+                obstacle = twin.unsupported(bound, interpret=self.transfer == "triton")
         if self.transfer == "triton" and obstacle is not None:
             raise ValueError(f"`transfer: triton` cannot be used, as {obstacle}: set it to auto or torch.")
         return obstacle
 
-    def fused(self, *tensors: Tensor | None) -> FusedSolver | None:
+    def fused(self, *tensors: Tensor | None) -> Fused | None:
         """The Triton substep of this material; None where the torch one is to be used.
 
         Args:
@@ -251,61 +218,26 @@ class MPMSolver(nn.Module):
         """
         if self._fused_obstacle is not None:
             return None
-        if torch.is_grad_enabled():
-            points = self.points
-            own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
-            held = [t for boundary in self._acting for t in (*boundary.parameters(), *boundary.buffers())]
-            if any(t is not None and t.requires_grad for t in (*own, *held, *tensors)):
-                if self.transfer == "triton":
-                    raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
-                return None
-        from gaussian_swaying.mpm.fused import FusedTotal, FusedUpdated, made_from
-
-        if self._fused is None or self._fused.made_from != made_from(self):
+        bound = self.bound
+        asking = (*bound.body.tensors(), *tensors) if torch.is_grad_enabled() else ()
+        if any(t is not None and t.requires_grad for t in asking):
+            if self.transfer == "triton":
+                raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
+            return None
+        if self._fused is None or not self._fused.holds():
+            twin = bound.twin()
+            assert twin is not None
             # ordinary tensors, which may be written within inference mode and without
             with torch.inference_mode(False), torch.no_grad():
-                self._fused = (FusedTotal if self.total_lagrangian else FusedUpdated)(self)
+                self._fused = twin(bound)
         return self._fused
 
-    def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> FusedSolver | None:
+    def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
         """As :meth:`fused`, for rollouts in some forces; None too if one of them has to be asked in every substep."""
         if not all(force.recordable for force in divide(forces)[1]):
             return None
-        asking = [*_tensors(state), *tensors_of(forces)] if torch.is_grad_enabled() else []
+        asking = [*state.tensors(), *tensors_of(forces)] if torch.is_grad_enabled() else []
         return self.fused(*asking)
-
-    def held_mass(self, k: int, time: Tensor | None) -> Tensor:
-        """Mass of the particles that the ``k``-th boundary holds at a time [kg], zero elsewhere, shape (..., P)."""
-        mass = self._static[f"pinned_mass_{k}"]
-        if time is not None and f"release_{k}" in self._static:
-            mass = torch.where(self._static[f"release_{k}"] > time + CLOCK, mass, 0.0)
-        return mass
-
-    def _share(self, k: int, stencil: Stencil, inverse_mass: Tensor, time: Tensor | None) -> Tensor:
-        """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
-        return scatter(stencil, self.held_mass(k, time)[..., None, None])[..., 0] * inverse_mass
-
-    def _bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
-        flat = position.detach().reshape(-1, 3)
-        low, high = flat.amin(0), flat.amax(0)
-        if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
-            raise _not_finite("position", flat)
-        grid = bounding_grid(low, high, self.dx, margin)
-        if grid.node_count > self.max_nodes:
-            size = [round(v, 3) for v in (high - low).tolist()]
-            what = f"The particles span {size} m"
-            if 2 * margin * self.dx > max(size):
-                what = f"The particles may fly {margin * self.dx:.3g} m to any side within a frame, at {speed:.3g} m/s"
-            raise ValueError(
-                f"{what}, which takes {grid.node_count:,} grid nodes at dx = {self.dx:g} m, more "
-                f"than `max_nodes` = {self.max_nodes:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
-            )
-        if max(map(abs, grid.offset)) >= 2**31:
-            raise ValueError(
-                f"The particles lie up to {float(flat.abs().amax()):.3g} m from the origin, more than 2^31 cells of dx "
-                f"= {self.dx:g} m: pin or enclose them, or shift the scene to the origin."
-            )
-        return grid
 
     def init_state(
         self,
@@ -335,53 +267,19 @@ class MPMSolver(nn.Module):
         self._framed = None
         if frame is not None:
             self._framed = tuple(b.in_frame(frame) for b in _conditions(self.boundaries))
-        self._points = None
+        self._bound = None
         self.to(points.position.device)  # the solver goes where its material is
         self._bind(points)
-        position = points.position
-        self._check_rounding(position)
         if velocity is None:
-            velocity = torch.zeros_like(position)
+            velocity = torch.zeros_like(points.position)
         check_shape("velocity", velocity, points.count, 3)
-        velocity = velocity.expand_as(position)
-        identity = torch.eye(3, dtype=position.dtype, device=position.device).repeat(*position.shape[:-1], 1, 1)
-        state = MPMState(
-            position=position,
-            velocity=velocity,
-            affine=torch.zeros_like(identity),
-            F_elastic=identity,
-            F_total=identity,
-            lost=torch.zeros(position.shape[:-1], dtype=torch.bool, device=position.device),
-            time=torch.zeros((), dtype=torch.float64, device=position.device),
-            grid=self._grid if self.total_lagrangian else self._bounding_grid(position, margin),
-            internal=self.laws.initial_internal(),
-            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
-        )
-        if not self.total_lagrangian:
-            return state
-        assert self._stencil is not None
-        momentum = scatter(self._stencil, (points.mass[..., None] * velocity)[..., None, :])
-        node_velocity = momentum * self._static["node_inverse_mass"][..., None]
-        return self._read_particles(state, torch.zeros_like(node_velocity), node_velocity)
-
-    def _check_rounding(self, position: Tensor) -> None:
-        """Refuse positions in ``updated`` whose rounding would swallow the way of a substep."""
-        farthest = float(position.detach().abs().amax()) if position.numel() else 0.0
-        limit = 1e-3 * self.dx / torch.finfo(position.dtype).eps
-        if not self.total_lagrangian and farthest > limit:
-            raise ValueError(
-                f"Expected `position` within {limit:.3g} m of the origin, but got {farthest:.3g} m, where "
-                f"{position.dtype} rounds by more than a thousandth of a cell: shift the scene to the origin (SimFrame "
-                "does so), or use float64."
-            )
+        return self.bound.first_state(velocity.expand_as(points.position), margin)
 
     # ---- time
 
     def stable_substep(self, state: MPMState | None = None) -> float:
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
-        F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
-        limit = stable_limit(self.points, self.dx, F, internal, spatial=not self.total_lagrangian, laws=self._laws)
-        return damped_substep(float(limit.detach().amin()), self._viscous_time(state))
+        return self.bound.stable_substep(state)
 
     def substeps(self, state: MPMState, frame_dt: float) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
@@ -399,34 +297,24 @@ class MPMSolver(nn.Module):
             steps = substeps_per_frame(frame_dt, self.substep, exact=True)
             return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
         longest = self.cfl / max(float(self._cells_per_second(state)), 1e-30)
-        return substeps_per_frame(frame_dt, damped_substep(longest, self._viscous_time(state)), exact=False)
+        return substeps_per_frame(frame_dt, damped_substep(longest, self.bound.viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
         """Largest Courant number ``dt (c + |v|) / dx`` of a substep; in ``total`` without v, as stencils rest.
 
         With stiffness damping it is that of the undamped substep which is as stable.
         """
-        return math.sqrt(dt * dt + 2 * self._viscous_time(state) * dt) * self._cells_per_second(state)
-
-    def _viscous_time(self, state: MPMState | None) -> float:
-        """The stiffness damping [s], grown by as much as the viscous stress of a stretched material is stiffer."""
-        if self.stiffness_damping == 0 or state is None:
-            return self.stiffness_damping
-        F = state.F_elastic.detach()
-        squared = float(symmetric_eigenvalues(F.mT @ F)[..., 0].amax().clamp(min=1.0))
-        return self.stiffness_damping * squared ** (1 if self.total_lagrangian else 2)
+        return math.sqrt(dt * dt + 2 * self.bound.viscous_time(state) * dt) * self._cells_per_second(state)
 
     def _cells_per_second(self, state: MPMState) -> Tensor:
-        """How many cells the fastest wave crosses in a second."""
-        F = state.F_elastic.detach()
+        """How many cells the fastest wave crosses in a second, in a kernel where there is one."""
         if self._fused_obstacle is None:
-            from gaussian_swaying.mpm.fused import largest_speed
+            from gaussian_swaying.mpm.triton.measures import largest_speed
 
-            cells = largest_speed(self, state)
+            cells = largest_speed(self.bound, state)
             if cells is not None:
                 return cells
-        speed = wave_speed(self.points, F, state.internal, spatial=not self.total_lagrangian, laws=self._laws)
-        return cfl_number(1.0, self.dx, speed, None if self.total_lagrangian else state.velocity).detach()
+        return self.bound.cells_per_second(state)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
         """Move and resize the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
@@ -443,22 +331,7 @@ class MPMSolver(nn.Module):
             FloatingPointError: If a position or a speed is NaN or infinite.
             ValueError: If the grid would be larger than ``max_nodes``.
         """
-        if self.total_lagrangian:
-            return state
-        speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
-        if not math.isfinite(speed):
-            raise _not_finite("speed", state.velocity.detach().square().sum(-1).reshape(-1, 1))
-        reach = (2 * speed + 0.5 * sum(g * g for g in self.gravity) ** 0.5 * horizon) * horizon
-        cells = 3 + margin + min(int(reach / self.dx), 1000)
-        grid = self._bounding_grid(state.position, cells, speed)
-        if not state.position.is_cuda:
-            return state.replace(grid=grid)
-        # CUDA graphs are recorded for one grid, so it stays as long as it serves
-        roomy = grid.with_room(state.grid)
-        serves = state.grid.holds(grid) and state.grid.node_count <= 3 * roomy.node_count
-        if serves and not margin:  # a margin is asked for where the grid did not serve
-            return state
-        return state.replace(grid=roomy if roomy.node_count <= self.max_nodes else grid)
+        return self.bound.fit_grid(state, horizon, margin)
 
     def step(
         self,
@@ -498,11 +371,10 @@ class MPMSolver(nn.Module):
 
     def _step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
         """One substep with a force and a drag that are known."""
-        fused = self.fused(*_tensors(state), force, drag)
+        fused = self.fused(*state.tensors(), force, drag)
         if fused is not None:
             return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
-        advance = self._step_total if self.total_lagrangian else self._step_updated
-        after = advance(state, dt, force, drag)
+        after = self.bound.step(state, dt, force, drag)
         return after if force is None else after.replace(work=self._work(state, after, dt, force, drag))
 
     @torch.no_grad()
@@ -514,7 +386,7 @@ class MPMSolver(nn.Module):
         if drag is not None:
             force = force - drag[..., None] * (after.velocity - state.velocity)
         power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum(-1)
-        return state.work + (0.5 * self.kick(state, dt)) * power
+        return state.work + (0.5 * kick_time(state, dt)) * power
 
     def rollout(
         self,
@@ -565,10 +437,6 @@ class MPMSolver(nn.Module):
 
         if checkpoint <= 0 or not torch.is_grad_enabled():
             return advance(state, 0, steps)
-        if self.compiled:
-            raise ValueError(
-                "Compiled substeps keep what their gradient needs: set `compile` or `checkpoint`, not both."
-            )
         for first in range(0, steps, checkpoint):
             count = min(checkpoint, steps - first)
             state = recompute(partial(advance, first=first, count=count), state)
@@ -610,189 +478,28 @@ class MPMSolver(nn.Module):
             seen.append(self.cfl_number(state, dt))
         return state, torch.stack(seen).amax()
 
-    @staticmethod
-    def kick(state: MPMState, dt: float) -> float:
-        """How long forces act in a substep of ``dt`` [s] (see :meth:`step`)."""
-        return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
-
-    def _step_total(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
-        assert self._stencil is not None
-        assert state.node_velocity is not None
-        displacement = state.node_displacement
-        assert displacement is not None
-        points, static, laws = self.points, self._static, self.laws
-        F = state.F_elastic
-        stress = self._stress(F, None)
-        if self.stiffness_damping > 0:
-            stress = stress + kelvin_voigt_pk1(F, state.affine, laws.mu, laws.lam, self.stiffness_damping)
-        stress = stress * points.volume[..., None, None]
-        value = torch.zeros_like(state.position) if force is None else force
-        node_force = self._scatter(self._stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
-        inverse_mass = static["node_inverse_mass"][..., None]
-        kick, yielding = self.kick(state, dt), None
-        if drag is not None:
-            resistance = scatter(self._stencil, drag[..., None, None])
-            yielding = 1 / (1 + kick * resistance * inverse_mass)
-        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, kick, yielding)
-        velocity = torch.where(inverse_mass > 0, velocity, 0.0)
-        position = lattice = None
-        if "node_rest" in static:
-            shift = (state.position - points.position) * points.mass[..., None]
-            position = static["node_rest"] + scatter(self._stencil, shift[..., None, :]) * inverse_mass
-        if any(b.needs_lattice for b in self._acting):
-            lattice = state.grid.node_positions(velocity) + displacement
-        inverse = inverse_mass[..., 0]
-        share = partial(self._share, stencil=self._stencil, inverse_mass=inverse, time=state.time)
-        velocity = self._constrain(velocity, share, position, lattice, state.time, dt)
-        state = state.replace(time=state.time + dt, substep=dt)
-        return self._read_particles(state, displacement + dt * velocity, velocity)
-
-    def _read_particles(self, state: MPMState, displacement: Tensor, velocity: Tensor) -> MPMState:
-        """Particle fields of the ``total`` formulation, interpolated from the nodes."""
-        assert self._stencil is not None
-        rows = self._gather(torch.cat([displacement, velocity], dim=-1), self._stencil)
-        F = rows[..., 1:4, :3].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
-        return state.replace(
-            position=self.points.position + rows[..., 0, :3],
-            velocity=rows[..., 0, 3:],
-            affine=rows[..., 1:4, 3:].mT,
-            F_elastic=F,
-            F_total=F,
-            node_displacement=displacement,
-            node_velocity=velocity,
-        )
-
-    def _step_updated(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
-        points, laws = self.points, self.laws
-        stencil = bspline_stencil(state.position, state.grid, gradients=not self.mls, deterministic=self.deterministic)
-        F = state.F_elastic
-        stress = self._stress(F, state.internal)
-        if self.stiffness_damping > 0:
-            rate = matmul3(state.affine, F)
-            viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, self.stiffness_damping)
-            stress = stress + matmul3(viscous, F.mT)
-        kick = self.kick(state, dt)
-        impulse = None if force is None else kick * force
-        if any(self.gravity):  # here, and not on the nodes, of which most may be empty
-            weight = kick * points.mass[..., None] * self._gravity.to(F)
-            impulse = weight if impulse is None else impulse + weight
-        if drag is not None:
-            held = (kick * drag)[..., None] * state.velocity
-            impulse = held if impulse is None else impulse + held
-        nodes = self._scatter_momentum(
-            points.mass,
-            state.velocity,
-            state.affine,
-            impulse,
-            kick * points.volume[..., None, None] * stress,
-            stencil,
-            4.0 / self.dx**2 if self.mls else None,
-        )
-        inverse_mass = _safe_inverse(nodes[..., 3])[..., None]
-        velocity, yielding = nodes[..., :3] * inverse_mass, None
-        if drag is not None:
-            yielding = 1 / (1 + kick * scatter(stencil, drag[..., None, None]) * inverse_mass)
-            velocity = velocity * yielding
-        if self.damping > 0:
-            velocity = velocity * math.exp(-self.damping * kick)
-        position = None
-        if any(b.needs_position or b.needs_lattice for b in self._acting):
-            position = state.grid.node_positions(velocity).expand_as(velocity)
-        share = partial(self._share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
-        velocity = self._constrain(velocity, share, position, position, state.time, dt)
-        new_velocity, affine, gradient = self._g2p(velocity, stencil, self.dx)
-        identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
-        update = identity + dt * gradient
-        F, internal = matmul3(update, F), state.internal
-        F_total = F
-        if laws.plastic:
-            F_total = matmul3(update, state.F_total)
-            F, internal = laws.return_map(F, internal, dt)
-        return state.replace(
-            position=state.position + dt * new_velocity,
-            velocity=new_velocity,
-            affine=affine,
-            F_elastic=F,
-            F_total=F_total,
-            lost=state.lost | ~stencil.inside,
-            time=state.time + dt,
-            internal=internal,
-            substep=dt,
-        )
-
-    def _accelerate(self, velocity: Tensor, acceleration: Tensor, dt: float, yielding: Tensor | None = None) -> Tensor:
-        """Apply the given acceleration, gravity and damping to node velocities of the ``total`` formulation.
-
-        ``yielding`` is mass over mass plus implicit drag times ``dt``, shape (..., G, 1).
-        """
-        if any(self.gravity):
-            acceleration = acceleration + self._gravity.to(velocity)
-        velocity = velocity + dt * (acceleration if yielding is None else yielding * acceleration)
-        if self.damping > 0:
-            velocity = velocity * math.exp(-self.damping * dt)
-        return velocity
-
-    def _constrain(
-        self,
-        velocity: Tensor,
-        share_of: Callable[[int], Tensor],
-        position: Tensor | None,
-        lattice: Tensor | None,
-        time: Tensor,
-        dt: float | Tensor,
-    ) -> Tensor:
-        """Apply the boundary conditions to node velocities, in order.
-
-        ``share_of(k)`` is the share of the nodal mass that the particles of the ``k``-th one hold, shape (..., G).
-        """
-        static = self._static
-        # what pushes comes before what holds, in whatever order they were given
-        for k, boundary in sorted(enumerate(self._acting), key=lambda pair: not isinstance(pair[1], Impulse)):
-            share = None
-            if f"pinned_mass_{k}" in static:
-                share = static[f"share_{k}"] if f"share_{k}" in static else share_of(k)
-            threshold = (boundary.held_share or 0.0) if self.total_lagrangian else 0.0
-            held_mass = static.get(f"held_mass_{k}")
-            velocity = boundary(velocity, Nodes(time, dt, position, lattice, share, threshold, held_mass))
-        return velocity
-
     def energies(self, state: MPMState) -> dict[str, Tensor]:
         """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""
-        points = self.points
-        if state.node_velocity is not None:
-            kinetic = 0.5 * (self._static["node_mass"] * state.node_velocity.square().sum(-1)).sum(-1)
-        else:
-            # lumped APIC kinetic energy: the affine part carries D = dx²/4 per particle (Jiang et al. 2015)
-            spread = 0.25 * self.dx**2 * state.affine.square().sum((-1, -2))
-            kinetic = 0.5 * (points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
+        points, laws = self.points, self.laws
         density = None
-        wanted = torch.is_grad_enabled() and (state.F_elastic.requires_grad or self.laws.mu.requires_grad)
+        wanted = torch.is_grad_enabled() and (state.F_elastic.requires_grad or laws.mu.requires_grad)
         if self._fused_obstacle is None and not wanted:
-            from gaussian_swaying.mpm.fused import elastic_energy
+            from gaussian_swaying.mpm.triton.measures import elastic_energy
 
-            density = elastic_energy(self, state.F_elastic)
+            density = elastic_energy(self.bound.body, state.F_elastic)
         if density is None:
-            density = self.laws.energy(state.F_elastic, state.internal)
-        height = (state.position * self._gravity.to(state.position)).sum(-1)
+            density = laws.energy(state.F_elastic, state.internal)
+        height = (state.position * self.bound.gravity.to(state.position)).sum(-1)
         return {
-            "kinetic": kinetic,
+            "kinetic": self.bound.kinetic(state),
             "elastic": (points.volume * density).sum(-1),
             "potential": -(points.mass * height).sum(-1),
         }
 
     def momenta(self, state: MPMState) -> dict[str, Tensor]:
         """Linear [kg m/s] and angular momentum about the origin [kg m²/s], each of shape (..., 3)."""
-        if state.node_velocity is not None:
-            assert state.node_displacement is not None
-            momentum = self._static["node_mass"][..., None] * state.node_velocity
-            place = state.grid.node_positions(momentum) + state.node_displacement
-            return {"linear": momentum.sum(-2), "angular": torch.linalg.cross(place, momentum, dim=-1).sum(-2)}
-        momentum = self.points.mass[..., None] * state.velocity
-        # what the affine velocity adds: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)
-        spin = state.affine * (self.points.mass * self.dx**2 / 4)[..., None, None]
-        own = torch.stack([spin[..., i, j] - spin[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
-        angular = torch.linalg.cross(state.position, momentum, dim=-1) + own
-        return {"linear": momentum.sum(-2), "angular": angular.sum(-2)}
+        linear, angular = self.bound.momenta(state)
+        return {"linear": linear, "angular": angular}
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
@@ -805,21 +512,3 @@ def _told(watch: WatchFunction, before: int, done: int) -> None:
 
 def _conditions(modules: nn.ModuleList) -> list[Boundary]:
     return [b for b in modules if isinstance(b, Boundary)]
-
-
-def _tensors(state: MPMState) -> list[Tensor]:
-    """The floating-point fields of a state."""
-    fields = [state.position, state.velocity, state.affine, state.F_elastic, state.F_total, state.internal]
-    return [t for t in (*fields, state.node_displacement, state.node_velocity) if t is not None]
-
-
-def _not_finite(name: str, values: Tensor) -> FloatingPointError:
-    """The error that names the first particle of which a value (P, ·) is NaN or infinite."""
-    first = int((~torch.isfinite(values)).any(-1).int().argmax())
-    return FloatingPointError(f"The {name} of particle {first} is NaN or infinite.")
-
-
-def _safe_inverse(mass: Tensor) -> Tensor:
-    """1 / mass where there is any, else 0; its derivative, 1 / mass², stays finite too."""
-    floor = torch.finfo(mass.dtype).tiny ** 0.5
-    return torch.where(mass > floor, 1 / mass.clamp(min=floor), 0.0)

@@ -258,6 +258,11 @@ class MPMState:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
+    def tensors(self) -> list[Tensor]:
+        """The fields that may ask for a gradient."""
+        fields = [self.position, self.velocity, self.affine, self.F_elastic, self.F_total, self.internal]
+        return [t for t in (*fields, self.node_displacement, self.node_velocity) if t is not None]
+
     def state_dict(self) -> dict[str, Any]:
         """The state as plain tensors and numbers, for ``torch.save``."""
         result = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}

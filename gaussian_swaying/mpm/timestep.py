@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.laws.shared import lame_parameters
-from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 
 def wave_speed(
@@ -104,6 +104,11 @@ def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
             "material, raise its density or the grid spacing `dx`, or shorten the frame."
         )
     return max(1, round(ratio) if exact else math.ceil(ratio - 1e-6))
+
+
+def kick_time(state: MPMState, dt: float) -> float:
+    """How long forces act in a substep of ``dt`` [s] from a state on; see ``MPMSolver.step``."""
+    return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
 
 def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | None) -> Tensor:

@@ -312,7 +312,7 @@ class Simulation(nn.Module):
                 f"than the {MAX_SUBSTEPS:,} that are of use: {remedy}."
             )
         self._most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
-        self._tearing = None if self.solver.total_lagrangian else TearingGauge(self.solver)
+        self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
         return state
 
     def edit(self, state: MPMState, *edits: Edit) -> MPMState:

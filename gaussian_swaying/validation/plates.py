@@ -127,7 +127,7 @@ def hinged_plate(
     hinge = Hinge(dx)
     solver = settings.solver(dx, gravity=(0.0, 0.0, -GRAVITY), damping=damping, boundaries=[Axial([0]), hinge])
     state = solver.init_state(points)
-    if solver.total_lagrangian:
+    if solver.neighbours_fixed:
         hinge.rest = state.grid.node_positions(state.position)
 
     like = points.position

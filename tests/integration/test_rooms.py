@@ -95,12 +95,27 @@ def test_metrics_stand_alone():
     assert {other for module in FILES if ".metrics" in module for other in _imports(module)} <= {f"{ROOT.name}._checks"}
 
 
+TORCHS_OWN = {"_apply", "_buffers", "_modules", "_version"}
+"""Private names of PyTorch that have no public form: what modules hold and move, and whether a tensor was changed."""
+
+
+def _private(name):
+    return name.startswith("_") and not name.endswith("__")
+
+
+@pytest.mark.parametrize("module", [module for module in FILES if module.split(".")[1:2] == ["mpm"]])
+def test_private_names_of_mpm_stay_in_their_file(module):
+    """A private name is read from ``self``, ``cls`` or ``super()``, and never imported."""
+    read = []
+    for node in ast.walk(ast.parse(FILES[module].read_text())):
+        if isinstance(node, ast.ImportFrom):
+            read += [alias.name for alias in node.names if _private(alias.name)]
+        elif isinstance(node, ast.Attribute) and _private(node.attr) and node.attr not in TORCHS_OWN:
+            read += [] if ast.unparse(node.value) in {"self", "cls", "super()"} else [ast.unparse(node)]
+    assert read == []
+
+
 def test_no_file_is_long():
     """Some 500 lines, unless it is one concept."""
-    one_concept = {
-        "mpm.solver",
-        "mpm.fused",
-        "mpm.transfer_triton",
-    }  # being split
     long = {m.removeprefix(f"{ROOT.name}.") for m, path in FILES.items() if len(path.read_text().splitlines()) > 500}
-    assert long <= one_concept
+    assert long == set()

@@ -16,7 +16,7 @@ from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 
 try:
-    from gaussian_swaying.mpm import fused
+    from gaussian_swaying.mpm.triton import fused
 except ImportError:
     fused = None
 

@@ -262,8 +262,8 @@ def test_solver_divides_a_frame_by_the_damped_substep(formulation):
         assert float(solver.cfl_number(state, longest)) == pytest.approx(0.4, rel=1e-9)
         assert float(solver.cfl_number(state, 0.04 / counts[-1])) <= 0.4 * (1 + 1e-9)
         assert solver.stable_substep() == pytest.approx(damped_substep(undamped, beta), rel=1e-9)
-        fixed = MPMSolver(dx=0.1, formulation=formulation, substep=1.01 * solver.stable_substep())
-        fixed.stiffness_damping = beta
+        substep = 1.01 * solver.stable_substep()
+        fixed = MPMSolver(dx=0.1, formulation=formulation, substep=substep, stiffness_damping=beta)
         with pytest.raises(ValueError, match=r"fixed `substep` of .* longer than the stable one"):
             fixed.substeps(fixed.init_state(points), 0.04)
     assert counts == sorted(set(counts))

@@ -16,7 +16,7 @@ import triton.language as tl
 
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.linalg_triton import polar_rotation, svd3
-from gaussian_swaying.mpm import fused, laws
+from gaussian_swaying.mpm import laws
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.fluid import Fluid
 from gaussian_swaying.mpm.laws.foam import Foam
@@ -29,6 +29,7 @@ from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, kirchhoff, pk1
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin, shared, twin_of
+from gaussian_swaying.mpm.triton import fused
 
 MU, LAM, DT = 4e3, 6e3, 1e-3
 

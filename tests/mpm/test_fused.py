@@ -45,7 +45,7 @@ try:
     import triton
     import triton.language as tl
 
-    from gaussian_swaying.mpm import fused
+    from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated, measures
 except ImportError:
     fused = None
 
@@ -92,7 +92,7 @@ def kernel_device(request):
 def _one_width(monkeypatch):
     """The number of lanes is a constant of the compiled kernel: the same for all bodies."""
     if fused is not None:
-        monkeypatch.setattr(fused, "_lanes", lambda sizes: 4)
+        monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 4)
 
 
 def _on(*everywhere, interpreted=()):
@@ -128,12 +128,12 @@ def _start(solver, points, strain=0.2):
     """Deformed and in motion."""
     device, shape = points.position.device, points.position.shape
     state = solver.init_state(points, _random(1, *shape).to(device))
-    if solver.total_lagrangian:
+    if solver.neighbours_fixed:
         nodes = [
             (size * _random(seed, *state.node_velocity.shape)).to(device) for seed, size in ((2, strain * DX), (3, 1.0))
         ]
-        massive = (solver._static["node_mass"] > 0)[..., None]  # others never move
-        return solver._read_particles(state, *(torch.where(massive, value, 0.0) for value in nodes))
+        massive = (solver.bound.node_mass > 0)[..., None]  # others never move
+        return solver.bound.read_particles(state, *(torch.where(massive, value, 0.0) for value in nodes))
     F = (torch.eye(3) + strain * _random(2, *shape, 3)).to(device)
     total = F.mT.contiguous() if solver.laws.plastic else F
     state = state.replace(F_elastic=F, F_total=total, affine=_random(3, *shape, 3).to(device))
@@ -244,7 +244,7 @@ def test_crushed_and_inverted_particles(kernel_device, formulation):
     """Where the nearest rotation is not unique, as at a reflection of a ball, there is nothing to compare."""
 
     def start(solver, points):
-        if solver.total_lagrangian:
+        if solver.neighbours_fixed:
             state = _start(solver, points, strain=0.9)
             assert bool((torch.linalg.det(state.F_elastic) < 0).any())
             return state
@@ -280,9 +280,9 @@ def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
     formulation, sizes = case
     if formulation == "updated" and programs > 1:
         pytest.skip("only `total` cuts cells")
-    monkeypatch.setattr(fused, "_PROGRAMS", programs)
+    monkeypatch.setattr(fused_total, "_PROGRAMS", programs)
     if len(sizes) > 2:
-        monkeypatch.setattr(fused, "_lanes", lambda sizes: 64)
+        monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 64)
     generator = torch.Generator().manual_seed(7)
     cells = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
     place = 0.52 + 0.96 * torch.rand(len(cells), 3, generator=generator)  # of a cell, from the first node
@@ -296,19 +296,19 @@ def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
 def test_every_number_of_lanes(lanes, monkeypatch):
     """The others are used elsewhere."""
     pytest.importorskip("triton")
-    monkeypatch.setattr(fused, "_lanes", lambda sizes: lanes)
+    monkeypatch.setattr(fused_total, "_lanes", lambda sizes: lanes)
     _agree(_wind_case(_points("cuda", count=300), "total"))
 
 
 @pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
 def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypatch):
     """200 particles in a cell and 10 in the next, by 32 lanes."""
-    monkeypatch.setattr(fused, "_lanes", lambda sizes: 32)
+    monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 32)
     generator = torch.Generator().manual_seed(2)
     place = 0.52 + 0.96 * torch.rand(210, 3, generator=generator)
     place[200:, 2] += 1
     for programs, pieces in ((2048, 7 + 1), (3, 3 + 1), (1, 2)):
-        monkeypatch.setattr(fused, "_PROGRAMS", programs)
+        monkeypatch.setattr(fused_total, "_PROGRAMS", programs)
         solver = MPMSolver(DX, formulation="total", transfer="triton")
         solver.init_state(_body((place * DX).to(kernel_device)))
         assert solver.fused().pieces == pieces
@@ -318,7 +318,7 @@ def test_the_number_of_lanes_suits_the_cells(monkeypatch):
     if fused is None:
         pytest.skip("needs triton, which there is for Linux only")
     monkeypatch.undo()
-    few, many = (fused._lanes(torch.full((100,), size)) for size in (3, 300))
+    few, many = (fused_total._lanes(torch.full((100,), size)) for size in (3, 300))
     assert few < many
 
 
@@ -548,7 +548,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     """Over a part that ends, particles that are sorted anew, and a batch; all forces and their work."""
     name, resistance = case
     monkeypatch.setattr(fused, "MAX_STEPS", 3)
-    monkeypatch.setattr(fused, "RESORT", 2)
+    monkeypatch.setattr(fused_updated, "RESORT", 2)
     points = _points(kernel_device, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)
 
@@ -773,14 +773,14 @@ def test_a_substep_that_changes(kernel_device, formulation):
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     """Longer than the schedule or the order of the particles lasts; the wind goes on, and so does the work."""
     monkeypatch.setattr(fused, "MAX_STEPS", 4)
-    monkeypatch.setattr(fused, "RESORT", 2)
+    monkeypatch.setattr(fused_updated, "RESORT", 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
     points = _points(kernel_device, count=12, batch=(2,))
     load = _load(points, [wind, WIND])
 
     def start(solver, points):
         state = _start(solver, points, strain=0.05)
-        return state if solver.total_lagrangian else state.replace(velocity=10 * state.velocity)  # across cells
+        return state if solver.neighbours_fixed else state.replace(velocity=10 * state.velocity)  # across cells
 
     ends = _both(points, lambda solver, state: solver.rollout(state, DT, 5, load), formulation, start=start)
     _agree(ends)
@@ -798,7 +798,7 @@ def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
 )
 def test_looks_on_the_way(kernel_device, case, monkeypatch):
     """The largest Courant number seen, and the same motion; some looks fall between two sorts of the particles."""
-    monkeypatch.setattr(fused, "RESORT", 2)
+    monkeypatch.setattr(fused_updated, "RESORT", 2)
     law, formulation = case
     points = _points(kernel_device, (ELASTIC | PLASTIC)[law])
 
@@ -1033,10 +1033,10 @@ def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
         (torch.cuda, "Stream", lambda device: None),
         (torch.cuda, "synchronize", lambda device: None),
         (torch.cuda, "empty_cache", lambda: None),
-        (fused.FusedUpdated, "_load", lambda self, state: None),
-        (fused.FusedUpdated, "_particles", lambda self, *more, **options: None),
-        (fused.FusedUpdated, "_nodes", lambda self, offset, options: substeps.append(offset)),
-        (fused.FusedUpdated, "_read", lambda self, state: {}),
+        (fused_updated.FusedUpdated, "_load", lambda self, state: None),
+        (fused_updated.FusedUpdated, "_particles", lambda self, *more, **options: None),
+        (fused_updated.FusedUpdated, "_nodes", lambda self, offset, options: substeps.append(offset)),
+        (fused_updated.FusedUpdated, "_read", lambda self, state: {}),
     ):
         monkeypatch.setattr(place, name, value)
     points, solver = _points(kernel_device, count=4), _solver("triton")
@@ -1164,8 +1164,8 @@ def test_courant_number(kernel_device, formulation, law):
     for F in (eye + 1e-4 * _random(31, 48, 3, 3), 4.0 * _random(32, 48, 3, 3), double, 1e-12 * double, 0 * double):
         at = state.replace(F_elastic=F.to(kernel_device))
         wide = {n: getattr(at, n).double() for n in ("F_elastic", "F_total", "velocity", "position")}
-        largest.append(float(fused.largest_speed(solver, at)))
-        assert largest[-1] == pytest.approx(float(exact._cells_per_second(at.replace(**wide))), rel=1e-5)
+        largest.append(float(measures.largest_speed(solver.bound, at)))
+        assert largest[-1] == pytest.approx(float(exact.bound.cells_per_second(at.replace(**wide))), rel=1e-5)
         # in torch and float32, where the digits are there
         if F is not double:
             assert float(solver.cfl_number(at, DT)) == pytest.approx(
@@ -1178,8 +1178,8 @@ def test_courant_number(kernel_device, formulation, law):
         at = state.replace(F_elastic=F.to(kernel_device), velocity=torch.zeros_like(state.velocity))
         if k in (0, 17, 47):
             wide = {n: getattr(at, n).double() for n in ("F_elastic", "F_total", "velocity", "position")}
-            one = float(exact._cells_per_second(at.replace(**wide)))
-            assert float(fused.largest_speed(solver, at)) == pytest.approx(one, rel=1e-5)
+            one = float(exact.bound.cells_per_second(at.replace(**wide)))
+            assert float(measures.largest_speed(solver.bound, at)) == pytest.approx(one, rel=1e-5)
             # a network never stiffens by more than particles differ in density
             assert one > 1.2 * largest[0] or law == "springs" or formulation == "updated"
 
@@ -1406,8 +1406,6 @@ def test_another_material_needs_other_buffers(kernel_device):
 def test_settings_that_contradict():
     with pytest.raises(ValueError, match=r"transfer.*tritn"):
         MPMSolver(transfer="tritn")
-    with pytest.raises(ValueError, match="leave out `compile`"):
-        MPMSolver(transfer="triton", compile=True)
 
 
 @pytest.mark.skipif(fused is not None and fused.INTERPRETED, reason="the kernels run here without one")

@@ -168,7 +168,7 @@ def test_gradients_are_finite_for_an_inverted_element(setting, law, shape):
     if setting == "total":
         nodes = state.grid.node_positions(REST)
         moved = nodes @ stretch - nodes + state.node_displacement
-        state = solver._read_particles(state, moved, state.node_velocity)
+        state = solver.bound.read_particles(state, moved, state.node_velocity)
     else:
         F = stretch @ state.F_elastic
         state = state.replace(F_elastic=F, F_total=F)

@@ -60,7 +60,7 @@ def test_free_body_conserves_both_momenta(formulation):
 
     def momenta(s):
         if s.node_velocity is not None:
-            mass = solver._static["node_mass"]
+            mass = solver.bound.node_mass
             place = s.grid.node_positions(points.position) + s.node_displacement
             linear = (mass[:, None] * s.node_velocity).sum(0)
             return linear, torch.linalg.cross(place, mass[:, None] * s.node_velocity).sum(0)
@@ -396,7 +396,7 @@ def test_module_moves_its_material(dtype):
     solver.init_state(_block())
     solver.to(dtype)
     assert solver.points.position.dtype == dtype
-    assert solver._static["node_mass"].dtype == dtype
+    assert solver.bound.node_mass.dtype == dtype
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,8 @@
 """The three flags of the paper's benchmark as an independent cloth solver sees them.
 
 Parameters are those of the paper's table; values that it does not give are chosen here and marked. Nothing in this file
-needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` combines them. Motions
-and their files are in ``flag_motion.py``, textures and cameras in ``flag_pictures.py``, comparisons in
+needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` combines them.
+Motions and their files are in ``flag_motion.py``, textures and cameras in ``flag_pictures.py``, comparisons in
 ``flag_difference.py``.
 """
 

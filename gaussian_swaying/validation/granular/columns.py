@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.mpm.boundary import Boundary, Plane
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.solver import MPMSolver

@@ -1,0 +1,73 @@
+"""The body of a run: its material, bound to its laws and to the boundaries that act on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
+from gaussian_swaying.mpm.dispatch import LawDispatch
+from gaussian_swaying.mpm.state import MaterialPoints
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """The particles that a boundary holds, and the nodes that they hold in turn.
+
+    Attributes:
+        mass: Mass of those particles [kg], zero elsewhere, shape (..., P).
+        total: Mass of all of them [kg], shape (...).
+        release: Time at which each particle is let go [s], shape (..., P), or None if they are not let go one by one.
+        share: Their share of the mass of each node, shape (..., G), where that never changes, or None.
+        threshold: Share above which a node is held.
+    """
+
+    mass: Tensor
+    total: Tensor
+    release: Tensor | None = None
+    share: Tensor | None = None
+    threshold: float = 0.0
+
+    def mass_at(self, time: Tensor) -> Tensor:
+        """Mass of the particles that are held at a time [kg], zero elsewhere, shape (..., P)."""
+        return self.mass if self.release is None else torch.where(self.release > time + CLOCK, self.mass, 0.0)
+
+
+class Body:
+    """A material, its laws, and the boundaries that act on it.
+
+    Args:
+        points: The material at rest.
+        boundaries: Boundary conditions in metres, in order.
+
+    Attributes:
+        laws: The laws of the material, bound to its particles.
+        held: What each boundary holds; None for one that holds no particles.
+        needs_position: Whether a boundary looks at where nodes are.
+        needs_lattice: Whether a boundary looks at where lattice points are.
+    """
+
+    def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary]) -> None:
+        self.points, self.boundaries = points, tuple(boundaries)
+        self.laws = LawDispatch(points)
+        self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
+        self.needs_position = any(b.needs_position for b in self.boundaries)
+        self.needs_lattice = any(b.needs_lattice for b in self.boundaries)
+
+    def tensors(self) -> list[Tensor]:
+        """What a substep depends on besides its state and its forces, any of which may ask for a gradient."""
+        points = self.points
+        own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
+        return own + [t for boundary in self.boundaries for t in (*boundary.parameters(), *boundary.buffers())]
+
+
+def _held(points: MaterialPoints, boundary: Boundary) -> Held | None:
+    position = points.position.detach()
+    mask = boundary.particle_mask(position)
+    if mask is None:
+        return None
+    mass = torch.where(mask, points.mass, 0.0)
+    return Held(mass, mass.sum(-1), boundary.release_time(position))

@@ -1,0 +1,254 @@
+"""What a formulation of the substep is: the material of a run on a grid, and how it moves."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
+from gaussian_swaying.mpm.body import Body, Held
+from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.damping import damped_substep
+from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
+from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, wave_speed
+from gaussian_swaying.mpm.transfer import Stencil, scatter
+
+if TYPE_CHECKING:
+    from gaussian_swaying.mpm.triton.fused import Fused
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What a formulation is told of the solver; ``MPMSolver`` explains the fields."""
+
+    dx: float
+    gravity: tuple[float, ...]
+    damping: float
+    stiffness_damping: float
+    max_nodes: int
+    mls: bool
+    deterministic: bool
+
+
+class Formulation(ABC):
+    """A body bound to a grid: its first state, its substep in torch, and what it asks of substep and grid.
+
+    Everything that a substep needs besides state and forces is computed once, here. Nothing of it changes: another
+    material, device or precision makes another object.
+
+    Args:
+        body: The material with its laws and boundaries.
+        settings: Numbers and switches of the solver.
+
+    Attributes:
+        name: What it is called in a configuration.
+        neighbours_fixed: Whether particles keep the neighbours that they have at rest, as the stencils stay where they
+            are: such a body cannot tear, flow or leave its grid, and moving costs it no Courant number.
+        viscous_power: With which power of the largest squared stretch the viscous stress grows stiffer.
+        held: As that of the body, with what never changes on this grid.
+    """
+
+    name: ClassVar[str]
+    neighbours_fixed: ClassVar[bool]
+    viscous_power: ClassVar[int]
+
+    def __init__(self, body: Body, settings: Settings) -> None:
+        self.body, self.settings = body, settings
+        self.held: tuple[Held | None, ...] = body.held
+        device = body.points.position.device
+        with torch.inference_mode(False):  # an ordinary tensor, which a gradient may need
+            # float64 on the device: no copy in a step, full precision in a float64 run
+            self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=device)
+
+    @classmethod
+    def check_settings(cls, settings: Settings) -> None:
+        """Raise ValueError if the formulation does not know a setting."""
+        return
+
+    def twin(self) -> type[Fused] | None:
+        """The class that runs this substep in Triton kernels, or None; ImportError where there is no Triton."""
+        return None
+
+    # ---- state and grid
+
+    @abstractmethod
+    def first_grid(self, margin: int) -> GridSpec:
+        """The grid of the body at rest, with so many further cells to each side where it may move."""
+
+    def first_state(self, velocity: Tensor, margin: int) -> MPMState:
+        """The state at time zero.
+
+        Args:
+            velocity: Initial velocity [m/s], shape (..., P, 3).
+            margin: Cells around the object in the first grid, where it may move.
+        """
+        position = self.body.points.position
+        identity = torch.eye(3, dtype=position.dtype, device=position.device).repeat(*position.shape[:-1], 1, 1)
+        return MPMState(
+            position=position,
+            velocity=velocity,
+            affine=torch.zeros_like(identity),
+            F_elastic=identity,
+            F_total=identity,
+            lost=torch.zeros(position.shape[:-1], dtype=torch.bool, device=position.device),
+            time=torch.zeros((), dtype=torch.float64, device=position.device),
+            grid=self.first_grid(margin),
+            internal=self.body.laws.initial_internal(),
+            work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
+        )
+
+    @abstractmethod
+    def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
+        """The state with a grid for the next ``horizon`` seconds; see ``MPMSolver.fit_grid``."""
+
+    def bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
+        """The smallest grid that holds the stencils of all particles.
+
+        Args:
+            position: Particle position [m], shape (..., P, 3).
+            margin: Further cells on each side.
+            speed: Largest speed [m/s], for the message if that is too much.
+
+        Raises:
+            FloatingPointError: If a position is NaN or infinite.
+            ValueError: If the grid would be larger than ``max_nodes``, or too far away.
+        """
+        dx, most = self.settings.dx, self.settings.max_nodes
+        flat = position.detach().reshape(-1, 3)
+        low, high = flat.amin(0), flat.amax(0)
+        if not bool(torch.isfinite(low).all() & torch.isfinite(high).all()):
+            raise not_finite("position", flat)
+        grid = bounding_grid(low, high, dx, margin)
+        if grid.node_count > most:
+            size = [round(v, 3) for v in (high - low).tolist()]
+            what = f"The particles span {size} m"
+            if 2 * margin * dx > max(size):
+                what = f"The particles may fly {margin * dx:.3g} m to any side within a frame, at {speed:.3g} m/s"
+            raise ValueError(
+                f"{what}, which takes {grid.node_count:,} grid nodes at dx = {dx:g} m, more "
+                f"than `max_nodes` = {most:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
+            )
+        if max(map(abs, grid.offset)) >= 2**31:
+            raise ValueError(
+                f"The particles lie up to {float(flat.abs().amax()):.3g} m from the origin, more than 2^31 cells of dx "
+                f"= {dx:g} m: pin or enclose them, or shift the scene to the origin."
+            )
+        return grid
+
+    # ---- the substep
+
+    @abstractmethod
+    def step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
+        """One substep of ``dt`` [s] in torch.
+
+        Args:
+            state: The state now.
+            dt: Substep [s].
+            force: Force on each particle [N], shape (..., P, 3), or None.
+            drag: Its resistance [kg/s], shape (..., P), or None; see ``MPMSolver.step``.
+
+        Returns:
+            The state ``dt`` later, without the work of the force.
+        """
+
+    def decay(self, velocity: Tensor, time: float) -> Tensor:
+        """A velocity after the damping of so many seconds."""
+        return velocity * math.exp(-self.settings.damping * time) if self.settings.damping > 0 else velocity
+
+    def constrain(
+        self,
+        velocity: Tensor,
+        share_of: Callable[[Held], Tensor],
+        position: Tensor | None,
+        lattice: Tensor | None,
+        time: Tensor,
+        dt: float | Tensor,
+    ) -> Tensor:
+        """Apply the boundary conditions to node velocities, in order.
+
+        Args:
+            velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
+            share_of: The share of the nodal mass that held particles have now, shape (..., G).
+            position: Where the nodes are [m], shape (..., G, 3), if a boundary asks for it.
+            lattice: Where the lattice points are [m], shape (..., G, 3), if a boundary asks for it.
+            time: Time at the start of the substep [s], scalar float64 tensor.
+            dt: Substep [s], a number or a scalar float64 tensor.
+
+        Returns:
+            Shape (..., G, 3).
+        """
+        pairs = zip(self.body.boundaries, self.held, strict=True)
+        # what pushes comes before what holds, in whatever order they were given
+        for boundary, held in sorted(pairs, key=lambda pair: not isinstance(pair[0], Impulse)):
+            if held is None:
+                nodes = Nodes(time, dt, position, lattice)
+            else:
+                share = share_of(held) if held.share is None else held.share
+                nodes = Nodes(time, dt, position, lattice, share, held.threshold, held.total)
+            velocity = boundary(velocity, nodes)
+        return velocity
+
+    # ---- what a state has
+
+    @abstractmethod
+    def kinetic(self, state: MPMState) -> Tensor:
+        """Kinetic energy [J], shape (...) over the batch."""
+
+    @abstractmethod
+    def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        """Linear [kg m/s] and angular momentum about the origin [kg m²/s], shape (..., 3) each."""
+
+    # ---- how long a substep may be
+
+    def stable_substep(self, state: MPMState | None) -> float:
+        """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
+        body, dx, spatial = self.body, self.settings.dx, not self.neighbours_fixed
+        F, internal = (None, None) if state is None else (state.F_elastic.detach(), state.internal)
+        limit = stable_limit(body.points, dx, F, internal, spatial=spatial, laws=body.laws)
+        return damped_substep(float(limit.detach().amin()), self.viscous_time(state))
+
+    def cells_per_second(self, state: MPMState) -> Tensor:
+        """How many cells the fastest wave crosses in a second, a scalar tensor."""
+        body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
+        speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
+        return cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach()
+
+    def viscous_time(self, state: MPMState | None) -> float:
+        """The stiffness damping [s], grown by as much as the viscous stress of a stretched material is stiffer."""
+        time = self.settings.stiffness_damping
+        if time == 0 or state is None:
+            return time
+        F = state.F_elastic.detach()
+        squared = float(symmetric_eigenvalues(F.mT @ F)[..., 0].amax().clamp(min=1.0))
+        return time * squared**self.viscous_power
+
+
+def held_share(held: Held, stencil: Stencil, inverse_mass: Tensor, time: Tensor) -> Tensor:
+    """Share of the mass of each node that held particles have at a time, shape (..., G).
+
+    Args:
+        held: The particles.
+        stencil: Support of all particles.
+        inverse_mass: One over the mass of each node [1/kg], 0 without any, shape (..., G).
+        time: When [s], scalar float64 tensor.
+    """
+    return scatter(stencil, held.mass_at(time)[..., None, None])[..., 0] * inverse_mass
+
+
+def safe_inverse(mass: Tensor) -> Tensor:
+    """1 / mass where there is any, else 0; its derivative, 1 / mass², stays finite too."""
+    floor = torch.finfo(mass.dtype).tiny ** 0.5
+    return torch.where(mass > floor, 1 / mass.clamp(min=floor), 0.0)
+
+
+def not_finite(name: str, values: Tensor) -> FloatingPointError:
+    """The error that names the first particle of which a value (P, ·) is NaN or infinite."""
+    first = int((~torch.isfinite(values)).any(-1).int().argmax())
+    return FloatingPointError(f"The {name} of particle {first} is NaN or infinite.")

@@ -1,0 +1,179 @@
+"""The ``total`` formulation: stencils at the rest positions, nodal displacement and velocity as the state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.body import Body, Held
+from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
+from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.timestep import kick_time
+from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
+
+if TYPE_CHECKING:
+    from gaussian_swaying.mpm.triton.fused import Fused
+
+
+class Total(Formulation):
+    """Total Lagrangian MPM (de Vaucorbeil, Nguyen & Hutchinson 2020): everything but the nodal fields is constant.
+
+    Args:
+        body: The material with its laws and boundaries.
+        settings: Numbers and switches of the solver.
+
+    Attributes:
+        grid: The nodes.
+        stencil: Support of the particles at rest.
+        node_mass: Mass of each node [kg], shape (..., G).
+        node_inverse_mass: One over it [1/kg], 0 without any, shape (..., G).
+        node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary asks where
+            nodes are.
+
+    Raises:
+        ValueError: If a law flows, a pin holds nothing or the grid is too large.
+    """
+
+    name = "total"
+    neighbours_fixed = True
+    viscous_power = 1
+
+    def __init__(self, body: Body, settings: Settings) -> None:
+        super().__init__(body, settings)
+        points, position = body.points, body.points.position
+        if body.laws.plastic:
+            raise ValueError(
+                f"The law {body.laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
+                "`solver.formulation` to updated, or choose an elastic law."
+            )
+        self.grid = self.bounding_grid(position, margin=0)
+        snap = torch.finfo(position.dtype).eps ** 0.5
+        self.stencil = bspline_stencil(
+            position, self.grid, False, snap, deterministic=settings.deterministic, fixed=True
+        )
+        self.node_mass = scatter(self.stencil, points.mass[..., None, None])[..., 0]
+        self.node_inverse_mass = safe_inverse(self.node_mass)
+        self.node_rest: Tensor | None = None
+        if body.needs_position:
+            first_moment = scatter(self.stencil, (points.mass[..., None] * position)[..., None, :])
+            self.node_rest = first_moment * self.node_inverse_mass[..., None]
+        self.held = tuple(None if held is None else self._on_nodes(k, held) for k, held in enumerate(body.held))
+
+    @classmethod
+    def check_settings(cls, settings: Settings) -> None:
+        """MLS-MPM is another substep."""
+        if settings.mls:
+            raise ValueError(
+                "`mls` is a variant of the updated formulation: set `formulation` to updated, or `mls` to false."
+            )
+
+    def _on_nodes(self, k: int, held: Held) -> Held:
+        """What the ``k``-th boundary holds, with its share of the nodes, which stay where they are."""
+        boundary = self.body.boundaries[k]
+        share = scatter(self.stencil, held.mass[..., None, None])[..., 0] * self.node_inverse_mass
+        threshold = boundary.held_share
+        if threshold is not None and not bool((share > threshold).any()):
+            count = int((held.mass > 0).sum())
+            raise ValueError(
+                f"The pin {k} holds {count} particles but no grid node: none of them has more than "
+                f"{threshold:g} of the mass of a node; enlarge `region` of the {type(boundary).__name__} or lower "
+                "its `held_share`."
+            )
+        return replace(held, share=share if held.release is None else None, threshold=threshold or 0.0)
+
+    def twin(self) -> type[Fused]:
+        """Two kernels: particles and nodes."""
+        from gaussian_swaying.mpm.triton.fused_total import FusedTotal
+
+        return FusedTotal
+
+    def first_grid(self, margin: int) -> GridSpec:
+        """That of the stencils."""
+        return self.grid
+
+    def first_state(self, velocity: Tensor, margin: int) -> MPMState:
+        """The state at time zero, its velocity as the nodes have it."""
+        state = super().first_state(velocity, margin)
+        momentum = scatter(self.stencil, (self.body.points.mass[..., None] * velocity)[..., None, :])
+        node_velocity = momentum * self.node_inverse_mass[..., None]
+        return self.read_particles(state, torch.zeros_like(node_velocity), node_velocity)
+
+    def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
+        """The state as it is: the grid rests."""
+        return state
+
+    def step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
+        """One substep: forces to the nodes, their new velocity and displacement, and the particles read from them."""
+        displacement = state.node_displacement
+        assert displacement is not None
+        assert state.node_velocity is not None
+        points, laws, time = self.body.points, self.body.laws, self.settings.stiffness_damping
+        F = state.F_elastic
+        stress = laws.pk1(F, None)
+        if time > 0:
+            stress = stress + kelvin_voigt_pk1(F, state.affine, laws.mu, laws.lam, time)
+        stress = stress * points.volume[..., None, None]
+        value = torch.zeros_like(state.position) if force is None else force
+        node_force = scatter(self.stencil, torch.cat([value[..., None, :], -stress.mT], dim=-2))
+        inverse_mass = self.node_inverse_mass[..., None]
+        kick, yielding = kick_time(state, dt), None
+        if drag is not None:
+            resistance = scatter(self.stencil, drag[..., None, None])
+            yielding = 1 / (1 + kick * resistance * inverse_mass)
+        velocity = self._accelerate(state.node_velocity, node_force * inverse_mass, kick, yielding)
+        velocity = torch.where(inverse_mass > 0, velocity, 0.0)
+        position = lattice = None
+        if self.node_rest is not None:
+            shift = (state.position - points.position) * points.mass[..., None]
+            position = self.node_rest + scatter(self.stencil, shift[..., None, :]) * inverse_mass
+        if self.body.needs_lattice:
+            lattice = state.grid.node_positions(velocity) + displacement
+        velocity = self.constrain(velocity, self.share_at(state.time), position, lattice, state.time, dt)
+        state = state.replace(time=state.time + dt, substep=dt)
+        return self.read_particles(state, displacement + dt * velocity, velocity)
+
+    def share_at(self, time: Tensor) -> partial[Tensor]:
+        """What gives the share of the nodal mass that held particles have at a time, as ``constrain`` asks for it."""
+        return partial(held_share, stencil=self.stencil, inverse_mass=self.node_inverse_mass, time=time)
+
+    def _accelerate(self, velocity: Tensor, acceleration: Tensor, kick: float, yielding: Tensor | None) -> Tensor:
+        """Apply the given acceleration, gravity and damping to node velocities.
+
+        ``yielding`` is mass over mass plus implicit drag times ``kick``, shape (..., G, 1).
+        """
+        if any(self.settings.gravity):
+            acceleration = acceleration + self.gravity.to(velocity)
+        velocity = velocity + kick * (acceleration if yielding is None else yielding * acceleration)
+        return self.decay(velocity, kick)
+
+    def read_particles(self, state: MPMState, displacement: Tensor, velocity: Tensor) -> MPMState:
+        """Particle fields, interpolated from nodal displacement [m] and velocity [m/s], shape (..., G, 3)."""
+        rows = gather(torch.cat([displacement, velocity], dim=-1), self.stencil)
+        F = rows[..., 1:4, :3].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
+        return state.replace(
+            position=self.body.points.position + rows[..., 0, :3],
+            velocity=rows[..., 0, 3:],
+            affine=rows[..., 1:4, 3:].mT,
+            F_elastic=F,
+            F_total=F,
+            node_displacement=displacement,
+            node_velocity=velocity,
+        )
+
+    def kinetic(self, state: MPMState) -> Tensor:
+        """Of the nodes."""
+        assert state.node_velocity is not None
+        return 0.5 * (self.node_mass * state.node_velocity.square().sum(-1)).sum(-1)
+
+    def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        """Of the nodes."""
+        assert state.node_velocity is not None
+        assert state.node_displacement is not None
+        momentum = self.node_mass[..., None] * state.node_velocity
+        place = state.grid.node_positions(momentum) + state.node_displacement
+        return momentum.sum(-2), torch.linalg.cross(place, momentum, dim=-1).sum(-2)

@@ -1,0 +1,145 @@
+"""The ``updated`` formulation: stencils at the current positions, momentum on the particles."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.geometry.linalg import matmul3
+from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.formulations.formulation import Formulation, held_share, not_finite, safe_inverse
+from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.timestep import kick_time
+from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, scatter, scatter_momentum
+
+if TYPE_CHECKING:
+    from gaussian_swaying.mpm.triton.fused import Fused
+
+
+class Updated(Formulation):
+    """The paper's: APIC (Jiang et al. 2015), and MLS-MPM (Hu et al. 2018) as a variant, on a grid that follows.
+
+    Args:
+        body: The material with its laws and boundaries.
+        settings: Numbers and switches of the solver.
+    """
+
+    name = "updated"
+    neighbours_fixed = False
+    viscous_power = 2
+
+    def twin(self) -> type[Fused]:
+        """One kernel that ends a substep and starts the next, and one for the nodes."""
+        from gaussian_swaying.mpm.triton.fused_updated import FusedUpdated
+
+        return FusedUpdated
+
+    def first_grid(self, margin: int) -> GridSpec:
+        """Around the body at rest; ValueError where rounding would swallow the way of a substep."""
+        position, dx = self.body.points.position, self.settings.dx
+        farthest = float(position.detach().abs().amax()) if position.numel() else 0.0
+        limit = 1e-3 * dx / torch.finfo(position.dtype).eps
+        if farthest > limit:
+            raise ValueError(
+                f"Expected `position` within {limit:.3g} m of the origin, but got {farthest:.3g} m, where "
+                f"{position.dtype} rounds by more than a thousandth of a cell: shift the scene to the origin (SimFrame "
+                "does so), or use float64."
+            )
+        return self.bounding_grid(position, margin)
+
+    def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
+        """The state with a grid that serves for ``horizon`` seconds, at twice the present speeds and in gravity."""
+        dx, gravity = self.settings.dx, self.settings.gravity
+        speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
+        if not math.isfinite(speed):
+            raise not_finite("speed", state.velocity.detach().square().sum(-1).reshape(-1, 1))
+        reach = (2 * speed + 0.5 * sum(g * g for g in gravity) ** 0.5 * horizon) * horizon
+        cells = 3 + margin + min(int(reach / dx), 1000)
+        grid = self.bounding_grid(state.position, cells, speed)
+        if not state.position.is_cuda:
+            return state.replace(grid=grid)
+        # CUDA graphs are recorded for one grid, so it stays as long as it serves
+        roomy = grid.with_room(state.grid)
+        serves = state.grid.holds(grid) and state.grid.node_count <= 3 * roomy.node_count
+        if serves and not margin:  # a margin is asked for where the grid did not serve
+            return state
+        return state.replace(grid=roomy if roomy.node_count <= self.settings.max_nodes else grid)
+
+    def step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
+        """One substep: momenta to the nodes, their new velocity, and back to the particles, which move with it."""
+        body, settings = self.body, self.settings
+        points, laws = body.points, body.laws
+        stencil = bspline_stencil(
+            state.position, state.grid, gradients=not settings.mls, deterministic=settings.deterministic
+        )
+        F = state.F_elastic
+        stress = laws.kirchhoff(F, state.internal)
+        if settings.stiffness_damping > 0:
+            rate = matmul3(state.affine, F)
+            viscous = kelvin_voigt_pk1(F, rate, laws.mu, laws.lam, settings.stiffness_damping)
+            stress = stress + matmul3(viscous, F.mT)
+        kick = kick_time(state, dt)
+        impulse = None if force is None else kick * force
+        if any(settings.gravity):  # here, and not on the nodes, of which most may be empty
+            weight = kick * points.mass[..., None] * self.gravity.to(F)
+            impulse = weight if impulse is None else impulse + weight
+        if drag is not None:
+            held = (kick * drag)[..., None] * state.velocity
+            impulse = held if impulse is None else impulse + held
+        nodes = scatter_momentum(
+            points.mass,
+            state.velocity,
+            state.affine,
+            impulse,
+            kick * points.volume[..., None, None] * stress,
+            stencil,
+            4.0 / settings.dx**2 if settings.mls else None,
+        )
+        inverse_mass = safe_inverse(nodes[..., 3])[..., None]
+        velocity = nodes[..., :3] * inverse_mass
+        if drag is not None:
+            velocity = velocity * (1 / (1 + kick * scatter(stencil, drag[..., None, None]) * inverse_mass))
+        velocity = self.decay(velocity, kick)
+        position = None
+        if body.needs_position or body.needs_lattice:
+            position = state.grid.node_positions(velocity).expand_as(velocity)
+        share = partial(held_share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
+        velocity = self.constrain(velocity, share, position, position, state.time, dt)
+        new_velocity, affine, gradient = g2p(velocity, stencil, settings.dx)
+        identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        update = identity + dt * gradient
+        F, internal = matmul3(update, F), state.internal
+        F_total = F
+        if laws.plastic:
+            F_total = matmul3(update, state.F_total)
+            F, internal = laws.return_map(F, internal, dt)
+        return state.replace(
+            position=state.position + dt * new_velocity,
+            velocity=new_velocity,
+            affine=affine,
+            F_elastic=F,
+            F_total=F_total,
+            lost=state.lost | ~stencil.inside,
+            time=state.time + dt,
+            internal=internal,
+            substep=dt,
+        )
+
+    def kinetic(self, state: MPMState) -> Tensor:
+        """Of the particles: the affine part carries D = dx²/4 of each (lumped APIC energy; Jiang et al. 2015)."""
+        spread = 0.25 * self.settings.dx**2 * state.affine.square().sum((-1, -2))
+        return 0.5 * (self.body.points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
+
+    def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        """Of the particles."""
+        mass = self.body.points.mass
+        momentum = mass[..., None] * state.velocity
+        # what the affine velocity adds: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)
+        spin = state.affine * (mass * self.settings.dx**2 / 4)[..., None, None]
+        own = torch.stack([spin[..., i, j] - spin[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
+        angular = torch.linalg.cross(state.position, momentum, dim=-1) + own
+        return momentum.sum(-2), angular.sum(-2)

@@ -1,0 +1,294 @@
+"""Runs substeps with the Triton kernels: buffers, forces, CUDA graphs.
+
+Used by ``MPMSolver`` in place of the torch substep of a formulation where no gradient is asked for; the torch substep
+is the definition. Each formulation has a subclass of :class:`Fused`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._graphs import Repeater, fingerprint
+from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, Force, ForceTwin, added, divide, split
+from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.laws.triton.body import BodyLaws
+from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.timestep import kick_time
+from gaussian_swaying.mpm.triton.shared import SCHEDULE
+
+MAX_STEPS = MOST_STEPS
+"""Substeps whose schedule the buffers hold; longer rollouts are run in parts."""
+
+MAX_INDEX = 2**31
+"""Entries that the kernels, which count with 32 bits, can reach in a buffer."""
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
+
+class Fused(ABC):
+    """Substeps of a formulation bound to its material.
+
+    Args:
+        bound: The formulation, which does not know this; see :meth:`unsupported`.
+
+    Attributes:
+        fixed_order: Whether sums take the same order in every run.
+    """
+
+    fixed_order: ClassVar[bool]
+
+    def __init__(self, bound: Formulation) -> None:
+        body, points = bound.body, bound.body.points
+        self.body, self.settings = body, bound.settings
+        self.device, self._made_from = points.position.device, _made_from(body)
+        self.particles = points.count
+        self.count = points.mass.numel()
+        self.scenes = self.count // max(self.particles, 1)
+        self.laws = BodyLaws(points.laws)
+        self.law_table = torch.tensor(self.laws.table, device=self.device)
+        self.law = torch.zeros(self.count, dtype=torch.int32, device=self.device)
+        if points.law_index is not None:
+            self.law = points.law_index.reshape(-1).int()
+        self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self.schedule = torch.zeros(MAX_STEPS + 2, SCHEDULE, device=self.device)
+        self.vectors = torch.zeros(MAX_STEPS, self.scenes, 3, device=self.device)
+        self.numbers = torch.zeros(TWIN_NUMBERS, device=self.device)
+        self.load = torch.zeros(8, self.count, device=self.device)
+        self.force_in = torch.zeros(0, 4, device=self.device)
+        self.wave = shared(points.laws, "wave")
+        self.watches = self.wave is not None
+        """Whether rollouts can look at the speed of waves."""
+        self.speed = torch.zeros(1, device=self.device)
+        self.time = torch.zeros((), dtype=torch.float64, device=self.device)
+        self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
+        self.gravity = [float(g) for g in bound.settings.gravity]
+        self._values_of: list[tuple[Tensor, int | None]] = []
+        self.asked: tuple[Force, ...] = ()
+        """The forces of the present rollout that are asked in torch, in every substep."""
+        self._resist: tuple[object, bool] = ((), False)
+        self._seen: dict[str, Tensor] = {}
+        self.repeater = Repeater(self.device)
+
+    @classmethod
+    def unsupported(cls, bound: Formulation, interpret: bool) -> str | None:
+        """Why these kernels cannot run a body, or None if they can.
+
+        Args:
+            bound: The formulation, bound to the body.
+            interpret: Whether Triton's interpreter, if it is on, may run them on a CPU.
+        """
+        points = bound.body.points
+        if not (points.position.is_cuda or (INTERPRETED and interpret)):
+            return "it needs a CUDA device"
+        if points.position.dtype != torch.float32:
+            return f"it computes in float32, and the material is {points.position.dtype}".replace("torch.", "")
+        if bound.settings.deterministic and not cls.fixed_order:
+            return f"in the {bound.name} formulation its sums have no fixed order, as `deterministic` asks for"
+        for law in points.laws:
+            if twin_of(law) is None:
+                return f"the law {type(law).__name__} has no fused form"
+        return None
+
+    def holds(self) -> bool:
+        """Whether buffers and graphs still serve: nothing that they were made from was replaced."""
+        return self._made_from == _made_from(self.body)
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        """Nothing to copy or pickle: a solver makes its buffers and graphs anew."""
+        return _nothing, ()
+
+    def rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        forces: Sequence[Force] = (),
+        force: Tensor | None = None,
+        drag: Tensor | None = None,
+        looks: Sequence[int] = (),
+        watch: Callable[[int], None] | None = None,
+    ) -> tuple[MPMState, Tensor]:
+        """Advance by ``steps`` substeps of ``dt`` [s], with some forces or one that stays (see ``MPMSolver.step``).
+
+        Args:
+            state: The state now.
+            dt: Substep [s].
+            steps: Number of substeps.
+            forces: Forces of which all but the first with a twin are recordable.
+            force: Force [N], shape (..., P, 3), or None; only without ``forces``.
+            drag: Its resistance [kg/s], shape (..., P), or None.
+            looks: After which substeps to look at the speed of waves, if ``watches``.
+            watch: Told how many substeps have been handed to the GPU, each time the buffers are full.
+
+        Returns:
+            The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
+        """
+        with _at_home(self.speed):
+            self.speed.zero_()
+            fused, self.asked = divide(forces)
+            twin = None if fused is None else fused.twin()
+            if twin is not None:
+                self._take_twin(twin)
+            options: dict[str, Any] = {
+                "LAWS": self.laws,
+                "MULTI": len(self.law_table) > 1,
+                "VISCOUS": self.settings.stiffness_damping > 0,
+                "TWIN": None if twin is None else twin.function,
+                "OPTIONS": None if twin is None else twin.options,
+                "FORCE": len(self.asked) > 0 or force is not None or drag is not None,
+                "IMPLICIT": drag is not None or (twin is not None and twin.implicit) or self._resists(state),
+            }
+            if options["FORCE"]:
+                if len(self.force_in) < self.count:  # the first time that it is needed
+                    self.force_in = torch.zeros(self.count, 4, device=self.device)
+                self.force_in.zero_()
+                self._fill(force, drag)
+            for first in range(0, steps, MAX_STEPS):
+                part = min(steps - first, MAX_STEPS)
+                marks = [look - first for look in looks if first < look <= first + part]
+                before = state.work
+                state = self._advance(state, dt, part, twin, options, marks)
+                if force is None and not forces:  # a drag alone does no work that counts
+                    state = state.replace(work=before)
+                if watch is not None:
+                    watch(first + part)
+            return state, self.speed[0] / self.settings.dx
+
+    def _advance(
+        self, state: MPMState, dt: float, steps: int, twin: ForceTwin | None, options: dict[str, Any], looks: list[int]
+    ) -> MPMState:
+        """As many substeps as the buffers hold."""
+        kick = kick_time(state, dt)
+        decay = [math.exp(-self.settings.damping * t) for t in (kick, dt)]
+        rows = [[0.0, dt, 1.0, 0.0], [kick, dt, decay[0], 0.0], *[[dt, dt, decay[1], 0.0]] * steps]
+        self.schedule[: steps + 2].copy_(_upload(rows, self.device), non_blocking=True)
+        self.first_step.zero_()
+        self.time.copy_(state.time)
+        self.dt.fill_(dt)
+        if twin is not None:
+            vectors = twin.vectors(self.time, self.dt, steps)
+            self.vectors[:steps].copy_(vectors.reshape(steps, -1, 3).expand(-1, self.scenes, -1))
+        loaded = twin is not None or options["FORCE"]
+        if loaded:
+            self.load.zero_()
+        changes = self._run(state, steps, options, looks)
+        if loaded:
+            changes["work"] = state.work + self._work().reshape(self.body.points.mass.shape[:-1])
+        return state.replace(time=state.time + steps * dt, substep=dt, **changes)
+
+    def _take_twin(self, twin: ForceTwin) -> None:
+        """Take the numbers of a twin, and its values of the particles where they are other ones."""
+        self.numbers[: len(twin.numbers)].copy_(twin.numbers)
+        sources = [(t, None if t.is_inference() else t._version) for t in twin.sources]
+        known = zip(self._values_of, sources, strict=False)
+        if not self._values_of or any(a is not b or v is None or v != w for (a, v), (b, w) in known):
+            self._values_of = sources
+            values = twin.values()
+            self._take_values(values.expand(*self.body.points.mass.shape, values.shape[-1]).flatten(0, -2))
+
+    # ---- forces in torch
+
+    def _fill(self, force: Tensor | None, drag: Tensor | None) -> None:
+        """Put a force and its resistance into the buffer that the kernels read."""
+        points = self.body.points
+        if force is not None:
+            self.force_in[:, :3].copy_(force.expand_as(points.position).reshape(-1, 3))
+        if drag is not None:
+            self.force_in[:, 3].copy_(drag.expand_as(points.mass).reshape(-1))
+
+    def _ask(self, state: MPMState) -> tuple[Tensor | None, Tensor | None]:
+        """The sum of the forces in torch and that of their resistances."""
+        return added([split(force(state), force, state) for force in self.asked])
+
+    def _asked_key(self) -> tuple[object, ...]:
+        """What recorded forces rest on; the forces themselves are in it, so that nothing else takes their place."""
+        return (self.asked, fingerprint(self.asked)) if self.asked else ()
+
+    def _resists(self, state: MPMState) -> bool:
+        """Whether a force in torch gives a resistance, from asking each once."""
+        key = self._asked_key()
+        if key != self._resist[0]:
+            self._resist = key, self._ask(state)[1] is not None
+        return self._resist[1]
+
+    def _push(self) -> None:
+        """Let the forces in torch look at the particles as they are in the buffers now, and fill theirs."""
+        self._fill(*self._ask(self._look_at()))
+
+    def _room(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        """A buffer for a field of the particles, which stays where it is: graphs write to it and read from it."""
+        if name not in self._seen:
+            self._seen[name] = torch.zeros(shape, dtype=dtype, device=self.device)
+        return self._seen[name]
+
+    @abstractmethod
+    def _look_at(self) -> MPMState:
+        """The state of the particles in the buffers."""
+
+    @abstractmethod
+    def _take_values(self, values: Tensor) -> None:
+        """Take the values of a twin, shape (N, n)."""
+
+    @abstractmethod
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
+        """Take the state into the buffers, run the substeps, and give the fields of the state after them."""
+
+    @abstractmethod
+    def _work(self) -> Tensor:
+        """Work of the load in each scene [J], shape (scenes,), float64."""
+
+    def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
+        """Run ``body(offset)``, one substep, for each offset, from graphs where there are any.
+
+        The first time a key is seen the substeps run as they are, which compiles what is not yet compiled; the second
+        time they are recorded.
+        """
+
+        def several(count: int) -> None:
+            for offset in range(count):
+                body(offset)
+            self.first_step.add_(count)
+
+        recordable = all(boundary.recordable for boundary in self.body.boundaries)
+        self.repeater.run(steps, (key, self._asked_key()), several, recordable)
+
+
+@contextmanager
+def _at_home(buffer: Tensor) -> Iterator[None]:
+    """The device of a buffer, where Triton is to launch, and ordinary tensors, which may be written in any mode."""
+    with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
+        yield
+
+
+def check_indices(entries: int) -> None:
+    """Raise ValueError if a buffer has more entries than the kernels can reach."""
+    if entries > MAX_INDEX:
+        raise ValueError(
+            f"The Triton kernels reach {MAX_INDEX:,} entries of a buffer, and this body or grid takes {entries:,}: set "
+            "`solver.transfer` to torch."
+        )
+
+
+def _nothing() -> None:
+    """What stands for a Fused in a copy."""
+
+
+def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
+    """A small table on the device, without making the host wait."""
+    table = torch.tensor(rows, dtype=torch.float32)
+    return table.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else table
+
+
+def _made_from(body: Body) -> tuple[object, ...]:
+    """What the buffers and graphs of a body rest on besides its points: they hold as long as it is the same."""
+    return fingerprint([*body.boundaries, *body.points.laws])

@@ -1,0 +1,225 @@
+"""Runs the ``total`` substep with its kernels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.forces import TWIN_VALUES
+from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.triton import total_kernels as kernels
+from gaussian_swaying.mpm.triton.fused import Fused, check_indices
+
+# time of a particle with so many lanes to a cell, relative to 32, on an H200
+_LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
+
+# pieces into which `total` cuts particles at least, where its cells are too few: about the warps that an H200 holds
+_PROGRAMS = 2048
+
+# more warps at once are worth the spilled registers
+_REGISTERS = {64: {"maxnreg": 128}}
+
+
+class FusedTotal(Fused):
+    """Substeps of the ``total`` formulation; everything but the nodal fields is constant.
+
+    Args:
+        bound: The formulation, bound to its material.
+    """
+
+    fixed_order = True
+
+    def __init__(self, bound: Formulation) -> None:
+        super().__init__(bound)
+        assert isinstance(bound, Total)
+        body, points, stencil, grid = bound.body, bound.body.points, bound.stencil, bound.grid
+        self.bound, self.grid = bound, grid
+        first = stencil.first
+        order = torch.argsort(first, stable=True)
+        cells, sizes = torch.unique_consecutive(first[order], return_counts=True)
+        self.order, self.cells = order.int(), len(cells)
+        ends = sizes.cumsum(0)
+        self.cell_start = torch.cat([ends.new_zeros(1), ends]).int()
+        self.cell_node = cells.int()
+        self.cell_scene = (cells // grid.node_count).int()
+        self.particle_cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), sizes).int()
+        # the place in the cell, from the slope of the first weight, (f - 1.5) / dx
+        self.fraction = (1.5 + stencil.factors[1, :, 0] * grid.dx)[:, order].contiguous()
+        rows = [points.volume, body.laws.mu, body.laws.lam, points.mass]
+        self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
+        self.law = self.law[order].contiguous()
+        self.values = torch.zeros(TWIN_VALUES, self.count, device=self.device)
+        self.rest = points.position.contiguous()
+        inverse = bound.node_inverse_mass.reshape(-1)
+        active = (inverse > 0).nonzero()[:, 0]
+        self.active, self.inverse_mass = active.int(), inverse[active].contiguous()
+        place = torch.full((len(inverse),), self.cells, dtype=torch.int32, device=self.device)
+        place[cells] = torch.arange(self.cells, dtype=torch.int32, device=self.device)
+        _, ny, nz = grid.resolution
+        shifts = [(i * ny + j) * nz + k for i in range(3) for j in range(3) for k in range(3)]
+        below = [active - shift for shift in shifts]
+        self.source = torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below])
+        self.fields = torch.zeros(len(inverse), 8, device=self.device)
+        self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
+        self.lanes = _lanes(sizes)
+        self._cut(sizes)
+        self.plain = all(type(b) is PinnedRegion and b.start <= 0 and b.end == math.inf for b in body.boundaries)
+        self.position = body.needs_position
+        self.lattice = grid.node_positions(self.rest) if body.needs_lattice else None
+        held = torch.zeros(len(inverse), dtype=torch.bool, device=self.device)
+        if self.plain:
+            for pin in bound.held:
+                assert pin is not None
+                assert pin.share is not None
+                held |= (pin.share > pin.threshold).reshape(-1)
+        self.held = held[active].to(torch.int8)
+        self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
+        self._partial: dict[tuple[int, int], Tensor] = {}
+        width = 8 if self.position else 4
+        check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
+
+    def _cut(self, sizes: Tensor) -> None:
+        """Cut crowded cells into pieces: a body of few cells would else have too few programs to fill a GPU."""
+        most = self.lanes * max(1, -(-self.count // (self.lanes * _PROGRAMS)))
+        counts = -(-sizes // most)
+        first = counts.cumsum(0) - counts
+        cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), counts)
+        self.pieces = len(cell)
+        within = torch.arange(self.pieces, device=self.device) - first[cell]
+        self.piece_start = torch.cat([self.cell_start[cell] + most * within, self.cell_start[-1:]]).int()
+        self.piece_node, self.piece_scene = self.cell_node[cell].contiguous(), self.cell_scene[cell].contiguous()
+        self.first_piece = torch.cat([first, first.new_tensor([self.pieces])]).int()
+
+    def _take_values(self, values: Tensor) -> None:
+        self.values[: values.shape[1]].copy_(values[self.order.long()].T)
+
+    def _sums(self, rows: int, width: int) -> Tensor:
+        """Buffer of the sums of each cell or piece of one, with a row of zeros behind the last."""
+        if (rows, width) not in self._partial:
+            self._partial[rows, width] = torch.zeros(27, rows + 1, width, device=self.device)
+        return self._partial[rows, width]
+
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
+        assert state.node_displacement is not None
+        assert state.node_velocity is not None
+        self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
+        self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
+        done = 0
+        for mark in sorted({*looks, steps}):
+            self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
+            done = mark
+            if mark in looks:
+                self._look()
+        return self._read(state, steps, options)
+
+    def _look(self) -> None:
+        _, ny, nz = self.grid.resolution
+        block = 128
+        kernels.total_look[(-(-self.count // block),)](
+            self.fraction, self.material, self.count, self.particle_cell, self.cell_node, self.fields, self.speed,
+            ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+
+    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+        if self.asked:
+            self._push()
+        width = 8 if self.position else 4
+        partial = self._sums(self.pieces, width)
+        _, ny, nz = self.grid.resolution
+        per_program = max(1, 32 // self.lanes)
+        kernels.total_particles[(-(-self.pieces // per_program),)](
+            self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
+            self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
+            self.fields, partial,
+            self.schedule, self.vectors, self.scenes, self.numbers, self.first_step, offset,
+            ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
+            **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
+            **_REGISTERS.get(self.lanes, {}),
+        )  # fmt: skip
+        if self.pieces > self.cells:
+            pieces, partial = partial, self._sums(self.cells, width)
+            kernels.total_pieces[(-(-self.cells // 8), 27)](
+                pieces, partial, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
+            )
+        block = 64
+        nodes = len(self.active)
+        kernels.total_nodes[(-(-nodes // block),)](
+            self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
+            self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity,
+            IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
+            HELD=self.plain and len(self.body.boundaries) > 0, MOVE=self.plain, BLOCK=block, num_warps=2,
+        )  # fmt: skip
+        if not self.plain:
+            self._constrain()
+        if not self.plain or self.asked:
+            self.time.add_(self.dt)
+
+    def _constrain(self) -> None:
+        """Boundary conditions that the kernels do not know, and the displacements after them."""
+        bound, inverse = self.bound, self.bound.node_inverse_mass
+        shape = (*inverse.shape, 3)
+        # nodes without mass forget what a boundary gave them
+        velocity = torch.where(inverse[..., None] > 0, self.velocity[:, :3].reshape(shape), 0.0)
+        position = lattice = None
+        if bound.node_rest is not None:
+            position = bound.node_rest + self.shift[:, :3].reshape(shape)
+        if self.lattice is not None:
+            lattice = self.lattice + self.displacement[:, :3].reshape(shape)
+        velocity = bound.constrain(velocity, bound.share_at(self.time), position, lattice, self.time, self.dt)
+        self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
+        self.displacement.addcmul_(self.velocity, self.dt.float())
+
+    def _read(self, state: MPMState, steps: int, options: dict[str, Any]) -> dict[str, Any]:
+        shape = state.position.shape
+        position, velocity = (torch.empty(shape, device=self.device) for _ in range(2))
+        affine, F = (torch.empty(*shape, 3, device=self.device) for _ in range(2))
+        loaded = options["TWIN"] is not None or options["FORCE"]
+        self._read_into(position, velocity, affine, F, self.schedule[steps], loaded, options["IMPLICIT"])
+        nodes = (*self.bound.node_inverse_mass.shape, 3)
+        return {
+            "position": position,
+            "velocity": velocity,
+            "affine": affine,
+            "F_elastic": F,
+            "F_total": F,
+            "node_displacement": self.displacement[:, :3].reshape(nodes).contiguous(),
+            "node_velocity": self.velocity[:, :3].reshape(nodes).contiguous(),
+        }
+
+    def _read_into(
+        self, position: Tensor, velocity: Tensor, affine: Tensor, F: Tensor, row: Tensor, work: bool, implicit: bool
+    ) -> None:
+        """Particle fields from the nodes, and the end of the work of the substep of a row of the schedule."""
+        _, ny, nz = self.grid.resolution
+        block = 128
+        kernels.total_read[(-(-self.count // block),)](
+            self.fraction, self.load, self.order, self.rest, self.count, self.particle_cell, self.cell_node,
+            self.fields, row, position, velocity, affine, F,
+            ny * nz, nz, 1 / self.grid.dx,
+            WORK=work, IMPLICIT=implicit, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+
+    def _look_at(self) -> MPMState:
+        shape = self.body.points.position.shape
+        position, velocity = (self._room(name, *shape) for name in ("position", "velocity"))
+        affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
+        self._read_into(position, velocity, affine, F, self.schedule, False, False)
+        lost = self._room("lost", *shape[:-1], dtype=torch.bool)
+        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid)
+
+    def _work(self) -> Tensor:
+        # cells are sorted by scene
+        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
+
+
+def _lanes(sizes: Tensor) -> int:
+    """Lanes per cell for which all cells have the least to do, full lanes or not (one synchronisation)."""
+    lanes = list(_LANE_COST)
+    work = torch.stack([(-(-sizes // n)).sum() * n for n in lanes]).tolist()
+    return min(zip(lanes, work, strict=True), key=lambda pair: pair[1] * _LANE_COST[pair[0]])[0]

@@ -1,0 +1,233 @@
+"""Runs the ``updated`` substep with its kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.body import Held
+from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.triton import updated_kernels as kernels
+from gaussian_swaying.mpm.triton.fused import Fused, check_indices
+
+RESORT = 32
+"""Substeps after which the particles are sorted by cell again."""
+
+
+class FusedUpdated(Fused):
+    """Substeps of the ``updated`` formulation; particles are sorted by cell at the start of each part.
+
+    Args:
+        bound: The formulation, bound to its material.
+    """
+
+    fixed_order = False
+
+    def __init__(self, bound: Formulation) -> None:
+        super().__init__(bound)
+        points, laws = bound.body.points, bound.body.laws
+        self.bound = bound
+        self.plastic = len(self.laws.flows) > 0
+        self.internal = laws.initial_internal() is not None
+        check_indices(44 * self.count)
+        self.moving = torch.zeros(44 if self.plastic else 35, self.count, device=self.device)
+        self.constants = torch.zeros(self.count, 9, device=self.device)
+        rows = [points.mass, points.volume, laws.mu, laws.lam, self.law]
+        self.constants[:, :5] = torch.stack([row.reshape(-1).float() for row in rows], dim=1)
+        self.scene = torch.arange(self.count, device=self.device) // max(self.particles, 1)
+        self.order = torch.arange(self.count, dtype=torch.int32, device=self.device)
+        self.momentum = torch.zeros(0, 4, device=self.device)
+        self.velocity = torch.zeros(0, 4, device=self.device)
+        self.inverse_mass = torch.zeros(0, device=self.device)
+        self.weight = torch.zeros(0, device=self.device)
+        self.node_position: Tensor | None = None
+        self.grid = GridSpec(bound.settings.dx, (0, 0, 0), (0, 0, 0))
+
+    def _take_values(self, values: Tensor) -> None:
+        self.constants[:, 5 : 5 + values.shape[1]] = values
+
+    def _take_grid(self, grid: GridSpec, width: int) -> None:
+        """Make room for a grid, and forget the graphs of another one."""
+        nodes = grid.node_count * self.scenes
+        check_indices(nodes * width)
+        if nodes > len(self.velocity) or width != self.momentum.shape[1]:
+            room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
+            held = room if len(self.body.boundaries) else 0
+            self.repeater.forget()  # before there is need of their memory
+            with torch.inference_mode(False):  # they may be written within inference mode and without
+                self.momentum = torch.zeros(room, width, device=self.device)
+                self.velocity = torch.zeros(room, 4, device=self.device)
+                self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
+        if grid != self.grid:
+            self.repeater.forget()  # they read the node positions
+            self.grid, self.node_position = grid, None
+            if self.body.needs_position or self.body.needs_lattice:
+                self.node_position = grid.node_positions(self.velocity)
+
+    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
+        self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
+        fields: dict[str, Any] = {}
+        marks = sorted({*looks, *range(RESORT, steps, RESORT), steps})
+        load, done = True, 0
+        for mark in marks:
+            if load:
+                self._load(state.replace(**fields))
+                if self.asked:
+                    self._push()
+                self._particles(0, options, gather=False, scatter=True)
+            sort = mark == steps or mark % RESORT == 0
+            self._several(mark - done - (1 if sort else 0), options)
+            if sort:  # the end of a substep without the start of the next
+                self._nodes(0, options)
+                self._particles(1, options, gather=True, scatter=False)
+                self.first_step.add_(1)
+                fields = self._read(state)
+            if mark in looks:
+                self._look()
+            load, done = sort, mark
+        return fields
+
+    def _load(self, state: MPMState) -> None:
+        """Sort the particles by cell and take their fields."""
+        self.momentum.zero_()  # whatever a part that was broken off has left
+        grid = state.grid
+        place = (state.position.reshape(-1, 3) / grid.dx - 0.5).floor_().int()
+        (ox, oy, oz), (nx, ny, nz) = grid.offset, grid.resolution
+        x, y, z = place.unbind(-1)
+        key = ((x - ox).clamp(0, nx) * (ny + 1) + (y - oy).clamp(0, ny)) * (nz + 1) + (z - oz).clamp(0, nz)
+        if self.scenes > 1:
+            key = key + self.scene * ((nx + 1) * (ny + 1) * (nz + 1))
+        order = torch.argsort(key)
+        if self.scenes > 1:  # the work done so far follows its particle; the forces are zero here
+            self.load[0].copy_(self.load[0][torch.argsort(self.order)][order])
+        self.order.copy_(order)
+        block = 128
+        programs = (-(-self.count // block),)
+        internal = state.internal is not None
+        kernels.updated_load[programs](
+            self.order, state.position.contiguous(), state.velocity.contiguous(), state.affine.contiguous(),
+            state.F_elastic.contiguous(), state.F_total.contiguous(), state.lost.contiguous(),
+            state.internal.contiguous() if state.internal is not None else self.load, self.constants, self.moving,
+            self.count, PLASTIC=self.plastic, INTERNAL=internal, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+
+    def _several(self, steps: int, options: dict[str, Any]) -> None:
+        """Substeps from the start of one to the start of another."""
+        self._repeat(steps, (*options.values(), self.grid), lambda offset: self._substep(offset, options))
+
+    def _look(self) -> None:
+        block = 128
+        kernels.updated_look[(-(-self.count // block),)](
+            self.moving, self.count, self.speed, WAVE=self.wave, BLOCK=block, num_warps=4
+        )
+
+    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+        self._nodes(offset, options)
+        if self.asked:  # the forces look at the end of a substep before the next one starts
+            self._particles(offset + 1, options, gather=True, scatter=False)
+            self._push()
+            self._particles(offset + 1, options, gather=False, scatter=True)
+        else:
+            self._particles(offset + 1, options, gather=True, scatter=True)
+
+    def _particles(self, offset: int, options: dict[str, Any], gather: bool, scatter: bool) -> None:
+        grid, settings = self.grid, self.settings
+        kernels.updated_particles[(-(-self.count // 32),)](
+            self.moving, self.order, self.load, self.count,
+            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.numbers, self.first_step,
+            offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx, 1 / grid.dx,
+            settings.stiffness_damping, self.particles,
+            **options, PLASTIC=self.plastic, MLS=settings.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
+            SCATTER=scatter, num_warps=1,
+        )  # fmt: skip
+
+    def _nodes(self, offset: int, options: dict[str, Any]) -> None:
+        nodes = self.grid.node_count * self.scenes
+        block = 256
+        acting = self.body.boundaries
+        kernels.updated_nodes[(-(-nodes // block),)](
+            self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
+            *self.gravity, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=len(acting) > 0,
+            BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        if acting:
+            self._constrain()
+        if acting or self.asked:
+            self.time.add_(self.dt)
+
+    def _constrain(self) -> None:
+        """Boundary conditions on the velocities of the nodes."""
+        grid = self.grid
+        nodes = grid.node_count * self.scenes
+        shape = (*self.body.points.position.shape[:-2], grid.node_count)
+        velocity = self.velocity[:nodes, :3].reshape(*shape, 3)
+        position = self.node_position
+        if position is not None:
+            position = position.expand_as(velocity)
+        velocity = self.bound.constrain(velocity, self._share, position, position, self.time, self.dt)
+        self.velocity[:nodes, :3].copy_(velocity.reshape(-1, 3))
+
+    def _share(self, held: Held) -> Tensor:
+        """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
+        grid, mass = self.grid, held.mass_at(self.time)
+        nodes = grid.node_count * self.scenes
+        weight = self.weight[:nodes].zero_()
+        block = 128
+        kernels.pin_mass[(-(-self.count // block),)](
+            self.moving, self.order, mass.contiguous(), weight, self.count, *grid.offset, *grid.resolution, grid.dx,
+            self.particles, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        shape = (*mass.shape[:-1], grid.node_count)
+        return (weight * self.inverse_mass[:nodes]).reshape(shape)
+
+    def _read(self, state: MPMState) -> dict[str, Any]:
+        position, velocity = (torch.empty(state.position.shape, device=self.device) for _ in range(2))
+        affine, F = (torch.empty(state.F_elastic.shape, device=self.device) for _ in range(2))
+        F_total = torch.empty_like(F) if self.plastic else F
+        lost = torch.empty(state.lost.shape, dtype=torch.bool, device=self.device)
+        internal = None if state.internal is None else torch.empty(state.internal.shape, device=self.device)
+        return self._read_into(position, velocity, affine, F, F_total, lost, internal)
+
+    def _read_into(
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        affine: Tensor,
+        F: Tensor,
+        F_total: Tensor,
+        lost: Tensor,
+        internal: Tensor | None,
+    ) -> dict[str, Any]:
+        """The rows of the particles as fields of the state."""
+        block = 128
+        kernels.updated_read[(-(-self.count // block),)](
+            self.order, self.moving, self.count, position, velocity, affine, F, F_total, lost,
+            self.load if internal is None else internal,
+            PLASTIC=self.plastic, INTERNAL=internal is not None, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        return {
+            "position": position,
+            "velocity": velocity,
+            "affine": affine,
+            "F_elastic": F,
+            "F_total": F_total,
+            "lost": lost,
+            "internal": internal,
+        }
+
+    def _look_at(self) -> MPMState:
+        shape = self.body.points.position.shape
+        position, velocity = (self._room(name, *shape) for name in ("position", "velocity"))
+        affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
+        F_total = self._room("F_total", *shape, 3) if self.plastic else F
+        lost = self._room("lost", *shape[:-1], dtype=torch.bool)
+        internal = self._room("internal", *shape[:-1]) if self.internal else None
+        fields = self._read_into(position, velocity, affine, F, F_total, lost, internal)
+        return MPMState(**fields, time=self.time, grid=self.grid)
+
+    def _work(self) -> Tensor:
+        # whatever the order within a scene, the particles are sorted by scene
+        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)

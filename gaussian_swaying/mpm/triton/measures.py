@@ -1,0 +1,44 @@
+"""What a state is measured by in one kernel, without the buffers of a substep."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.body import Body
+from gaussian_swaying.mpm.formulations.formulation import Formulation
+from gaussian_swaying.mpm.laws.triton.twin import shared
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.triton import measure_kernels as kernels
+
+
+def largest_speed(bound: Formulation, state: MPMState) -> Tensor | None:
+    """Cells per second as ``Formulation.cells_per_second``, in one kernel; None for laws that share no wave speed."""
+    points, laws, spatial = bound.body.points, bound.body.laws, not bound.neighbours_fixed
+    wave = shared(points.laws, "wave")
+    if wave is None:
+        return None
+    out = torch.zeros(1, device=points.position.device)
+    count, block = points.mass.numel(), 128
+    density = points.mass / points.volume
+    with torch.cuda.device_of(out):
+        kernels.largest_speed[(-(-count // block),)](
+            state.F_elastic.contiguous(), density.contiguous(), laws.mu.contiguous(), laws.lam.contiguous(),
+            state.velocity.contiguous(), out, count, WAVE=wave, SPATIAL=spatial, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+    return out[0] / bound.settings.dx
+
+
+def elastic_energy(body: Body, F: Tensor) -> Tensor | None:
+    """Energy density [J/m³] in one kernel, shape (..., P); None for laws that share no energy."""
+    energy = shared(body.points.laws, "energy")
+    if energy is None:
+        return None
+    out = torch.empty(F.shape[:-2], device=F.device)
+    block = 128
+    with torch.cuda.device_of(out):
+        kernels.elastic_energy[(-(-out.numel() // block),)](
+            F.contiguous(), body.laws.mu.contiguous(), body.laws.lam.contiguous(), out, out.numel(), ENERGY=energy,
+            BLOCK=block, num_warps=4,
+        )  # fmt: skip
+    return out

@@ -1,0 +1,134 @@
+"""What the kernels of the formulations have in common: weights, loads and stores, forces and their work.
+
+The definitions are :mod:`~gaussian_swaying.mpm.transfer`, :mod:`~gaussian_swaying.mpm.timestep` and the torch substeps
+of :mod:`~gaussian_swaying.mpm.formulations`; the kernels follow them and are tested against them. Loops over i and j
+stay loops in Triton's intermediate code: unrolled, its passes take minutes.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, matmul, transpose
+
+SCHEDULE = 4
+"""Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
+
+# Numbers that differ from body to body and from grid to grid. Triton would compile a kernel again for each of them that
+# becomes one or a multiple of 16, in the middle of a run, and even while a graph is recorded.
+VARIES = (
+    "count", "cells", "pieces", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
+    "nx", "ny", "nz",
+)  # fmt: skip
+
+
+@triton.jit
+def node_weight(f, i, inverse_dx):
+    """Quadratic B-spline weight of node i of one axis and its slope; f in [0.5, 1.5)."""
+    t = f - (1.5 - 0.5 * i)
+    a = tl.where(i == 1, -1.0, 0.5) * t
+    return a * t + tl.where(i == 1, 0.75, 0.0), 2 * inverse_dx * a
+
+
+@triton.jit
+def axis_weights(f, inverse_dx):
+    """The three weights of one axis and their slopes."""
+    w0, g0 = node_weight(f, 0, inverse_dx)
+    w1, g1 = node_weight(f, 1, inverse_dx)
+    w2, g2 = node_weight(f, 2, inverse_dx)
+    return (w0, w1, w2), (g0, g1, g2)
+
+
+@triton.jit
+def load3(pointer, stride, index, mask):
+    return (
+        tl.load(pointer + index, mask, 0.0),
+        tl.load(pointer + stride + index, mask, 0.0),
+        tl.load(pointer + 2 * stride + index, mask, 0.0),
+    )
+
+
+@triton.jit
+def load9(pointer, stride, index, mask):
+    return (
+        tl.load(pointer + index, mask, 0.0),
+        tl.load(pointer + stride + index, mask, 0.0),
+        tl.load(pointer + 2 * stride + index, mask, 0.0),
+        tl.load(pointer + 3 * stride + index, mask, 0.0),
+        tl.load(pointer + 4 * stride + index, mask, 0.0),
+        tl.load(pointer + 5 * stride + index, mask, 0.0),
+        tl.load(pointer + 6 * stride + index, mask, 0.0),
+        tl.load(pointer + 7 * stride + index, mask, 0.0),
+        tl.load(pointer + 8 * stride + index, mask, 0.0),
+    )
+
+
+@triton.jit
+def store3(pointer, stride, index, value, mask):
+    for k in tl.static_range(3):
+        tl.store(pointer + k * stride + index, value[k], mask)
+
+
+@triton.jit
+def store9(pointer, stride, index, value, mask):
+    for k in tl.static_range(9):
+        tl.store(pointer + k * stride + index, value[k], mask)
+
+
+@triton.jit
+def twin_force(
+    TWIN: tl.constexpr, OPTIONS: tl.constexpr, F, velocity, index, mask, scene, values, count, vectors, scenes, step,
+    numbers,
+):  # fmt: skip
+    """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]."""
+    first = load3(values, count, index, mask)
+    last = tl.load(values + 3 * count + index, mask, 0.0)
+    vector = vectors + (step * scenes + scene) * 3
+    return TWIN(F, velocity, (first[0], first[1], first[2], last), vector, numbers, OPTIONS)
+
+
+@triton.jit
+def add_given(force, resistance, force_in, where, mask):
+    """Add the force and the resistance in the rows of ``force_in``."""
+    more = load3(force_in, 1, where * 4, mask)
+    resistance += tl.load(force_in + where * 4 + 3, mask, 0.0)
+    return (force[0] + more[0], force[1] + more[1], force[2] + more[2]), resistance
+
+
+@triton.jit
+def account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, load, count, index, mask):
+    """Work of the external force: what ended with this velocity is added, what begins with it is kept.
+
+    ``load`` has the rows work, force (with implicit drag force + D v, D and v, eight rows in all).
+    """
+    work = tl.load(load + index, mask, 0.0)
+    last = load3(load + count, count, index, mask)
+    if IMPLICIT:
+        held = tl.load(load + 4 * count + index, mask, 0.0)
+        was = load3(load + 5 * count, count, index, mask)
+        for k in tl.static_range(3):
+            work += 0.5 * before * (last[k] - held * velocity[k]) * (was[k] + velocity[k])
+            tl.store(load + (1 + k) * count + index, force[k] + resistance * velocity[k], mask)
+            tl.store(load + (5 + k) * count + index, velocity[k], mask)
+        tl.store(load + 4 * count + index, resistance, mask)
+    else:
+        for k in tl.static_range(3):
+            work += 0.5 * velocity[k] * (before * last[k] + kick * force[k])
+            tl.store(load + (1 + k) * count + index, force[k], mask)
+    tl.store(load + index, work, mask)
+
+
+@triton.jit
+def wave_speed(F, density, mu, lam, WAVE: tl.constexpr, SPATIAL: tl.constexpr):
+    """Speed of a wave [m/s], as ``timestep.wave_speed``."""
+    squared = WAVE(F, mu, lam) / density
+    if SPATIAL:
+        stretch = largest_eigenvalue(matmul(transpose(F), F))
+        squared = squared * largest(stretch, 1.0)
+    return tl.sqrt(squared)
+
+
+@triton.jit
+def keep_largest(out, speed, mask):
+    """The largest value into ``out``; infinity for NaN, which an atomic maximum would lose."""
+    speed = tl.where(mask, tl.where(speed == speed, speed, float("inf")), 0.0)
+    tl.atomic_max(out, tl.max(speed))

@@ -1,0 +1,309 @@
+"""Kernels of the ``total`` substep; the definition is :mod:`~gaussian_swaying.mpm.formulations.total`.
+
+Stencils rest, so particles are sorted by cell once. A program takes some cells with up to ``LANES`` particles at a
+time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of its 27
+cells. No atomics: the result is the same in every run.
+
+Rows of node arrays: displacement and velocity, each in four columns of eight, a sector of memory. What is summed has
+four columns, or eight where boundaries ask for positions.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.geometry.linalg_triton import axpy9, scale9
+from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
+from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.triton.shared import (
+    VARIES,
+    account,
+    add_given,
+    axis_weights,
+    keep_largest,
+    load3,
+    node_weight,
+    twin_force,
+    wave_speed,
+)
+
+
+@triton.jit
+def _gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr):
+    """Columns 0 to 2 of rows of eight interpolated, their derivatives [component, axis], and (BOTH) columns 4 to 6."""
+    zero = wz[0] * 0
+    u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
+    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for i in range(3):
+        wx, gx = node_weight(f[0], i, inverse_dx)
+        for j in range(3):
+            wy, gy = node_weight(f[1], j, inverse_dx)
+            row = field + (node + i * sx + j * sy) * 8
+            s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            for k in tl.static_range(3):
+                q0 = tl.load(row + k * 8, mask, 0.0)
+                q1 = tl.load(row + k * 8 + 1, mask, 0.0)
+                q2 = tl.load(row + k * 8 + 2, mask, 0.0)
+                s0 += wz[k] * q0
+                s1 += wz[k] * q1
+                s2 += wz[k] * q2
+                t0 += gz[k] * q0
+                t1 += gz[k] * q1
+                t2 += gz[k] * q2
+                if BOTH:
+                    r0 += wz[k] * tl.load(row + k * 8 + 4, mask, 0.0)
+                    r1 += wz[k] * tl.load(row + k * 8 + 5, mask, 0.0)
+                    r2 += wz[k] * tl.load(row + k * 8 + 6, mask, 0.0)
+            w = wx * wy
+            dx = gx * wy
+            dy = wx * gy
+            u0 += w * s0
+            u1 += w * s1
+            u2 += w * s2
+            if BOTH:
+                v0 += w * r0
+                v1 += w * r1
+                v2 += w * r2
+            g00 += dx * s0
+            g01 += dy * s0
+            g02 += w * t0
+            g10 += dx * s1
+            g11 += dy * s1
+            g12 += w * t1
+            g20 += dx * s2
+            g21 += dy * s2
+            g22 += w * t2
+    return (u0, u1, u2), (g00, g01, g02, g10, g11, g12, g20, g21, g22), (v0, v1, v2)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_particles(
+    fraction, material, law, law_table, values, force_in, load, order, count,
+    cell_start, cell_node, cell_scene, cells,
+    fields, partial,
+    schedule, vectors, scenes, numbers, first_step, step_offset,
+    sx, sy, inverse_dx, viscous_time,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, FORCE: tl.constexpr,
+    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
+    CELLS: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
+
+    Lanes without a particle have no volume, values of a twin or mass, so they add nothing. A step of index zero of a
+    rollout takes what came before it from row 0 of the schedule.
+    """
+    LOADED: tl.constexpr = (TWIN is not None) or FORCE
+    step = tl.load(first_step) + step_offset
+    kick = tl.load(schedule + (step + 1) * 4)
+    before = tl.load(schedule + step * 4)
+    cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
+    real = cell < cells
+    start = tl.load(cell_start + cell, real, 0)
+    end = tl.load(cell_start + cell + 1, real, 0)
+    node = tl.load(cell_node + cell, real, 0)[:, None]
+    scene = tl.load(cell_scene + cell, real, 0)[:, None]
+    longest = tl.max(end - start)
+    lane = tl.arange(0, LANES)[None, :]
+    known = real[:, None]
+    for chunk in range(0, longest, LANES):
+        index = start[:, None] + chunk + lane
+        mask = index < end[:, None]
+        # a lane without a particle stands in the middle of the cell: outside it F might be inverted, which takes long
+        f = (
+            tl.load(fraction + index, mask, 1.0),
+            tl.load(fraction + count + index, mask, 1.0),
+            tl.load(fraction + 2 * count + index, mask, 1.0),
+        )
+        volume = tl.load(material + index, mask, 0.0)
+        mu = tl.load(material + count + index, mask, 0.0)
+        lam = tl.load(material + 2 * count + index, mask, 0.0)
+        wz, gz = axis_weights(f[2], inverse_dx)
+        if VISCOUS:
+            u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+            v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        elif LOADED:
+            u, F, v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
+        else:
+            u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+        if MULTI:
+            row = law_table + ROW * tl.load(law + index, mask, 0)
+        else:
+            row = law_table
+        stress = pk1(F, mu, lam, row, LAWS)
+        if VISCOUS:
+            stress = axpy9(1.0, stress, 1.0, kelvin_voigt_pk1(F, rate, mu, lam, viscous_time))
+        stress = scale9(-volume, stress)
+        zero = volume * 0
+        value = (zero, zero, zero)
+        resistance = zero
+        if TWIN is not None:
+            value, resistance = twin_force(
+                TWIN, OPTIONS, F, v, index, mask, scene, values, count, vectors, scenes, step, numbers
+            )
+        if FORCE:
+            where = tl.load(order + index, mask, 0)
+            value, resistance = add_given(value, resistance, force_in, where, mask)
+        if LOADED:
+            account(value, resistance, v, kick, before, IMPLICIT, load, count, index, mask)
+        if POSITION:
+            mass = tl.load(material + 3 * count + index, mask, 0.0)
+            moved = (mass * u[0], mass * u[1], mass * u[2])
+        for i in range(3):
+            wx, gx = node_weight(f[0], i, inverse_dx)
+            for j in range(3):
+                wy, gy = node_weight(f[1], j, inverse_dx)
+                w = wx * wy
+                ax = gx * wy
+                ay = wx * gy
+                a0 = value[0] * w + stress[0] * ax + stress[1] * ay
+                a1 = value[1] * w + stress[3] * ax + stress[4] * ay
+                a2 = value[2] * w + stress[6] * ax + stress[7] * ay
+                for k in tl.static_range(3):
+                    out = partial + (((i * 3 + j) * 3 + k) * (cells + 1) + cell) * WIDTH
+                    gw = gz[k] * w
+                    s0 = tl.sum(wz[k] * a0 + gw * stress[2], 1)
+                    s1 = tl.sum(wz[k] * a1 + gw * stress[5], 1)
+                    s2 = tl.sum(wz[k] * a2 + gw * stress[8], 1)
+                    if chunk > 0:
+                        s0 += tl.load(out, real, 0.0)
+                        s1 += tl.load(out + 1, real, 0.0)
+                        s2 += tl.load(out + 2, real, 0.0)
+                    tl.store(out, s0, real)
+                    tl.store(out + 1, s1, real)
+                    tl.store(out + 2, s2, real)
+                    if IMPLICIT:
+                        s3 = tl.sum(wz[k] * (w * resistance), 1)
+                        if chunk > 0:
+                            s3 += tl.load(out + 3, real, 0.0)
+                        tl.store(out + 3, s3, real)
+                    if POSITION:
+                        for c in tl.static_range(3):
+                            s4 = tl.sum(wz[k] * (w * moved[c]), 1)
+                            if chunk > 0:
+                                s4 += tl.load(out + 4 + c, real, 0.0)
+                            tl.store(out + 4 + c, s4, real)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
+    """``total``: the sums of each cell from those of its pieces, always in the same order."""
+    o = tl.program_id(1)
+    cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = cell < cells
+    first = tl.load(first_piece + cell, mask, 0)
+    many = tl.load(first_piece + cell + 1, mask, 0) - first
+    column = tl.arange(0, WIDTH)[None, :]
+    total = tl.zeros([BLOCK, WIDTH], tl.float32)
+    for k in range(0, tl.max(many)):
+        row = (o * (pieces + 1) + first + k) * WIDTH
+        total += tl.load(pieces_in + row[:, None] + column, (k < many)[:, None], 0.0)
+    out = (o * (cells + 1) + cell) * WIDTH
+    tl.store(partial + out[:, None] + column, total, mask[:, None])
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_nodes(
+    active, source, inverse_mass, held, nodes, cells, partial, fields, shift,
+    schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z,
+    IMPLICIT: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, HELD: tl.constexpr, MOVE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``total``: nodal velocities and displacements from the sums of the cells around each node."""
+    step = tl.load(first_step) + step_offset
+    kick = tl.load(schedule + (step + 1) * 4)
+    dt = tl.load(schedule + (step + 1) * 4 + 1)
+    decay = tl.load(schedule + (step + 1) * 4 + 2)
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = k < nodes
+    node = tl.load(active + k, mask, 0)
+    inverse = tl.load(inverse_mass + k, mask, 0.0)
+    f0 = tl.zeros([BLOCK], tl.float32)
+    f1 = tl.zeros([BLOCK], tl.float32)
+    f2 = tl.zeros([BLOCK], tl.float32)
+    drag = tl.zeros([BLOCK], tl.float32)
+    m0 = tl.zeros([BLOCK], tl.float32)
+    m1 = tl.zeros([BLOCK], tl.float32)
+    m2 = tl.zeros([BLOCK], tl.float32)
+    for o in tl.static_range(27):
+        row = partial + (o * (cells + 1) + tl.load(source + o * nodes + k, mask, cells)) * WIDTH
+        f0 += tl.load(row, mask, 0.0)
+        f1 += tl.load(row + 1, mask, 0.0)
+        f2 += tl.load(row + 2, mask, 0.0)
+        if IMPLICIT:
+            drag += tl.load(row + 3, mask, 0.0)
+        if POSITION:
+            m0 += tl.load(row + 4, mask, 0.0)
+            m1 += tl.load(row + 5, mask, 0.0)
+            m2 += tl.load(row + 6, mask, 0.0)
+    if IMPLICIT:
+        push = kick / (1 + kick * drag * inverse)
+    else:
+        push = kick
+    place = fields + node * 8 + 4
+    v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
+    v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay
+    v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
+    if HELD:
+        free = tl.load(held + k, mask, 0) == 0
+        v0 = tl.where(free, v0, 0.0)
+        v1 = tl.where(free, v1, 0.0)
+        v2 = tl.where(free, v2, 0.0)
+    tl.store(place, v0, mask)
+    tl.store(place + 1, v1, mask)
+    tl.store(place + 2, v2, mask)
+    if MOVE:
+        to = fields + node * 8
+        tl.store(to, tl.load(to, mask, 0.0) + dt * v0, mask)
+        tl.store(to + 1, tl.load(to + 1, mask, 0.0) + dt * v1, mask)
+        tl.store(to + 2, tl.load(to + 2, mask, 0.0) + dt * v2, mask)
+    if POSITION:
+        out = shift + node * 4
+        tl.store(out, m0 * inverse, mask)
+        tl.store(out + 1, m1 * inverse, mask)
+        tl.store(out + 2, m2 * inverse, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_read(
+    fraction, load, order, rest, count, particle_cell, cell_node, fields, kick_before,
+    position_out, velocity_out, affine_out, F_out, sx, sy, inverse_dx,
+    WORK: tl.constexpr, IMPLICIT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``total``: the particle fields, in the order in which they were given."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    f = load3(fraction, count, index, mask)
+    node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
+    where = tl.load(order + index, mask, 0)
+    wz, gz = axis_weights(f[2], inverse_dx)
+    u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    if WORK:
+        zero = f[0] * 0
+        account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
+    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    for k in tl.static_range(3):
+        tl.store(position_out + where * 3 + k, tl.load(rest + where * 3 + k, mask, 0.0) + u[k], mask)
+        tl.store(velocity_out + where * 3 + k, v[k], mask)
+    for k in tl.static_range(9):
+        tl.store(F_out + where * 9 + k, F[k], mask)
+        tl.store(affine_out + where * 9 + k, rate[k], mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_look(
+    fraction, material, count, particle_cell, cell_node, fields, out, sx, sy, inverse_dx,
+    WAVE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``total``: as ``largest_speed``, from the nodal displacements."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    f = load3(fraction, count, index, mask)
+    node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
+    wz, gz = axis_weights(f[2], inverse_dx)
+    _u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    mu = tl.load(material + count + index, mask, 0.0)
+    lam = tl.load(material + 2 * count + index, mask, 0.0)
+    density = tl.load(material + 3 * count + index, mask, 1.0) / tl.load(material + index, mask, 1.0)
+    keep_largest(out, wave_speed(F, density, mu, lam, WAVE, False), mask)

@@ -1,0 +1,402 @@
+"""Kernels of the ``updated`` substep; the definition is :mod:`~gaussian_swaying.mpm.formulations.updated`.
+
+One kernel gathers the end of a substep and scatters the start of the next, so a particle is read and written once.
+Particles are sorted by cell now and then; neighbours in that order that share a cell are summed by a segmented scan,
+and only the last of each segment goes to the grid, atomically.
+
+Rows of node arrays: velocity, or momentum and mass, in four columns. What is summed has four too, or eight with
+implicit drag.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.geometry.linalg_triton import axpy9, matmul, scale9, transpose
+from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
+from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.triton.shared import (
+    VARIES,
+    account,
+    add_given,
+    axis_weights,
+    keep_largest,
+    load3,
+    load9,
+    node_weight,
+    store3,
+    store9,
+    twin_force,
+    wave_speed,
+)
+
+
+@triton.jit
+def _gather_affine(field, node, sx, sy, f, wz, gz, mz, inverse_dx, dx, mask, SLOPES: tl.constexpr):
+    """Interpolated vector, its moments about the particle and (SLOPES) its derivatives [component, axis]."""
+    zero = wz[0] * 0
+    v0, v1, v2 = zero, zero, zero
+    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    c00, c01, c02, c10, c11, c12, c20, c21, c22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for i in range(3):
+        wx, gx = node_weight(f[0], i, inverse_dx)
+        mx = wx * (i - f[0]) * dx
+        for j in range(3):
+            wy, gy = node_weight(f[1], j, inverse_dx)
+            row = field + (node + i * sx + j * sy) * 4
+            s0, s1, s2, t0, t1, t2, r0, r1, r2 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+            for k in tl.static_range(3):
+                q0 = tl.load(row + k * 4, mask, 0.0)
+                q1 = tl.load(row + k * 4 + 1, mask, 0.0)
+                q2 = tl.load(row + k * 4 + 2, mask, 0.0)
+                s0 += wz[k] * q0
+                s1 += wz[k] * q1
+                s2 += wz[k] * q2
+                r0 += mz[k] * q0
+                r1 += mz[k] * q1
+                r2 += mz[k] * q2
+                if SLOPES:
+                    t0 += gz[k] * q0
+                    t1 += gz[k] * q1
+                    t2 += gz[k] * q2
+            w = wx * wy
+            ex = mx * wy
+            ey = wx * (wy * (j - f[1]) * dx)
+            v0 += w * s0
+            v1 += w * s1
+            v2 += w * s2
+            c00 += ex * s0
+            c01 += ey * s0
+            c02 += w * r0
+            c10 += ex * s1
+            c11 += ey * s1
+            c12 += w * r1
+            c20 += ex * s2
+            c21 += ey * s2
+            c22 += w * r2
+            if SLOPES:
+                ax = gx * wy
+                ay = wx * gy
+                g00 += ax * s0
+                g01 += ay * s0
+                g02 += w * t0
+                g10 += ax * s1
+                g11 += ay * s1
+                g12 += w * t1
+                g20 += ax * s2
+                g21 += ay * s2
+                g22 += w * t2
+    return (v0, v1, v2), (c00, c01, c02, c10, c11, c12, c20, c21, c22), (g00, g01, g02, g10, g11, g12, g20, g21, g22)
+
+
+@triton.jit
+def _larger(a, b):
+    return tl.maximum(a, b)
+
+
+@triton.jit
+def _sum_segments(a, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16):
+    """Sum of each segment of 32 lanes, in its last lane: five shuffles, each from a lane of the same segment."""
+    a += tl.where(s1, tl.gather(a, l1, 0), 0.0)
+    a += tl.where(s2, tl.gather(a, l2, 0), 0.0)
+    a += tl.where(s4, tl.gather(a, l4, 0), 0.0)
+    a += tl.where(s8, tl.gather(a, l8, 0), 0.0)
+    a += tl.where(s16, tl.gather(a, l16, 0), 0.0)
+    return a
+
+
+@triton.jit
+def _locate(x, dx, o, n):
+    """First node of the stencil on one axis within the grid, the place in it, and whether the stencil fits."""
+    lattice = tl.div_rn(x, dx + x * 0)
+    base = tl.floor(lattice - 0.5)
+    first = base.to(tl.int32) - o
+    f = lattice - base
+    fits = (first >= 0) & (first <= n - 3) & (f < 2)  # NaN becomes any integer, and is not below anything
+    return first, tl.where(fits, f, 1.0), fits
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_particles(
+    moving, order, load, count,
+    momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
+    ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size,
+    LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr,
+    FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr,
+    GATHER: tl.constexpr, SCATTER: tl.constexpr,
+):  # fmt: skip
+    """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
+
+    Rows of ``moving``: position 0, F 3, velocity 12, affine 15, lost 24, internal 25, mass 26, volume 27, mu 28,
+    lam 29, law 30, the four values of a twin 31, and total F 35 where a law is plastic.
+    """
+    LOADED: tl.constexpr = (TWIN is not None) or FORCE
+    step = tl.load(first_step) + step_offset
+    kick = tl.load(schedule + (step + 1) * 4)
+    before = tl.load(schedule + step * 4)
+    dt = tl.load(schedule + step * 4 + 1)
+    index = tl.program_id(0) * 32 + tl.arange(0, 32)  # one warp, for its shuffles
+    mask = index < count
+    x = load3(moving, count, index, mask)
+    F = load9(moving + 3 * count, count, index, mask)
+    internal = tl.load(moving + 25 * count + index, mask, 0.0)
+    mu = tl.load(moving + 28 * count + index, mask, 0.0)
+    lam = tl.load(moving + 29 * count + index, mask, 0.0)
+    where = tl.load(order + index, mask, 0)
+    scene = where // scene_size
+    if MULTI:
+        law = law_table + ROW * tl.load(moving + 30 * count + index, mask, 0.0).to(tl.int32)
+    else:
+        law = law_table
+    sy = nz
+    sx = ny * nz
+    if PLASTIC:
+        F_total = load9(moving + 35 * count, count, index, mask)
+    else:
+        F_total = F
+    stress = F
+    if GATHER:
+        bx, fx, okx = _locate(x[0], dx, ox, nx)
+        by, fy, oky = _locate(x[1], dx, oy, ny)
+        bz, fz, okz = _locate(x[2], dx, oz, nz)
+        inside = mask & okx & oky & okz
+        node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + scene * (nx * ny * nz)
+        wz, gz = axis_weights(fz, inverse_dx)
+        mz = (-fz * wz[0] * dx, (1 - fz) * wz[1] * dx, (2 - fz) * wz[2] * dx)
+        v, C, L = _gather_affine(
+            velocity, node, sx, sy, (fx, fy, fz), wz, gz, mz, inverse_dx, dx, inside, SLOPES=not MLS
+        )
+        C = scale9(4 * inverse_dx * inverse_dx, C)
+        if MLS:
+            L = C
+        U = (1 + dt * L[0], dt * L[1], dt * L[2], dt * L[3], 1 + dt * L[4], dt * L[5], dt * L[6], dt * L[7],
+             1 + dt * L[8])  # fmt: skip
+        F = matmul(U, F)
+        if PLASTIC:
+            F_total = matmul(U, F_total)
+        else:
+            F_total = F
+        x = (x[0] + dt * v[0], x[1] + dt * v[1], x[2] + dt * v[2])
+        lost = tl.load(moving + 24 * count + index, mask, 0.0)
+        tl.store(moving + 24 * count + index, tl.where(inside, lost, 1.0), mask)
+        if PLASTIC or SCATTER:
+            F, internal, stress = kirchhoff(F, mu, lam, internal, law, dt, LAWS, True)
+        store3(moving, count, index, x, mask)
+        store9(moving + 3 * count, count, index, F, mask)
+        store3(moving + 12 * count, count, index, v, mask)
+        if PLASTIC:
+            store9(moving + 35 * count, count, index, F_total, mask)
+            tl.store(moving + 25 * count + index, internal, mask)
+    else:
+        v = load3(moving + 12 * count, count, index, mask)
+        C = load9(moving + 15 * count, count, index, mask)
+        F, internal, stress = kirchhoff(F, mu, lam, internal, law, dt, LAWS, False)
+    zero = mu * 0
+    force = (zero, zero, zero)
+    resistance = zero
+    if SCATTER:
+        if TWIN is not None:
+            force, resistance = twin_force(
+                TWIN, OPTIONS, F_total, v, index, mask, scene, moving + 31 * count, count, vectors, scenes, step,
+                numbers,
+            )  # fmt: skip
+        if FORCE:
+            force, resistance = add_given(force, resistance, force_in, where, mask)
+    if LOADED:
+        account(force, resistance, v, kick, before, IMPLICIT, load, count, index, mask)
+    if SCATTER:
+        mass = tl.load(moving + 26 * count + index, mask, 0.0)
+        volume = tl.load(moving + 27 * count + index, mask, 0.0)
+        if VISCOUS:
+            viscous = kelvin_voigt_pk1(F, matmul(C, F), mu, lam, viscous_time)
+            stress = axpy9(1.0, stress, 1.0, matmul(viscous, transpose(F)))
+        bx, fx, okx = _locate(x[0], dx, ox, nx)
+        by, fy, oky = _locate(x[1], dx, oy, ny)
+        bz, fz, okz = _locate(x[2], dx, oz, nz)
+        inside = mask & okx & oky & okz
+        node = tl.where(inside, (bx * ny + by) * nz + bz + scene * (nx * ny * nz), -1)
+        wz, gz = axis_weights(fz, inverse_dx)
+        pull = -kick * volume
+        if IMPLICIT:
+            value = (
+                mass * v[0] + kick * (force[0] + resistance * v[0]),
+                mass * v[1] + kick * (force[1] + resistance * v[1]),
+                mass * v[2] + kick * (force[2] + resistance * v[2]),
+                mass,
+            )
+        else:
+            value = (mass * v[0] + kick * force[0], mass * v[1] + kick * force[1], mass * v[2] + kick * force[2], mass)
+        # what multiplies w (x_i - x_p), and what multiplies the gradient of w
+        if MLS:
+            moment = axpy9(mass, C, 4 * inverse_dx * inverse_dx * pull, stress)
+            slope = moment
+        else:
+            moment = scale9(mass, C)
+            slope = scale9(pull, stress)
+        # neighbours in the order that share a cell form a segment
+        lane = tl.arange(0, 32)
+        following = tl.gather(node, tl.minimum(lane + 1, 31), 0)
+        last = ((node != following) | (lane == 31)) & (node >= 0)
+        l1 = tl.maximum(lane - 1, 0)
+        l2 = tl.maximum(lane - 2, 0)
+        l4 = tl.maximum(lane - 4, 0)
+        l8 = tl.maximum(lane - 8, 0)
+        l16 = tl.maximum(lane - 16, 0)
+        head = (node != tl.gather(node, l1, 0)) | (lane == 0)
+        first = tl.associative_scan(tl.where(head, lane, 0), 0, _larger)
+        s1 = lane - 1 >= first
+        s2 = lane - 2 >= first
+        s4 = lane - 4 >= first
+        s8 = lane - 8 >= first
+        s16 = lane - 16 >= first
+        for i in range(3):
+            wx, gx = node_weight(fx, i, inverse_dx)
+            rx = (i - fx) * dx
+            for j in range(3):
+                wy, gy = node_weight(fy, j, inverse_dx)
+                ry = (j - fy) * dx
+                w = wx * wy
+                c0 = (value[0] + moment[0] * rx + moment[1] * ry) * w
+                c1 = (value[1] + moment[3] * rx + moment[4] * ry) * w
+                c2 = (value[2] + moment[6] * rx + moment[7] * ry) * w
+                if not MLS:
+                    gw = gx * wy
+                    wg = wx * gy
+                    c0 += slope[0] * gw + slope[1] * wg
+                    c1 += slope[3] * gw + slope[4] * wg
+                    c2 += slope[6] * gw + slope[7] * wg
+                for k in tl.static_range(3):
+                    wr = wz[k] * w * ((k - fz) * dx)
+                    a0 = wz[k] * c0 + wr * moment[2]
+                    a1 = wz[k] * c1 + wr * moment[5]
+                    a2 = wz[k] * c2 + wr * moment[8]
+                    a3 = wz[k] * (w * mass)
+                    if not MLS:
+                        sw = gz[k] * w
+                        a0 += sw * slope[2]
+                        a1 += sw * slope[5]
+                        a2 += sw * slope[8]
+                    a0 = _sum_segments(a0, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                    a1 = _sum_segments(a1, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                    a2 = _sum_segments(a2, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                    a3 = _sum_segments(a3, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                    row = momentum + (node + i * sx + j * sy + k) * WIDTH
+                    tl.atomic_add(row, a0, last, sem="relaxed")
+                    tl.atomic_add(row + 1, a1, last, sem="relaxed")
+                    tl.atomic_add(row + 2, a2, last, sem="relaxed")
+                    tl.atomic_add(row + 3, a3, last, sem="relaxed")
+                    if IMPLICIT:
+                        a4 = _sum_segments(wz[k] * (w * resistance), l1, l2, l4, l8, l16, s1, s2, s4, s8, s16)
+                        tl.atomic_add(row + 4, a4, last, sem="relaxed")
+    else:
+        store9(moving + 15 * count, count, index, C, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_nodes(
+    momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
+    gravity_x, gravity_y, gravity_z,
+    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``updated``: nodal velocities from momenta and masses, which are set back to zero; KEEP for boundaries."""
+    step = tl.load(first_step) + step_offset
+    kick = tl.load(schedule + (step + 1) * 4)
+    decay = tl.load(schedule + (step + 1) * 4 + 2)
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = k < nodes
+    row = momentum + k * WIDTH
+    mass = tl.load(row + 3, mask, 0.0)
+    some = mass > 1.0842022e-19  # the square root of the smallest normal number, as in the definition
+    inverse = tl.where(some, 1.0 / tl.maximum(mass, 1.0842022e-19), 0.0)
+    push = tl.where(some, kick, 0.0)
+    share = inverse
+    if IMPLICIT:
+        yielding = 1.0 / (1 + kick * tl.load(row + 4, mask, 0.0) * inverse)
+        push = push * yielding
+        share = inverse * yielding
+    place = velocity + k * 4
+    tl.store(place, (tl.load(row, mask, 0.0) * share + push * gravity_x) * decay, mask)
+    tl.store(place + 1, (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay, mask)
+    tl.store(place + 2, (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay, mask)
+    if KEEP:
+        tl.store(inverse_mass + k, inverse, mask)
+    zero = mass * 0
+    used = mask & (mass != 0)
+    for c in tl.static_range(WIDTH):
+        tl.store(row + c, zero, used)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_load(
+    order, position, velocity, affine, F_elastic, F_total, lost, internal, constants, moving, count,
+    PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``updated``: particle fields, and the ``constants`` (P, 9) of rows 26 to 34, into the rows of ``moving``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    where = tl.load(order + index, mask, 0)
+    store3(moving, count, index, load3(position, 1, where * 3, mask), mask)
+    store9(moving + 3 * count, count, index, load9(F_elastic, 1, where * 9, mask), mask)
+    store3(moving + 12 * count, count, index, load3(velocity, 1, where * 3, mask), mask)
+    store9(moving + 15 * count, count, index, load9(affine, 1, where * 9, mask), mask)
+    tl.store(moving + 24 * count + index, tl.load(lost + where, mask, 0).to(tl.float32), mask)
+    if INTERNAL:
+        tl.store(moving + 25 * count + index, tl.load(internal + where, mask, 0.0), mask)
+    store9(moving + 26 * count, count, index, load9(constants, 1, where * 9, mask), mask)
+    if PLASTIC:
+        store9(moving + 35 * count, count, index, load9(F_total, 1, where * 9, mask), mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_read(
+    order, moving, count, position, velocity, affine, F_elastic, F_total, lost, internal,
+    PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``updated``: the rows of ``moving`` back to particle fields in the order in which they were given."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    where = tl.load(order + index, mask, 0)
+    store3(position, 1, where * 3, load3(moving, count, index, mask), mask)
+    store9(F_elastic, 1, where * 9, load9(moving + 3 * count, count, index, mask), mask)
+    store3(velocity, 1, where * 3, load3(moving + 12 * count, count, index, mask), mask)
+    store9(affine, 1, where * 9, load9(moving + 15 * count, count, index, mask), mask)
+    tl.store(lost + where, tl.load(moving + 24 * count + index, mask, 0.0) != 0, mask)
+    if INTERNAL:
+        tl.store(internal + where, tl.load(moving + 25 * count + index, mask, 0.0), mask)
+    if PLASTIC:
+        store9(F_total, 1, where * 9, load9(moving + 35 * count, count, index, mask), mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, scene_size, BLOCK: tl.constexpr):
+    """``updated``: mass that the particles of a boundary bring to each node."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    where = tl.load(order + index, mask, 0)
+    mass = tl.load(pinned + where, mask, 0.0)
+    bx, fx, okx = _locate(tl.load(moving + index, mask, 0.0), dx, ox, nx)
+    by, fy, oky = _locate(tl.load(moving + count + index, mask, 0.0), dx, oy, ny)
+    bz, fz, okz = _locate(tl.load(moving + 2 * count + index, mask, 0.0), dx, oz, nz)
+    inside = mask & okx & oky & okz & (mass > 0)
+    node = tl.where(inside, (bx * ny + by) * nz + bz, 0) + (where // scene_size) * (nx * ny * nz)
+    wz, _gz = axis_weights(fz, 1.0)
+    for i in range(3):
+        wx, _gx = node_weight(fx, i, 1.0)
+        for j in range(3):
+            wy, _gy = node_weight(fy, j, 1.0)
+            row = weight + node + (i * ny + j) * nz
+            for k in tl.static_range(3):
+                tl.atomic_add(row + k, mass * (wx * wy * wz[k]), inside, sem="relaxed")
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_look(moving, count, out, WAVE: tl.constexpr, BLOCK: tl.constexpr):
+    """``updated``: as ``largest_speed``, from the rows of ``moving``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    F = load9(moving + 3 * count, count, index, mask)
+    mu = tl.load(moving + 28 * count + index, mask, 0.0)
+    lam = tl.load(moving + 29 * count + index, mask, 0.0)
+    density = tl.load(moving + 26 * count + index, mask, 1.0) / tl.load(moving + 27 * count + index, mask, 1.0)
+    v = load3(moving + 12 * count, count, index, mask)
+    speed = wave_speed(F, density, mu, lam, WAVE, True) + tl.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    keep_largest(out, speed, mask)
