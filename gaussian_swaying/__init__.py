@@ -60,12 +60,13 @@ if TYPE_CHECKING:
     from gaussian_swaying.rendering.torch_renderer import TorchRenderer
     from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
     from gaussian_swaying.simulation.edits import Edit
+    from gaussian_swaying.simulation.frame import Frame
     from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
     from gaussian_swaying.simulation.physgaussian.space import Normalisation
     from gaussian_swaying.simulation.recording.recorder import Recorder
     from gaussian_swaying.simulation.recording.trajectory import load_trajectory
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
-    from gaussian_swaying.simulation.simulation import Frame, Simulation
+    from gaussian_swaying.simulation.simulation import Simulation
     from gaussian_swaying.training.data.datamodule import CaptureDataModule
     from gaussian_swaying.training.densification import DefaultDensification, MCMCDensification
     from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
@@ -170,7 +171,8 @@ _HOMES = {
     "simulation.edits": ("Edit",),
     "simulation.physgaussian.camera": ("PhysGaussianCamera",),
     "simulation.physgaussian.space": ("Normalisation",),
-    "simulation.simulation": ("Frame", "Simulation"),
+    "simulation.frame": ("Frame",),
+    "simulation.simulation": ("Simulation",),
     "simulation.recording.recorder": ("Recorder",),
     "simulation.recording.trajectory": ("load_trajectory",),
     "simulation.scene": (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.meters import PeakMemory, WallClock
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.recording.checkpoint import check_state, unreadable
@@ -88,6 +90,21 @@ def _check_checkpoint(
         )
 
 
+def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+    """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
+
+    Args:
+        simulation: What ran.
+        log: Diagnostics of its frames.
+    """
+    scene, points = simulation.scene, simulation.scene.points
+    where = scene.frame.point_to_scene(points.position.double().cpu())
+    elastic = simulation.solver.laws.elastic_particles()
+    size = scene.size * scene.frame.metres_per_unit
+    found = extremes(log, where, size, None if elastic is None else elastic.cpu())
+    return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+
+
 class Run:
     """What a run carries from frame to frame besides the state."""
 
@@ -142,7 +159,7 @@ class Run:
             with suppress(OSError):  # a terminal that has gone
                 bar.close()
                 if progress:
-                    for sentence in simulation.health(self.log[:done])[1]:
+                    for sentence in run_health(simulation, self.log[:done])[1]:
                         print(f"warning: {sentence}", file=sys.stderr)
             simulation.progress = None
             summary: dict[str, Any] = {"status": status, "reason": reason}
@@ -229,7 +246,7 @@ class Run:
         """What is told of a run: see docs/runs.md."""
         simulation, scene, solver = self.simulation, self.simulation.scene, self.simulation.solver
         moved = [entry["displacement_mean"] for entry in log]
-        found, sentences = simulation.health(log)
+        found, sentences = run_health(simulation, log)
         energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
         return {
             "device": describe_device(simulation.device),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
@@ -17,14 +17,13 @@ from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Region, RegionInFrame
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
-from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
+from gaussian_swaying.rendering.protocol import Renderer
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.config import (
     arguments_of,
@@ -52,7 +51,7 @@ from gaussian_swaying.simulation.diagnostics import (
     measure,
 )
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
-from gaussian_swaying.simulation.health import advice, extremes
+from gaussian_swaying.simulation.frame import Frame
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.simulation.physgaussian.space import Normalisation
@@ -465,19 +464,6 @@ class Simulation(nn.Module):
         position = self.scene.points.position
         return self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
 
-    def health(self, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
-        """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
-
-        Args:
-            log: Diagnostics of its frames.
-        """
-        scene, points = self.scene, self.scene.points
-        where = scene.frame.point_to_scene(points.position.double().cpu())
-        elastic = self.solver.laws.elastic_particles()
-        size = scene.size * scene.frame.metres_per_unit
-        found = extremes(log, where, size, None if elastic is None else elastic.cpu())
-        return found, advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
-
     # ---- the run
 
     def run(
@@ -508,46 +494,3 @@ class Simulation(nn.Module):
         """
         self.recorder = recorder or self.recorder
         return run(self, Path(output), frames, resume, dict(settings or {}), progress)
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A frame of a simulation.
-
-    Attributes:
-        simulation: Where it comes from.
-        index: Its number; 0 is at rest.
-        state: The state at its end.
-        health: Energies, momenta, stretch and what else was measured.
-    """
-
-    simulation: Simulation
-    index: int
-    state: MPMState
-    health: FrameDiagnostics
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self.health.time
-
-    @cached_property
-    def gaussians(self) -> DeformedGaussians:
-        """All Gaussians in scene units: means, covariances, normals, and colours as the camera sees them."""
-        painter = self.simulation.painter
-        return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
-
-    def render(self, camera: str = "") -> RenderOutput:
-        """The picture of the frame.
-
-        Args:
-            camera: Which of ``cameras``; empty for ``camera``.
-
-        Returns:
-            Colour, opacity and depth.
-        """
-        painter, gaussians = self.simulation.painter, self.gaussians
-        if camera:
-            gaussians = painter.shade(gaussians, painter.camera_at(self.index, camera))
-        assert gaussians.colors is not None
-        return painter.draw(gaussians, gaussians.colors, painter.camera_at(self.index, camera))

@@ -14,14 +14,16 @@ RESULTS = ROOT / "docs" / "results"
 
 
 def test_one_example_for_each_component():
-    used = ("GaussianSurfaceModel", "MPMSolver", "AeroForce", "WindForce", "DiffuseShader")
-    assert len(EXAMPLES) == README.count("```python") == 5
+    used = ("Simulation", "GaussianSurfaceModel", "MPMSolver", "AeroForce", "WindForce", "DiffuseShader")
+    assert len(EXAMPLES) == README.count("```python") == 6
     for name, (example, _) in zip(used, EXAMPLES, strict=True):
         assert name in example
         assert len([line for line in example.splitlines() if line.strip()]) <= 14
 
 
-@pytest.mark.parametrize(("example", "output"), EXAMPLES, ids=["surface", "solver", "wind", "load", "shading"])
+@pytest.mark.parametrize(
+    ("example", "output"), EXAMPLES, ids=["simulation", "surface", "solver", "wind", "load", "shading"]
+)
 def test_example_prints_what_the_readme_shows(example, output, capsys):
     """The same words, and numbers to 2 % or the last digit that is shown: random ones are drawn from a known seed."""
     torch.manual_seed(0)

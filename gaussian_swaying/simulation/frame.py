@@ -1,0 +1,58 @@
+"""A frame of a simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
+
+if TYPE_CHECKING:
+    from gaussian_swaying.simulation.simulation import Simulation
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame of a simulation.
+
+    Attributes:
+        simulation: Where it comes from.
+        index: Its number; 0 is at rest.
+        state: The state at its end.
+        health: Energies, momenta, stretch and what else was measured.
+    """
+
+    simulation: Simulation
+    index: int
+    state: MPMState
+    health: FrameDiagnostics
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.health.time
+
+    @cached_property
+    def gaussians(self) -> DeformedGaussians:
+        """All Gaussians in scene units: means, covariances, normals, and colours as the camera sees them."""
+        painter = self.simulation.painter
+        return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
+
+    def render(self, camera: str = "") -> RenderOutput:
+        """The picture of the frame.
+
+        Args:
+            camera: Which of ``cameras``; empty for ``camera``.
+
+        Returns:
+            Colour, opacity and depth.
+        """
+        painter, gaussians = self.simulation.painter, self.gaussians
+        if camera:
+            gaussians = painter.shade(gaussians, painter.camera_at(self.index, camera))
+        assert gaussians.colors is not None
+        return painter.draw(gaussians, gaussians.colors, painter.camera_at(self.index, camera))
