@@ -27,6 +27,12 @@ def splat(tmp_path):
     return path
 
 
+@pytest.fixture
+def untried(monkeypatch):
+    """Without the trial runs that find a stiffness: of no account for what is asked, and most of the time."""
+    monkeypatch.setattr("gaussian_swaying.cli.preview.calibrated_suggestion", lambda found, draft, sway: found)
+
+
 def preview(splat, output, *options):
     scene = [] if splat is None else [str(splat)]
     return main([*scene, "--output", str(output), "--device", "cpu", "--height", "96", *options])
@@ -89,6 +95,7 @@ def test_more_sway_is_softer(tmp_path):
     assert hold[0] > 2 * hold[1]
 
 
+@pytest.mark.usefixtures("untried")
 def test_edited_starter_is_kept(splat, tmp_path):
     out = tmp_path / "out"
     for change in ("", "# mine\n", "# mine too\n"):
@@ -101,6 +108,7 @@ def test_edited_starter_is_kept(splat, tmp_path):
     assert not (out / "starter.3.yaml").exists()
 
 
+@pytest.mark.usefixtures("untried")
 def test_options_replace_guesses(splat, tmp_path, capsys):
     assert preview(splat, tmp_path / "a", "--up", "-y", "--hold", "+x", "--longest-side", "2") == 0
     found = json.loads((tmp_path / "a/preview.json").read_text())["suggestion"]
@@ -184,6 +192,7 @@ def test_a_point_cloud_is_called_after_its_training():
     assert splat_name("/data/bonsai/point_cloud/iteration_30000/point_cloud.ply") == "bonsai"
 
 
+@pytest.mark.usefixtures("untried")
 def test_weak_guesses_print_their_commands(splat, tmp_path, capsys):
     """A flag whose origin is far from its pole may hang from its top."""
     cloud = FlagScene(spacing=0.08).generate()

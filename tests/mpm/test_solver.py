@@ -176,7 +176,7 @@ def test_formulations_agree_on_a_vibrating_block():
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_flag_hung_by_one_row_does_not_slide_off(formulation):
-    """Ten seconds: a pin that only resets its particles lets the sheet fall at 70 % of free fall."""
+    """Four seconds: a pin that only resets its particles lets the sheet fall at 70 % of free fall."""
     points = _sheet(spacing=0.05, e=1e4)
     pin = PinnedRegion(Box([None, None, 0.37], [None, None, None]))
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[pin], damping=0.5)
@@ -184,10 +184,10 @@ def test_flag_hung_by_one_row_does_not_slide_off(formulation):
     row = points.position[:, 2] > 0.37
     assert int(row.sum()) == 12
     with torch.inference_mode():
-        for _ in range(250):
+        for _ in range(100):
             steps = solver.substeps(state, 0.04)
             state = solver.rollout(solver.fit_grid(state, 0.04), 0.04 / steps, steps)
-    # static stretch: rho g L² / (2 E) = 2.4 mm; free fall would be 490 m, sliding off 340 m
+    # static stretch: rho g L² / (2 E) = 2.4 mm; free fall would be 78 m, sliding off 54 m
     assert float((state.position - points.position)[row].norm(dim=-1).max()) < 0.01
     assert float((state.position - points.position).norm(dim=-1).max()) < 0.05
     assert not bool(state.lost.any())
