@@ -65,7 +65,7 @@ def interpolate_keys(
 
 
 def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
-    """Slope of the smooth interpolant at a key: weighted harmonic mean of the slopes on both sides, zero at an extremum."""
+    """Slope of the smooth interpolant at a key: weighted harmonic mean of the slopes beside it, zero at an extremum."""
     if not 0 < k < len(times) - 1:
         return 0.0
     left, right = times[k] - times[k - 1], times[k + 1] - times[k]
