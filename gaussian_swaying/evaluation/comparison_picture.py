@@ -30,9 +30,10 @@ def comparison_picture(
     Args:
         reference: Picture from 0 to 1, shape (H, W, 3).
         image: Picture of the run, of the same shape.
-        labels: What is written above the two.
+        labels: Text above the two.
         error_scale: Error at the bright end.
-        panel_width: Wider pictures are averaged down by the smallest whole number that makes them fit [pixels].
+        panel_width: Largest width [pixels]; wider pictures are averaged down by the smallest whole number that makes
+            them fit.
 
     Returns:
         Picture, uint8, shape (h + band, 3 w + gaps, 3).
