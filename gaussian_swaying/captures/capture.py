@@ -1,4 +1,4 @@
-"""Captured scenes: images with their cameras, and the points that came with them."""
+"""Captured scenes: images with their cameras and points."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class View:
     """One image of a capture with the camera that took it.
 
     Attributes:
-        name: Path of the image as the capture's files give it.
+        name: Path of the image as written in the capture's files.
         image_path: The image on disk.
         camera: Pinhole camera of the pixels that :meth:`load` returns, float32.
         split: ``train``, ``val`` or ``test``.
         lens: Lens of the image on disk.
-        downscale: How many pixels on a side of the undistorted image become one.
+        downscale: Factor by which width and height of the undistorted image are reduced.
     """
 
     name: str
@@ -45,28 +45,28 @@ class View:
     downscale: int = 1
 
     def load(self) -> Tensor:
-        """Read the pixels, undistorted and made smaller, see :func:`~gaussian_swaying.captures.images.load_image`.
+        """Read the pixels, undistorted and downscaled, see :func:`~gaussian_swaying.captures.images.load_image`.
 
         Returns:
-            Dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha.
+            Dtype uint8, shape (H, W, 3), or (H, W, 4) with premultiplied alpha.
 
         Raises:
-            ValueError: If the image cannot be read any more.
+            ValueError: If the image can no longer be read.
         """
         return load_image(self.image_path, self.lens, self.downscale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A captured scene; no pixels are in memory.
+    """A captured scene, without pixels in memory.
 
     Attributes:
         path: Where it was read from.
         views: Its views, sorted by name.
         center: Mean position of the training cameras [scene units], float32, shape (3,).
-        extent: 1.1 times the largest distance of a training camera from ``center`` [scene units], which 3DGS scales
-            its learning rates and thresholds by.
-        points: Points that came with the capture [scene units], float32, shape (P, 3), or None.
+        extent: 1.1 times the largest distance of a training camera from ``center`` [scene units]. Learning rates and
+            thresholds of 3DGS scale with it.
+        points: Points of the capture [scene units], float32, shape (P, 3), or None.
         colors: Their colours in 0 to 1, float32, shape (P, 3), or None.
     """
 
@@ -90,18 +90,18 @@ def read_capture(
     test_every: int = 8,
     images: str = "images",
 ) -> Capture:
-    """Read the cameras of a capture and check that its images are there and have the right size.
+    """Read the cameras of a capture and check that its images exist and have the right size.
 
-    Lens distortion is taken out: the cameras are the pinhole cameras of the undistorted, cropped images. Where a
-    folder ``images_2``, ``images_4`` ... made for the wanted size stands beside the images, it is read instead.
+    Lens distortion is removed: the cameras are the pinhole cameras of the undistorted, cropped images. If there is a
+    folder ``images_2``, ``images_4`` ... of the wanted size beside the images, it is read instead.
 
     Args:
         path: Folder with ``sparse/0`` or ``sparse`` (COLMAP), with ``transforms.json`` or with
             ``transforms_train.json``; or a transforms.json itself.
-        format: ``colmap``, ``transforms``, or ``auto`` for the first of these that is there.
-        downscale: How many pixels on a side become one.
-        test_every: Every how many-th image, in the order of the names and from the first, is for testing; 0 for none.
-            Where the capture's files say what is for training and testing, they are followed instead.
+        format: ``colmap``, ``transforms``, or ``auto`` for the first of these that exists.
+        downscale: Factor by which width and height are reduced.
+        test_every: Every n-th image, sorted by name and starting with the first, is used for testing; 0 for none. Not
+            used if the capture's files define training and test images.
         images: Folder of the images of a COLMAP model.
 
     Returns:
@@ -109,11 +109,11 @@ def read_capture(
 
     Raises:
         FileNotFoundError: If ``path`` does not exist.
-        ValueError: If a file, a field or an image is bad, or nothing is left to train on. The message names it and
-            the remedy.
+        ValueError: If a file, a field or an image is bad, or there are no training images. The message names the
+            problem and the remedy.
 
     Warns:
-        UserWarning: Once, with the number of frames that were left out because they have no image.
+        UserWarning: Once, with the number of frames left out because they have no image.
     """
     root = Path(path)
     check_choice("format", format, FORMATS)
@@ -139,7 +139,7 @@ def read_capture(
     else:
         wanted = {"colmap": "sparse/0 or sparse", "transforms": "transforms.json or transforms_train.json"}
         names = " or ".join(wanted.values()) if format == "auto" else wanted[format]
-        raise ValueError(f"{root} is not a capture: it has no {names}; give the folder that holds it.")
+        raise ValueError(f"{root} is not a capture: it has no {names}; give the folder that contains it.")
     if not posed:
         first = f", the first of them {missing[0]}" if missing else ""
         raise ValueError(f"{root} has no images: all {len(missing)} are missing{first}; put them beside its cameras.")
@@ -151,7 +151,7 @@ def read_capture(
     extent = 1.1 * float((eyes - center).norm(dim=-1).max())
     if not extent > 0:
         raise ValueError(
-            f"All {len(eyes)} training cameras of {root} stand at the same place, so its depth cannot be learned: "
+            f"All {len(eyes)} training cameras of {root} are at the same place, so its depth cannot be learned: "
             "add images from elsewhere, or lower `test_every` to 0."
         )
     if missing:
@@ -165,7 +165,7 @@ def read_capture(
 
 
 def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
-    """The point whose summed squared distance to all optical axes is least.
+    """The point with the smallest sum of squared distances to all optical axes.
 
     Args:
         cameras: At least one camera.
@@ -183,7 +183,7 @@ def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
 
 
 def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
-    """The point nearest to all optical axes, if most cameras have it before them.
+    """The point nearest to all optical axes, if it is in front of most cameras.
 
     Args:
         cameras: At least one camera.
@@ -199,7 +199,7 @@ def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
 
 
 def view_reach(cameras: Sequence[Camera], focus: Tensor) -> float:
-    """How far to a side of a point (3,) the median camera sees [scene units]."""
+    """How far the median camera sees to the side of a point (3,) [scene units]."""
     reach = []
     for camera in cameras:
         distance = math.dist(camera.position.tolist(), focus.tolist())
@@ -215,7 +215,7 @@ def _check_count(name: str, value: int, least: int) -> None:
 
 
 def _splits(root: Path, posed: list[PosedImage], test_every: int) -> list[str]:
-    """Split of each image; an image that the files leave out of their own split is for training."""
+    """Split of each image; images without a split in the files are for training."""
     if any(item.split is not None for item in posed):
         splits = [item.split or "train" for item in posed]
         remedy = "add images to its train split"
@@ -228,7 +228,7 @@ def _splits(root: Path, posed: list[PosedImage], test_every: int) -> list[str]:
 
 
 def _view(root: Path, item: PosedImage, split: str, downscale: int) -> View:
-    """Check an image on disk against its lens and make the view of the wanted size."""
+    """Check the size of an image on disk against its lens, and make the downscaled view."""
     path, lens, factor = item.path, item.lens, downscale
     small = _made_smaller(root, path, downscale) if downscale > 1 else None
     if small is not None:

@@ -1,4 +1,4 @@
-"""The cameras of a capture as camera paths of a run: one of them, or a journey through all."""
+"""The cameras of a capture as camera paths of a run: one of them, or a path through all."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transfo
 def read_views(
     path: str | Path, width: int | None = None, height: int | None = None, near: float = 0.01
 ) -> list[tuple[str, Camera]]:
-    """Read the cameras of a capture; its images need not be there.
+    """Read the cameras of a capture; its images need not exist.
 
     Args:
         path: A transforms.json, a folder with one (or with ``transforms_train.json`` ...), a COLMAP model, or a folder
             with ``sparse/0`` or ``sparse``, which is preferred.
         width: Width of the images to render [pixels]; by default that of the capture.
-        height: Height of the images to render [pixels], likewise.
+        height: Height of the images to render [pixels]; by default that of the capture.
         near: Near plane [scene units].
 
     Returns:
-        Name and camera of each view, sorted by name. Lens distortion is left out: they are the pinhole cameras of the
-        same focal lengths.
+        Name and camera of each view, sorted by name. Lens distortion is ignored: the cameras are pinhole cameras with
+        the same focal lengths.
 
     Raises:
         ValueError: If there are no cameras, or a file is bad. The message names it and the remedy.
@@ -54,31 +54,31 @@ def read_views(
                 views.append((name, camera_of_transforms(file, data, index, width, height, near)))
     if not views:
         raise ValueError(
-            f"`{path}` holds no cameras: give a transforms.json, a COLMAP model (cameras and images, .bin or .txt), or "
-            "the folder that holds one."
+            f"`{path}` has no cameras: give a transforms.json, a COLMAP model (cameras and images, .bin or .txt), or "
+            "the folder that contains one."
         )
     return sorted(views, key=lambda view: view[0])
 
 
 class CaptureCamera(CameraPath):
-    """Cameras of a ``transforms.json`` or a COLMAP model: one of them, or a journey through all in the order of names.
+    """Cameras of a ``transforms.json`` or a COLMAP model: one of them, or a path through all, sorted by name.
 
-    The files are read at the first frame; the images need not be there. Lens distortion is left out.
+    The files are read at the first frame; the images need not exist. Lens distortion is ignored.
 
     Args:
-        path: A transforms.json, a COLMAP model, or a folder that holds one.
-        view: Name of the view to stand at, with or without folder and extension, or its number from 0 in the order of
-            the names; null to travel through all.
-        seconds_per_view: Time from one view to the next [s]; the journey ends at the last.
-        interpolation: Between views: ``smooth`` or ``linear``, as of KeyframedCamera.
+        path: A transforms.json, a COLMAP model, or a folder that contains one.
+        view: Name of the view, with or without folder and extension, or its number from 0 when sorted by name; null to
+            move through all views.
+        seconds_per_view: Time from one view to the next [s]; the path ends at the last.
+        interpolation: Between views: ``smooth`` or ``linear``, as for KeyframedCamera.
         width: Image width [pixels]; by default that of the capture.
         height: Image height [pixels]; by default that of the capture.
         near: Near plane [scene units].
 
     Raises:
         TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range; at the first frame, if the files are bad or have no such view, or if
-            views of different sizes are to be travelled through without ``width`` and ``height``.
+        ValueError: If a number is out of range; at the first frame, if the files are bad or have no such view, or if a
+            path through views of different sizes has no ``width`` and ``height``.
     """
 
     captured = True
@@ -134,7 +134,7 @@ class CaptureCamera(CameraPath):
             )
         eyes = torch.stack([camera.position for camera in cameras]).double()
         quats = rotation_to_quat(torch.stack([camera.world_to_camera[:3, :3] for camera in cameras]).double())
-        for k, _ in enumerate(pairwise(cameras)):  # of the two signs of a quaternion, that of the shorter way
+        for k, _ in enumerate(pairwise(cameras)):  # use the sign of the quaternion that gives the shorter way
             if float(quats[k] @ quats[k + 1]) < 0:
                 quats[k + 1] = -quats[k + 1]
         lenses = torch.stack([camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]).double()

@@ -16,7 +16,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.captures.images import PosedImage
 from gaussian_swaying.captures.lens import NO_DISTORTION, Lens
 
-# name and number of parameters of each camera model, by COLMAP's numbering
+# name and number of parameters of each camera model, in the order of COLMAP's numbers
 _MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -43,7 +43,7 @@ def colmap_model(path: Path) -> Path | None:
 
 
 def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str], tuple[Tensor, Tensor] | None]:
-    """Read a sparse model: ``cameras``, ``images`` and, if there, ``points3D``, each as .bin or else .txt.
+    """Read a sparse model: ``cameras``, ``images`` and optionally ``points3D``, each as .bin or else .txt.
 
     Args:
         model: Folder of the model.
@@ -54,7 +54,7 @@ def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str],
         the points, each float32 of shape (P, 3), or None.
 
     Raises:
-        ValueError: If a file is missing or damaged, or a camera model has a distortion that cannot be undone here.
+        ValueError: If a file is missing or damaged, or the distortion of a camera model is not supported.
     """
     posed: list[PosedImage] = []
     missing: list[str] = []
@@ -76,7 +76,7 @@ def read_colmap(model: Path, images: Path) -> tuple[list[PosedImage], list[str],
 
 
 def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
-    """Read the cameras of a sparse model alone; the images themselves need not be there.
+    """Read only the cameras of a sparse model; the images need not exist.
 
     Args:
         model: Folder of the model.
@@ -85,7 +85,7 @@ def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
         Name, lens and world-to-camera matrix (float64, shape (4, 4)) of each image, in the order of the file.
 
     Raises:
-        ValueError: If a file is missing or damaged, or a camera model has a distortion that cannot be undone here.
+        ValueError: If a file is missing or damaged, or the distortion of a camera model is not supported.
     """
     lenses: dict[int, Lens] = _read(model, "cameras", _binary_cameras, _text_cameras)
     rows: list[tuple[str, tuple[float, ...], int]] = _read(model, "images", _binary_images, _text_images)
@@ -115,14 +115,14 @@ def _pose(where: str, pose: tuple[float, ...]) -> Tensor:
 
 
 class _UnknownLensError(Exception):
-    """A whole file with a lens that cannot be undone here, as against a damaged one."""
+    """The file is intact, but its lens model is not supported."""
 
 
 def _lens(identity: int, model: str, width: int, height: int, values: tuple[float, ...]) -> Lens:
     """Lens of a COLMAP camera."""
     if model not in _READABLE:
         raise _UnknownLensError(
-            f"camera {identity} has the model {model}, whose distortion cannot be undone here (only "
+            f"camera {identity} has the model {model}, whose distortion is not supported (only "
             f"{', '.join(_READABLE)}): run `colmap image_undistorter` and give its output"
         )
     if len(values) != dict(_MODELS)[model]:
@@ -217,7 +217,7 @@ def _text_images(lines: Iterator[list[str]]) -> list[tuple[str, tuple[float, ...
             result.append((" ".join(words[9:]), tuple(float(word) for word in words[1:8]), int(words[8])))
             if not words[9:]:
                 raise ValueError(f"image {words[0]} has no name")
-            next(lines, None)  # the points that it sees, an empty line if none
+            next(lines, None)  # the line of points that it sees, which may be empty
     return result
 
 

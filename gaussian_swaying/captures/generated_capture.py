@@ -1,4 +1,4 @@
-"""A capture made in code: photographs of a rippled flag whose true surface is known."""
+"""A capture made in code: photographs of a rippled flag with a known surface."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 
-_STEPS = 24  # samples along a ray between which the first crossing is looked for
+_STEPS = 24  # samples along a ray, to find the interval of the first crossing
 _LIGHT = (0.4, -0.8, 0.45)
 
 
@@ -29,7 +29,7 @@ class TrueSurface:
         vertices: Points on the surface [m], float64, shape (V, 3).
         faces: Triangles as indices of vertices, shape (T, 3).
         normals: Unit normals at the vertices, on the -y side, float64, shape (V, 3).
-        colors: Colours that a camera sees there, in 0 to 1, shape (V, 3).
+        colors: Colours as seen by a camera, in 0 to 1, shape (V, 3).
         area: Area of one side of the smooth surface [m²].
     """
 
@@ -61,9 +61,9 @@ class GeneratedCapture:
     """Photographs of a rippled, patterned flag from all around, with its true normals and area.
 
     The flag is the sheet y = f(x, z) over 0 <= x <= ``width``, 0 <= z <= ``height``, in metres, a ripple that grows
-    from the pole side at x = 0. It is drawn by intersecting a ray with the sheet for each sample of each pixel, so what
-    the images show is the true surface and no splat. Light is in the colours and the same for both sides and all
-    cameras. The cameras stand on a sphere around the flag, evenly spread, from 35 degrees below to 60 above, with z up.
+    from the pole side at x = 0. It is drawn by intersecting a ray with the sheet for each sample of each pixel, so the
+    images show the true surface and not a splat. Light is baked into the colours and is the same for both sides and all
+    cameras. The cameras are spread evenly on a sphere around the flag, from 35 degrees below to 60 above, with z up.
 
     Args:
         views: Number of images.
@@ -74,8 +74,8 @@ class GeneratedCapture:
         waves: Number of waves along x.
         distance: Of the cameras from the centre of the flag [m].
         fov: Field of view [degrees].
-        samples: Each pixel is the mean of this number of samples on a side.
-        seed: Of the pattern and the places of the cameras.
+        samples: Each pixel is the mean of ``samples`` x ``samples`` samples.
+        seed: Seed of the pattern and of the positions of the cameras.
 
     Raises:
         ValueError: If a number is out of range.
@@ -171,8 +171,8 @@ class GeneratedCapture:
         """Nearest points on the sheet, by Gauss-Newton steps in its tangent plane from the point straight below.
 
         Args:
-            points: Points [m], shape (N, 3). For one that is further away than the sheet's radius of curvature, another
-                point than the nearest may be found.
+            points: Points [m], shape (N, 3). For a point farther away than the sheet's radius of curvature, the result
+                may not be the nearest point.
             iterations: Number of steps.
 
         Returns:
@@ -198,7 +198,7 @@ class GeneratedCapture:
         low, high = math.sin(math.radians(-35.0)), math.sin(math.radians(60.0))
         cameras = []
         for index in range(self.views):
-            # two irrational steps: all views, and every eighth of them, are spread evenly
+            # two irrational steps, so that all views, and also every eighth of them, are spread evenly
             share = ((index + 0.5) * 0.5 * (math.sqrt(5) - 1)) % 1.0
             sine = low + (high - low) * share
             azimuth = self._turn + 2 * math.pi * ((index * (math.sqrt(2) - 1)) % 1.0)
@@ -240,7 +240,7 @@ class GeneratedCapture:
         return functional.avg_pool2d(packed.permute(2, 0, 1)[None], n)[0].permute(1, 2, 0)
 
     def _cast(self, camera: Camera, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Whether each ray hits, depth of the hit, and its x and z; of shape (rows, columns)."""
+        """Whether each ray hits, the depth of the hit, and its x and z, each of shape (rows, columns)."""
         intrinsics, view = camera.intrinsics.double(), camera.world_to_camera.double()
         v, u = torch.meshgrid(
             (row - intrinsics[1, 2]) / intrinsics[1, 1], (column - intrinsics[0, 2]) / intrinsics[0, 0], indexing="ij"
@@ -265,7 +265,7 @@ class GeneratedCapture:
         return hit.reshape(shape), depth.reshape(shape), x.reshape(shape), z.reshape(shape)
 
     def _first_crossing(self, eye: Tensor, rays: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor]:
-        """Which rays cross the sheet between two depths, and the first depth where those do."""
+        """Which rays cross the sheet between two depths, and the first depth of these crossings."""
 
         def above(t: Tensor, rays: Tensor) -> Tensor:
             x, y, z = (eye[axis] + t * rays[:, axis] for axis in range(3))
@@ -289,18 +289,18 @@ class GeneratedCapture:
     def write(self, folder: str | os.PathLike[str], threads: int = 2) -> Path:
         """Write the capture: ``images/``, ``transforms.json``, ``mesh.ply`` and ``truth.npz``.
 
-        ``truth.npz`` holds ``vertices``, ``faces``, ``normals`` and ``area`` of :class:`TrueSurface`. Images are PNG
+        ``truth.npz`` contains ``vertices``, ``faces``, ``normals`` and ``area`` of :class:`TrueSurface`. Images are PNG
         with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
 
         Args:
             folder: Folder to write, new or empty.
-            threads: Number of images in work at a time.
+            threads: Number of images drawn at a time.
 
         Returns:
             The folder.
 
         Raises:
-            ValueError: If the folder holds files already.
+            ValueError: If the folder already contains files.
         """
         from imageio.v3 import imwrite
         from plyfile import PlyData, PlyElement

@@ -1,4 +1,4 @@
-"""Photographs on disk and the pixels that training sees: read, composited, undistorted, made smaller."""
+"""Photographs on disk as pixels for training: read, composited, undistorted and downscaled."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from torch import Tensor
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.captures.lens import Lens, remap
 
-_PIXELS = 80_000_000  # and one more for each byte of the file: reading takes some 12 bytes a pixel
+_PIXELS = 80_000_000  # plus one for each byte of the file: reading takes about 12 bytes per pixel
 _WITH_ALPHA = ("RGBA", "LA", "PA", "P", "La", "RGBa")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImage:
-    """What a capture's files say about one image.
+    """One image as described by a capture's files.
 
     Attributes:
-        name: Path of the image as the files give it.
+        name: Path of the image as written in the files.
         path: The image on disk.
         lens: Its intrinsics and size.
         world_to_camera: Pose with OpenCV axes, float64, shape (4, 4).
-        split: ``train``, ``val`` or ``test`` where the files say so, else None.
+        split: ``train``, ``val`` or ``test`` if the files define it, else None.
     """
 
     name: str
@@ -41,18 +41,18 @@ def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image file [pixels], from its header.
 
     Raises:
-        ValueError: If the file is missing, is not an image, or has far more pixels than its size lets one expect.
+        ValueError: If the file is missing, is not an image, or has far too many pixels for its file size.
     """
     import imageio.v3 as iio
 
     _refuse_pipes(path)
     try:
         height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]
-    except Exception as error:  # the readers of the formats raise what they like
+    except Exception as error:  # the readers of the formats raise many kinds of errors
         raise _unreadable(path, error) from error
     if width * height > _PIXELS + Path(path).stat().st_size:
         raise ValueError(
-            f"The image {path} announces {width:,} x {height:,} pixels, too many for its size: make it smaller, or "
+            f"The image {path} claims {width:,} x {height:,} pixels, too many for its file size: make it smaller, or "
             "delete it to leave it out."
         )
     return int(width), int(height)
@@ -62,14 +62,14 @@ def read_image(path: str | Path) -> Tensor:
     """Read an image of 8 or 16 bits, grey or colour, with or without alpha.
 
     Args:
-        path: File in any format that Pillow reads; of an animation the first picture. Rotation tags are ignored, as
-            tools that find camera poses ignore them.
+        path: File in any format that Pillow reads; the first picture of an animation. Rotation tags are ignored, as
+            tools for camera poses do.
 
     Returns:
-        Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) if the alpha channel says anything.
+        Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) if the image is not fully opaque.
 
     Raises:
-        ValueError: If the file is missing or damaged, or holds numbers that are not colours.
+        ValueError: If the file is missing or damaged, or its numbers are not colours.
     """
     import imageio.v3 as iio
 
@@ -80,10 +80,10 @@ def read_image(path: str | Path) -> Tensor:
             deep = mode.startswith("I")
             convert = None if deep or mode == "F" else "RGBA" if mode in _WITH_ALPHA else "RGB"
             pixels = np.asarray(file.read(index=0, mode=convert))
-    except Exception as error:  # the readers of the formats raise what they like
+    except Exception as error:  # the readers of the formats raise many kinds of errors
         raise _unreadable(path, error) from error
     if mode == "F":
-        raise ValueError(f"The image {path} holds floating-point numbers: convert it to 8-bit PNG or JPEG.")
+        raise ValueError(f"The image {path} has floating-point numbers: convert it to 8-bit PNG or JPEG.")
     if deep:
         pixels = np.repeat((pixels.astype(np.int64) // 257).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
     if pixels.shape[-1] == 4 and bool((pixels[..., 3] == 255).all()):
@@ -92,7 +92,7 @@ def read_image(path: str | Path) -> Tensor:
 
 
 def _refuse_pipes(path: str | Path) -> None:
-    """Raise ValueError if something other than a file has the name of an image; reading a pipe may never end."""
+    """Raise ValueError if the path is not a regular file; reading a pipe may never end."""
     if Path(path).exists():
         check_regular(path, "the image")
 
@@ -105,9 +105,9 @@ def _unreadable(path: str | Path, error: Exception) -> ValueError:
 
 
 def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
-    """Read an image, take the distortion out and average it down.
+    """Read an image, undistort it and average it down.
 
-    Alpha is multiplied into the colours first, so that what is transparent bleeds into nothing.
+    Colours are premultiplied with alpha first, so that transparent pixels do not bleed into others.
 
     Args:
         path: The file.
@@ -136,16 +136,16 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
 
 
 def check_image_size(path: str | Path, size: tuple[int, int], lens: Lens) -> None:
-    """Raise ValueError unless an image of ``size`` (width, height) [pixels] fits its lens."""
+    """Raise ValueError unless an image of ``size`` (width, height) [pixels] matches its lens."""
     if size != (lens.width, lens.height):
         raise ValueError(
             f"The image {path} has {size[0]} x {size[1]} pixels, but its camera has {lens.width} x {lens.height}: "
-            "put the image that the camera was made for in its place, or correct the size in the camera file."
+            "replace it by the image that belongs to the camera, or correct the size in the camera file."
         )
 
 
 def average_down(image: Tensor, factor: int) -> Tensor:
-    """Mean over squares of ``factor`` x ``factor`` pixels; what does not fill one is cut off below and on the right.
+    """Mean over squares of ``factor`` x ``factor`` pixels; incomplete squares below and on the right are cut off.
 
     Args:
         image: Floating-point picture, channels first, shape (C, H, W).
@@ -165,7 +165,7 @@ def straight_colors(pixels: Tensor) -> tuple[Tensor, Tensor | None]:
 
     Returns:
         Colours in 0 to 1 as float32, shape (..., 3), not multiplied with alpha and black where it is 0; alpha, shape
-        (..., 1), or None without it. The picture in front of a background is colours alpha + (1 - alpha) background.
+        (..., 1), or None without it. The picture over a background is colours alpha + (1 - alpha) background.
 
     Example:
         >>> straight_colors(torch.tensor([51, 0, 0, 51], dtype=torch.uint8))

@@ -1,4 +1,4 @@
-"""Points that Gaussians start from: those of a capture, of a file, of a mesh, or at random."""
+"""Initial points for Gaussians: from a capture, a file or a mesh, or random."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def initial_points(
     seed: int = 0,
     half_side: float | None = None,
 ) -> PointCloud:
-    """Points that the training of a capture starts from.
+    """Initial points for training on a capture.
 
-    Random points are not nearer to a camera than half of its distance to the point that all cameras look at: what
-    starts there ends as haze that only this camera sees.
+    Random points are never closer to a camera than half of its distance to the point that all cameras look at.
+    Otherwise they would end as haze that only this camera sees.
 
     Args:
         capture: The capture.
-        source: ``capture`` for the points that came with it, ``random`` for a cube, ``auto`` for the former if there
-            are any and else the latter, or a file: .ply with points, .ply or .obj with a mesh.
-        count: Number of points in the cube or on the mesh. Points of a capture or a file are all taken.
-        seed: Of the random numbers.
-        half_side: Half the side of the cube [scene units]. The default is what the median camera sees to either side
+        source: ``capture`` for the points of the capture, ``random`` for a cube, ``auto`` for the points of the capture
+            if it has any, else random; or a file: .ply with points, .ply or .obj with a mesh.
+        count: Number of points in the cube or on the mesh. All points of a capture or a file are used.
+        seed: Seed of the random numbers.
+        half_side: Half the side of the cube [scene units]. The default is how far the median camera sees to each side
             of the point that all cameras look at.
 
     Returns:
@@ -51,7 +51,7 @@ def initial_points(
     if source == "capture" or (source == "auto" and capture.points is not None):
         if capture.points is None or capture.colors is None:
             raise ValueError(
-                f"The capture {capture.path} came with no points: set the initial points to random or to a file."
+                f"The capture {capture.path} has no points: set the initial points to random or to a file."
             )
         return PointCloud(capture.points, capture.colors)
     if source in ("auto", "random"):
@@ -77,7 +77,7 @@ def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -
         center: Centre of the cube [scene units], shape (3,).
         half_side: Half its side [scene units].
         count: Number of points.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
     """
     check_vector("center", center)
     check_positive("half_side", half_side)
@@ -87,7 +87,7 @@ def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -
 
 
 def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: int, seed: int) -> PointCloud:
-    """Random points of a cube, of which those close to a camera are drawn again."""
+    """Random points of a cube; points close to a camera are drawn again."""
     points = colors = torch.zeros(0, 3)
     for attempt in range(_ATTEMPTS):
         more = random_points(center, reach, count, seed + 1_000_003 * attempt)
@@ -102,7 +102,7 @@ def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: in
 
 
 def _clear(capture: Capture, center: Tensor, points: Tensor) -> Tensor:
-    """Which points (N, 3) no camera has closer than half its distance to the centre, shape (N,)."""
+    """Which points (N, 3) are at least half as far from every camera as the centre, shape (N,)."""
     eyes = torch.stack([view.camera.position for view in capture.split("train")]).float()
     limit = 0.5 * (eyes - center.float()).norm(dim=-1)
     return torch.cat([(torch.cdist(part, eyes) >= limit).all(-1) for part in points.split(1 << 16)])
@@ -116,13 +116,13 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
     the distance up to ten times its half side; each half gives half of the points, so that the background has some.
 
     Args:
-        capture: The capture; photos with alpha are taken in front of black.
+        capture: The capture; photos with alpha are put over black.
         count: Number of points.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
         half_side: Half the side of the cube [scene units]; that of :func:`initial_points` by default.
 
     Returns:
-        The points, with the mean of the colours that the photos show there.
+        The points, with the mean of their colours in the photos.
 
     Raises:
         ValueError: If fewer than ``count`` candidates are in three photos and not close to a camera.
@@ -171,7 +171,7 @@ def _focus(capture: Capture) -> Tensor:
     focus = common_focus([view.camera for view in capture.split("train")])
     if focus is None:
         raise ValueError(
-            f"The cameras of {capture.path} look at no common point, so no cube for random initial points is known: "
+            f"The cameras of {capture.path} do not look at a common point, so no random initial points can be placed: "
             "set the initial points to a .ply or .obj file."
         )
     return focus

@@ -1,4 +1,4 @@
-"""Lenses with radial and tangential distortion, and the pinhole picture that remains when it is taken out."""
+"""Lenses with radial and tangential distortion, and the pinhole picture after undistortion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def distort(points: Tensor, coefficients: tuple[float, ...]) -> Tensor:
-    r"""Where a lens with Brown-Conrady distortion sees what a pinhole camera sees at ``points``.
+    r"""Apply Brown-Conrady distortion to ``points`` of a pinhole camera.
 
     .. math::
         \mathbf{x}_d = (1 + k_1 r^2 + k_2 r^4 + k_3 r^6)\,\mathbf{x} +
@@ -146,10 +146,10 @@ class Lens:
         return whole.resized(width, height)
 
     def undistorted(self) -> Lens:
-        """The pinhole lens of the same focal lengths that sees the largest upright rectangle the image covers.
+        """The pinhole lens with the same focal lengths that covers the largest upright rectangle in the image.
 
-        Every pixel of the new picture lies between pixel centres of the old one, so nothing has to be invented at
-        the edges. With barrel distortion the new picture may be larger than the old one, at most twice.
+        Every pixel of the new picture is between pixel centres of the old one, so no pixel is made up at the edges.
+        With barrel distortion the new picture may be larger than the old one, at most twice.
 
         Raises:
             ValueError: If the coefficients fold the image or leave less than a fifth of it.
@@ -176,7 +176,7 @@ def _undistorted(lens: Lens) -> Lens:
         "bottom": torch.stack([x, y[-1:].expand(len(x))], -1),
     }
     seen = {k: undistort((e - center) / focal, lens.distortion) * focal + center for k, e in edges.items()}
-    # first and one past the last pixel whose centre lies inside, in pixels of the old image
+    # first and one past the last pixel whose centre is inside, in pixels of the old image
     left = math.ceil(max(float(seen["left"][:, 0].max()), -0.5 * lens.width) - 0.5)
     right = math.floor(min(float(seen["right"][:, 0].min()), 1.5 * lens.width) - 0.5) + 1
     top = math.ceil(max(float(seen["top"][:, 1].max()), -0.5 * lens.height) - 0.5)
@@ -191,7 +191,7 @@ def _undistorted(lens: Lens) -> Lens:
 
 
 def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
-    """Picture that a pinhole lens takes, by bilinear interpolation in the picture of a distorted one.
+    """Picture of a pinhole lens, by bilinear interpolation in the picture of a distorted one.
 
     Args:
         image: Picture taken with ``source``, channels first, floating point, shape (C, H, W).

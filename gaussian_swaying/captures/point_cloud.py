@@ -1,4 +1,4 @@
-"""Coloured points, and how they are read from .ply and .obj files or drawn from a mesh."""
+"""Coloured points, read from .ply and .obj files or sampled on a mesh."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def sample_mesh(vertices: PointCloud, faces: Tensor, count: int, seed: int = 0) 
         seed: Of the random numbers.
 
     Raises:
-        ValueError: If the mesh has no area or a face names a vertex that does not exist.
+        ValueError: If the mesh has no area or a face refers to a vertex that does not exist.
     """
     if len(faces) == 0 or int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
         raise ValueError(f"Expected faces with indices from 0 to {len(vertices) - 1}: export the mesh again.")
@@ -82,12 +82,12 @@ def read_ply_points(path: Path) -> tuple[PointCloud, Tensor | None]:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices, or None if there are none.
 
     Raises:
-        ValueError: If the file cannot be read or holds no usable points.
+        ValueError: If the file cannot be read or has no usable points.
     """
     from plyfile import PlyData, PlyParseError
 
     try:
-        read_header(path)  # what it announces is in the file
+        read_header(path)  # checks that the file is long enough for its header
         ply = PlyData.read(str(path))
         table = ply["vertex"].data
         points = np.stack([np.asarray(table[axis], dtype=np.float32) for axis in ("x", "y", "z")], -1)
@@ -116,13 +116,13 @@ def read_obj_mesh(path: Path) -> tuple[PointCloud, Tensor]:
     """Read a mesh from a Wavefront .obj file.
 
     Args:
-        path: The file. Polygons are cut into triangles; textures are not read, colours behind the vertices are.
+        path: The file. Polygons are cut into triangles; textures are not read, but vertex colours are.
 
     Returns:
         The vertices, grey if they have no colours, and triangles (T, 3) as indices.
 
     Raises:
-        ValueError: If the file cannot be read or holds no usable mesh.
+        ValueError: If the file cannot be read or has no usable mesh.
     """
     vertices: list[list[float]] = []
     colors: list[list[float]] = []
@@ -160,6 +160,6 @@ def _triangles(polygons: object) -> list[list[int]]:
 
 def _check_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
     if len(points) == 0:
-        raise ValueError(f"{path} holds no points: export it again, or set the initial points to random.")
+        raise ValueError(f"{path} has no points: export it again, or set the initial points to random.")
     if not np.isfinite(points).all() or not np.isfinite(colors).all():
         raise ValueError(f"{path} has points or colours that are NaN or infinite: remove them.")

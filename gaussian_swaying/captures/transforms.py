@@ -18,7 +18,7 @@ _OTHER_COEFFICIENTS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
 
 
 def transforms_files(path: Path) -> list[tuple[Path, str | None]]:
-    """The camera files of a capture with the split that each holds, or an empty list if there are none.
+    """The camera files of a capture with the split of each, or an empty list if there are none.
 
     Args:
         path: A folder with ``transforms.json`` or ``transforms_{train,val,test}.json``, or one such file.
@@ -36,10 +36,10 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
     """Read the cameras of a capture in the style of NeRF, Blender, instant-ngp or Nerfstudio.
 
     Intrinsics come from the frame or from the top of the file, as in
-    :func:`~gaussian_swaying.rendering.cameras.transforms_json.camera_from_transforms`; a missing ``w`` and ``h`` is
-    the size of the image. ``file_path`` may lack its extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and
-    ``p2``. A file per split, or lists ``train_filenames``, ``val_filenames`` and ``test_filenames``, say what is
-    for training.
+    :func:`~gaussian_swaying.rendering.cameras.transforms_json.camera_from_transforms`; if ``w`` and ``h`` are missing,
+    the size of the image is used. ``file_path`` may have no extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and
+    ``p2``. The splits come from one file per split, or from the lists ``train_filenames``, ``val_filenames`` and
+    ``test_filenames``.
 
     Args:
         path: Folder or file, see :func:`transforms_files`.
@@ -74,7 +74,7 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
 
 
 def _merged(data: dict[str, object], frame: dict[str, object]) -> dict[str, object]:
-    """Fields of a frame, and those of the top where it has none; the top's focal length yields to the frame's angle."""
+    """Fields of a frame, completed by those at the top; an angle in the frame overrides a focal length at the top."""
     hidden: set[str] = set()
     for axis, other in ("xy", "yx"):
         if f"fl_{axis}" in frame or f"camera_angle_{axis}" in frame:
@@ -85,7 +85,7 @@ def _merged(data: dict[str, object], frame: dict[str, object]) -> dict[str, obje
 
 
 def check_rigid(what: str, pose: torch.Tensor, tolerance: float = 1e-3) -> None:
-    """Raise ValueError unless a matrix (4, 4) is a rigid motion; ``what`` begins the sentence."""
+    """Raise ValueError unless a matrix (4, 4) is a rigid motion; ``what`` is the subject of the message."""
     rotation, row = pose[:3, :3], pose.new_tensor([0.0, 0.0, 0.0, 1.0])
     error = max(
         float((rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max()), float((pose[3] - row).abs().max())
@@ -100,7 +100,7 @@ def check_rigid(what: str, pose: torch.Tensor, tolerance: float = 1e-3) -> None:
 
 
 def find_image(folder: Path, name: str) -> Path | None:
-    """The image that a file path means, with or without its extension; None if there is none."""
+    """The image for a file path with or without extension; None if there is none."""
     base = folder / name
     if base.is_file():
         return base
@@ -121,7 +121,7 @@ def _file_path(where: str, index: int, frame: dict[str, Any]) -> str:
 
 
 def _listed_splits(where: str, data: dict[str, Any]) -> dict[str, str] | None:
-    """Split of each file name as Nerfstudio's lists give it, or None without such lists."""
+    """Split of each file name from Nerfstudio's lists, or None without such lists."""
     result: dict[str, str] = {}
     for split in _SPLITS:
         names = data.get(f"{split}_filenames")
@@ -138,13 +138,13 @@ def _read_lens(where: str, fields: dict[str, Any], image: Path) -> Lens:
     if model not in _PINHOLE_MODELS:
         raise ValueError(
             f"The camera file {where} asks for {model} (`camera_model`, `is_fisheye`): only "
-            f"{', '.join(_PINHOLE_MODELS)} can be read; undistort the images with the tool that found the cameras."
+            f"{', '.join(_PINHOLE_MODELS)} are supported; undistort the images with the tool that found the cameras."
         )
     for name in _OTHER_COEFFICIENTS:
         if read_number(where, fields, name):
             raise ValueError(
-                f"The field `{name}` of the camera file {where} is not 0: only k1, k2, k3, p1 and p2 can be undone "
-                "here; undistort the images first."
+                f"The field `{name}` of the camera file {where} is not 0: only k1, k2, k3, p1 and p2 are "
+                "supported; undistort the images first."
             )
     width, height = image_size(image)
     given = {name: value for name, value in fields.items() if value is not None}

@@ -1,1 +1,1 @@
-"""A run beside a reference."""
+"""Comparison of a run with a reference."""

@@ -1,4 +1,4 @@
-"""A run beside a reference, frame by frame: pictures, surface and, with a network, video. Numbers, a table, files."""
+"""Comparison of a run with a reference, frame by frame: pictures, surface and, with a network, video."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _SSIM_WINDOW = 11
 
 
 def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
-    """PSNR and SSIM of torchmetrics, for values from 0 to 1.
+    """PSNR and SSIM from torchmetrics, for values from 0 to 1.
 
     Args:
         image: Picture of the run, shape (H, W, 3).
@@ -81,39 +81,39 @@ def compare_run(
 ) -> dict[str, Any]:
     """Compare a run with a reference, frame by frame.
 
-    Frame i of the run, which is at rest at i = 0, belongs to frame i + ``reference_offset`` of the reference. Frames
-    are counted from 0 in the order of their numbers.
+    Frame i of the run, which is at rest at i = 0, is compared with frame i + ``reference_offset`` of the reference.
+    Frames are counted from 0, sorted by their numbers.
 
-    Pictures are compared if both folders have ``frames/*.png`` (the reference's may lie in ``video/``). Surfaces are if
-    the reference has ``cloth.npz`` (see :func:`read_cloth`) and the run ``trajectory.npz``: points drawn from the
-    reference's surface against the simulated Gaussians, moved from the frame of the simulation to that of the scene, in
-    metres. The Chamfer distance is the average of the two mean distances, so two equal sheets at a distance h have h.
-    How much of it is due to sampling tells ``sampling_m``, the distance between that many random points of the
-    reference and as many others as there are particles.
+    Pictures are compared if both folders have ``frames/*.png`` (in the reference also ``video/frames``). Surfaces are
+    compared if the reference has ``cloth.npz`` (see :func:`read_cloth`) and the run ``trajectory.npz``: random points
+    on the reference's surface against the simulated Gaussians, transformed from the frame of the simulation to that of
+    the scene, in metres. The Chamfer distance is the average of the two mean distances, so two equal sheets at a
+    distance h have h. ``sampling_m`` tells how much of it is due to sampling: it is the distance between that many
+    random points of the reference and as many other points as there are particles.
 
     Args:
         run: Folder of a run, as a simulation writes it.
         reference: Folder of the reference.
-        reference_offset: Number of the reference's frame that belongs to frame 0 of the run; may be negative.
-        frames: Compare only so many frames; by default all, and then both must have equally many.
+        reference_offset: The reference's frame that is compared with frame 0 of the run; may be negative.
+        frames: Compare only this many frames; by default all, and then both must have the same number.
         side: Longer side of the reference's surface [m]; by default that of ``cloth.npz``, if it has one.
         points: Number of points on the reference's surface, and largest number of particles.
-        seed: Of the points.
-        device: Where the metrics are computed.
-        fvd: Computes the Fréchet video distance; None for none. What it has seen before is forgotten.
+        seed: Seed of the points.
+        device: Device on which the metrics are computed.
+        fvd: Computes the Fréchet video distance; None for none. It is reset first.
         video: An .mp4 of reference, run and error side by side; None for none.
         progress: Show a progress bar.
 
     Returns:
-        What ``eval.json`` holds: ``mean`` and ``worst`` over the frames and ``per_frame``, with ``psnr_db``, ``ssim``,
-        ``mse``, ``chamfer_m`` and its two terms ``run_to_reference_m`` and ``reference_to_run_m``; ``psnr_of_mean_db``,
-        the PSNR of the mean square over all frames; ``chamfer_share``, the mean Chamfer distance over ``side_m``;
-        ``fvd`` with its protocol; ``skipped``, what was not compared and why; sizes, numbers, seed, device and
-        versions. What is not finite is None.
+        The content of ``eval.json``: ``mean`` and ``worst`` over the frames and ``per_frame``, with ``psnr_db``,
+        ``ssim``, ``mse``, ``chamfer_m`` and its two terms ``run_to_reference_m`` and ``reference_to_run_m``;
+        ``psnr_of_mean_db``, the PSNR of the mean square over all frames; ``chamfer_share``, the mean Chamfer distance
+        over ``side_m``; ``fvd`` with its protocol; ``skipped``, what was not compared and why; sizes, numbers, seed,
+        device and versions. What is not finite is None.
 
     Raises:
-        ValueError: If a folder is missing or does not hold what it should, numbers of frames or sizes differ, or there
-            is nothing to compare.
+        ValueError: If a folder or its content is missing, numbers of frames or sizes differ, or there is nothing to
+            compare.
         OSError: If the video cannot be written.
     """
     run, reference, device = Path(run), Path(reference), torch.device(device)
@@ -124,7 +124,7 @@ def compare_run(
         check_positive("side", side)
     summary = _read_summary(run)
     if not reference.is_dir():
-        raise ValueError(f"There is no reference folder {reference}: give one with frames/*.png or cloth.npz.")
+        raise ValueError(f"The reference folder {reference} does not exist: give one with frames/*.png or cloth.npz.")
     skipped: list[str] = []
     run_pictures, pictures = frame_files(run), frame_files(reference) or frame_files(reference / "video")
     has_surface, has_particles = (reference / "cloth.npz").exists(), (run / "trajectory.npz").exists()
@@ -148,11 +148,11 @@ def compare_run(
     size = _common_size(run, reference, run_pictures, pictures) if with_pictures else None
     if fvd is not None:
         if not with_pictures:
-            raise ValueError(f"The Fréchet video distance needs pictures ({skipped[0]}): leave out its network.")
+            raise ValueError(f"The Fréchet video distance needs pictures ({skipped[0]}): remove its network.")
         if count < fvd.clip_length + fvd.stride:
             raise ValueError(
                 f"Two clips of {fvd.clip_length} frames need {fvd.clip_length + fvd.stride} frames, but {count} are "
-                "compared: lower `clip_length`, or leave out the network."
+                "compared: lower `clip_length`, or remove the network."
             )
         fvd.to(device)
         fvd.reset()
@@ -219,7 +219,7 @@ def compare_run(
 
 
 def table(result: dict[str, Any]) -> str:
-    """The numbers of :func:`compare_run` as Markdown, which also reads as plain text."""
+    """The numbers of :func:`compare_run` as Markdown that is also readable as plain text."""
     mean, worst = result["mean"], result["worst"]
     rows: list[tuple[str, str, str]] = []
     if "psnr_db" in mean:
@@ -254,7 +254,7 @@ def table(result: dict[str, Any]) -> str:
             f"{result['particles']} particles of the run, seed {result['seed']}."
         ]
         if not result["side_m"]:
-            lines += ["No longer side is known, so no share of it is given: --side gives it."]
+            lines += ["The longer side is not known, so distances are not given as shares of it: set it with --side."]
     if result["fvd"] is not None:
         lines += [
             "FVD: " + ", ".join(f"{name} {value}" for name, value in result["fvd"].items() if name != "fvd") + "."
@@ -273,12 +273,12 @@ def evaluate(
     video: bool = True,
     **options: Any,
 ) -> dict[str, Any]:
-    """Compare and write ``eval.json``, ``eval.md`` and ``comparison.mp4`` to a folder; each whole or not at all.
+    """Compare and write ``eval.json``, ``eval.md`` and ``comparison.mp4`` to a folder, each completely or not at all.
 
     Args:
         run: Folder of a run.
         reference: Folder of the reference.
-        output: Where to write; what an earlier comparison left there is replaced.
+        output: Folder to write to; results of an earlier comparison are replaced.
         video: Whether to make the video.
         options: Further arguments of :func:`compare_run`.
 
@@ -290,7 +290,7 @@ def evaluate(
         OSError: If a file cannot be written.
     """
     folder = Path(output)
-    _read_summary(Path(run))  # before the folder, which may lie within, is made
+    _read_summary(Path(run))  # before the folder, which may be inside the run's, is made
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -302,11 +302,11 @@ def evaluate(
         made = folder / "comparison.mp4"
         result = compare_run(run, reference, video=made if video else None, **options)
         if not (video and result["size"]):
-            made.unlink(missing_ok=True)  # that of an earlier comparison
+            made.unlink(missing_ok=True)  # the video of an earlier comparison
         write_json(folder / "eval.json", result)
         write_text(folder / "eval.md", table(result))
     except BaseException:
-        with suppress(OSError):  # those that hold something stay
+        with suppress(OSError):  # folders with content stay
             for path in missing:
                 path.rmdir()
         raise
@@ -331,7 +331,7 @@ class _Surface:
         self.frame = _sim_frame(run, summary)
         recorded = len(load_trajectory(self.trajectory, 0)[0])
         surface = summary.get("surface_particles") or summary.get("simulated_gaussians")
-        self.particles = min(int(surface or recorded), recorded)  # others come after them
+        self.particles = min(int(surface or recorded), recorded)  # the other particles follow them
         generator = torch.Generator().manual_seed(seed)
         self.chosen = torch.randperm(self.particles, generator=generator)[:points].sort().values
         others = surface_points(cloth.positions[first_reference], cloth.faces, len(self.chosen), seed + 1)
@@ -366,7 +366,7 @@ class _Surface:
 
 def _read_summary(run: Path) -> dict[str, Any]:
     if not run.is_dir():
-        raise ValueError(f"There is no run folder {run}: give the folder of a simulation.")
+        raise ValueError(f"The run folder {run} does not exist: give the folder of a simulation.")
     try:
         return dict(read_json(run / "summary.json", "summary"))
     except (OSError, ValueError, TypeError) as error:
@@ -376,7 +376,7 @@ def _read_summary(run: Path) -> dict[str, Any]:
 
 
 def _sim_frame(run: Path, summary: dict[str, Any]) -> SimFrame:
-    """The frame of the simulation, from the numbers of the summary or else from its line for people."""
+    """The frame of the simulation, from the numbers of the summary or else from its line of text."""
     if "sim_frame" in summary:
         try:
             return SimFrame.from_summary(summary)
@@ -384,7 +384,7 @@ def _sim_frame(run: Path, summary: dict[str, Any]) -> SimFrame:
             raise ValueError(f"The summary.json of {run} cannot be used: {error}.") from error
     line = re.fullmatch(r"1 scene unit = (\S+) m; origin (\[.*\]); up (\[.*\]) .*", str(summary.get("frame")))
     if line is None:
-        raise ValueError(f"The summary.json of {run} does not say where the scene lies (`frame`): run it again.")
+        raise ValueError(f"The summary.json of {run} has no usable `frame`: run it again.")
     origin = torch.tensor(json.loads(line[2]), dtype=torch.float64)
     return SimFrame(origin, rotation_from_z(json.loads(line[3])).T, float(line[1]))
 
@@ -409,7 +409,7 @@ def _common_count(
     left = [(of_run - first, of_reference - first_reference) for of_run, of_reference in counts.values()]
     shared = min(min(pair) for pair in left)
     told = ", ".join(
-        f"{of_run} {name} of {run} and {of_reference} of {reference}" for name, (of_run, of_reference) in counts.items()
+        f"{of_run} {name} in {run} and {of_reference} in {reference}" for name, (of_run, of_reference) in counts.items()
     )
     begins = f"beginning with frame {first} of the run and {first_reference} of the reference"
     if shared < 1:
@@ -449,12 +449,12 @@ def _read_frame(path: Path, device: torch.device) -> Tensor:
     """A picture from 0 to 1, float32, shape (H, W, 3)."""
     pixels = read_image(path)
     if pixels.shape[-1] != 3:
-        raise ValueError(f"The picture {path} has transparent pixels: render it in front of its background.")
+        raise ValueError(f"The picture {path} has transparent pixels: render it over its background.")
     return pixels.to(device).float() / 255
 
 
 def _finite(value: Any) -> Any:
-    """The same with None in place of what JSON has no number for."""
+    """The same with None for numbers that JSON does not have."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""What the folder of a reference holds: pictures in order, and a surface that moves."""
+"""The content of a reference folder: pictures in order, and a moving surface."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Cloth:
     Attributes:
         positions: Vertices of each frame in the axes and from the origin of the scene [m], float32, shape (T, V, 3).
         faces: Triangles as indices of vertices, shape (F, 3).
-        side: Its longer side at rest [m], if the file says so.
+        side: Its longer side at rest [m], if the file has it.
     """
 
     positions: Tensor
@@ -34,18 +34,18 @@ class Cloth:
 
 
 def read_cloth(path: str | os.PathLike[str]) -> Cloth:
-    """Read ``cloth.npz``: ``positions`` (T, V, 3) [m] and ``faces`` (F, 3), or (F, 4), whose squares are halved.
+    """Read ``cloth.npz``: ``positions`` (T, V, 3) [m] and ``faces`` (F, 3), or (F, 4) for squares, which are halved.
 
     The longer side [m] is ``side``, or else the larger of ``width`` and ``height`` in the JSON text ``settings``, if
-    they are there.
+    these exist.
 
     Raises:
-        ValueError: If the file is missing or damaged, lacks an array, or one has a wrong shape or value.
+        ValueError: If the file or an array is missing, damaged, or has a wrong shape or value.
     """
     try:
         with np.load(check_archive(path, "the reference")) as arrays:
             found = {name: arrays[name] for name in ("positions", "faces", "side", "settings") if name in arrays}
-    except Exception as error:  # not there, not a zip, pickled, ...
+    except Exception as error:  # missing, not a zip, pickled, ...
         raise ValueError(f"The surface {path} cannot be read ({error}): make the reference again.") from error
     for name in ("positions", "faces"):
         if name not in found:
@@ -78,25 +78,25 @@ def _side(path: str | os.PathLike[str], found: dict[str, Any]) -> float | None:
 
 
 def surface_points(vertices: Tensor, faces: Tensor, count: int, seed: int = 0) -> Tensor:
-    """Points drawn evenly by area from a triangle mesh; the same seed gives the same points of the same mesh.
+    """Random points on a triangle mesh, uniform by area; the same mesh and seed give the same points.
 
     Args:
         vertices: Vertices [m], shape (V, 3).
         faces: Triangles, shape (F, 3).
         count: Number of points.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
 
     Returns:
         Points [m], float32, shape (count, 3).
 
     Raises:
-        ValueError: If the mesh has no area or a face names a vertex that does not exist.
+        ValueError: If the mesh has no area or a face refers to a vertex that does not exist.
     """
     return sample_mesh(PointCloud(vertices, torch.zeros_like(vertices)), faces, count, seed).points
 
 
 def frame_files(folder: Path) -> list[Path]:
-    """The pictures ``frames/<number>.png`` of a folder in order; their numbers must follow one another.
+    """The pictures ``frames/<number>.png`` of a folder in order; their numbers must be consecutive.
 
     Raises:
         ValueError: If a name is not a number or a number is missing.
@@ -104,11 +104,11 @@ def frame_files(folder: Path) -> list[Path]:
     files = [path for path in (folder / "frames").glob("*.png") if not path.name.startswith(".")]
     for path in files:
         if not path.stem.isdecimal():
-            raise ValueError(f"Expected {path} to be named by the number of its frame: rename it, or take it away.")
+            raise ValueError(f"Expected the name of {path} to be the number of its frame: rename it, or move it away.")
     files.sort(key=lambda path: int(path.stem))
     for before, after in pairwise(files):
         if int(after.stem) != int(before.stem) + 1:
-            raise ValueError(f"Between {before} and {after.name} frames are missing or double: make them again.")
+            raise ValueError(f"Frames are missing or duplicated between {before} and {after.name}: make them again.")
     return files
 
 

@@ -1,1 +1,1 @@
-"""Surface-aligned Gaussians from photos: losses, densification, the Lightning module and its command line."""
+"""Surface-aligned Gaussians from photos: data, losses, densification and the Lightning module."""

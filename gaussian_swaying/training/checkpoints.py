@@ -1,4 +1,4 @@
-"""Checkpoints of a training: sealed when they are written, read without executing anything in them."""
+"""Checkpoints of a training run: written with a checksum, and read without executing any code in them."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str,
 
     Args:
         path: The file.
-        map_location: Where its tensors go, as for ``torch.load``.
+        map_location: Device of its tensors, as for ``torch.load``.
 
     Raises:
-        ValueError: If there is none, or it is damaged or something else.
+        ValueError: If it does not exist, is damaged, or is another kind of file.
     """
     if kind_of(path) is None:
         raise ValueError(f"The checkpoint {path} does not exist: give another `--ckpt_path`.")
@@ -33,10 +33,10 @@ def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str,
         check_seal(path)
         held = torch.load(path, map_location=map_location, weights_only=True)
         if not isinstance(held, dict) or not isinstance(held.get("splat_training"), dict):
-            raise ValueError("it is not of this training")
+            raise ValueError("it is not a checkpoint of this package")
         missing = _FIELDS - set(held["splat_training"])
         if missing:
-            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+            raise ValueError(f"it has no {', '.join(sorted(missing))}")
         _check_parameters(held["state_dict"])
     except Exception as error:
         why = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
@@ -54,10 +54,10 @@ def _check_parameters(state: dict[str, Any]) -> None:
 
 
 class SealedCheckpoints(TorchCheckpointIO):
-    """How Lightning reads and writes the checkpoints of a training, in every subcommand."""
+    """Lightning's reading and writing of checkpoints, in every subcommand."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write a checkpoint with its checksum, whole or not at all."""
+        """Write a checkpoint with its checksum, completely or not at all."""
         file = Path(path)
         file.parent.mkdir(parents=True, exist_ok=True)
         save_sealed(file, checkpoint)
@@ -68,5 +68,5 @@ class SealedCheckpoints(TorchCheckpointIO):
         map_location: Callable[..., Any] | None = lambda storage, loc: storage,
         weights_only: bool | None = None,
     ) -> dict[str, Any]:
-        """Read a checkpoint; ``weights_only`` is taken as true, whatever is asked for."""
+        """Read a checkpoint; ``weights_only`` is always true."""
         return read_training_checkpoint(Path(path), map_location)

@@ -1,4 +1,4 @@
-"""The log of a training: rows that are added to ``metrics.csv``, never taken away."""
+"""The log of a training run: rows are appended to ``metrics.csv`` and never removed."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gaussian_swaying._files import check_not_taken, write_table
 
 
 def append_row(path: Path, row: dict[str, Any]) -> None:
-    """Add a row to a CSV file with a header; a new column is added to all rows before.
+    """Append a row to a CSV file with a header; a new column is added to all earlier rows.
 
     Args:
-        path: The file; it is made, with its folder, if there is none.
+        path: The file; it is created, with its folder, if it does not exist.
         row: Values by column.
 
     Raises:
-        ValueError: If the path is no regular file.
+        ValueError: If the path is not a regular file.
     """
     check_not_taken(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -42,13 +42,13 @@ def append_row(path: Path, row: dict[str, Any]) -> None:
         write_table(path, [{name: line.get(name) for name in wider} for line in [*rows, row]])
         return
     with path.open("a", newline="") as text:
-        if not whole:  # a row that was cut off when its training was killed
+        if not whole:  # the last row was cut off when the run was killed
             text.write("\r\n")
         csv.DictWriter(text, fieldnames=names).writerow(row)
 
 
 class CsvLog(Logger):
-    """Lightning's values as rows of ``metrics.csv``, each with its ``step``. Nothing is written before the first.
+    """Lightning's values as rows of ``metrics.csv``, each with its ``step``. No file is written before the first row.
 
     Args:
         folder: Where the file is.
@@ -60,7 +60,7 @@ class CsvLog(Logger):
 
     @property
     def name(self) -> str:
-        """Empty: the folder has a name already."""
+        """Empty, as the folder already has a name."""
         return ""
 
     @property

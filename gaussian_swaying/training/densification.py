@@ -1,4 +1,4 @@
-"""Which Gaussians to copy, split, move and remove while training: the strategies of gsplat behind one interface."""
+"""Copying, splitting, moving and removing Gaussians during training: gsplat's strategies behind one interface."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gaussian_swaying.gaussians.subdivision import split_large
 from gaussian_swaying.rendering.protocol import ScreenGaussians
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
-"""Parameters of a :class:`GaussianSurfaceModel`; a training has one optimiser for each."""
+"""Parameters of a :class:`GaussianSurfaceModel`; training uses one optimiser for each."""
 
 
 def _check_steps(**values: int) -> None:
@@ -26,14 +26,14 @@ def _check_steps(**values: int) -> None:
 
 
 class Densification(ABC):
-    """Keeps the parameters of a model, their optimisers and the state of a strategy together as their number changes.
+    """Keeps parameters, optimisers and the state of a strategy consistent when Gaussians are added or removed.
 
-    In a training: :meth:`attach` once, then for each image :meth:`before_backward`, the backward pass, the steps of
+    Order of calls: :meth:`attach` once, then for each image :meth:`before_backward`, the backward pass, the steps of
     the optimisers, and :meth:`after_step`. Steps count images from 0.
     """
 
     absgrad: bool = False
-    """Whether the renderer is to compute absolute gradients."""
+    """Whether the renderer must compute absolute gradients."""
 
     def __init__(self) -> None:
         self._model: GaussianSurfaceModel | None = None
@@ -49,12 +49,12 @@ class Densification(ABC):
     def attach(
         self, model: GaussianSurfaceModel, optimizers: Mapping[str, torch.optim.Optimizer], scene_scale: float
     ) -> None:
-        """Take charge of a model and of its optimisers.
+        """Use a model and its optimisers from now on.
 
         Args:
-            model: The model; its parameters are exchanged when their number changes.
-            optimizers: One for each of :data:`PARAMETERS`, with that one parameter.
-            scene_scale: Extent of the scene [scene units], which thresholds of size are a share of.
+            model: The model; its parameters are replaced when the number of Gaussians changes.
+            optimizers: One for each of :data:`PARAMETERS`, with only that parameter.
+            scene_scale: Extent of the scene [scene units]; size thresholds are shares of it.
 
         Raises:
             ValueError: If an optimiser is missing or has another parameter, ``scene_scale`` is not positive, or the
@@ -65,7 +65,7 @@ class Densification(ABC):
             groups = optimizers[name].param_groups if name in optimizers else []
             held = [id(item) for group in groups for item in group["params"]]
             if held != [id(getattr(model, name))]:
-                raise ValueError(f"Expected an optimiser of `{name}` alone for the densification.")
+                raise ValueError(f"Expected an optimiser with only `{name}` for the densification.")
         device = model.means.device
         self._strategy = self.make_strategy(device)
         self._model, self._optimizers = model, {name: optimizers[name] for name in PARAMETERS}
@@ -79,12 +79,12 @@ class Densification(ABC):
         return dict(self._strategy.initialize_state())
 
     def before_backward(self, step: int, screen: ScreenGaussians) -> None:
-        """Prepare the picture of a step for its backward pass."""
+        """Prepare the backward pass of a step."""
         if screen.means2d.requires_grad:
             screen.means2d.retain_grad()
 
     def after_step(self, step: int, screen: ScreenGaussians) -> None:
-        """Change the Gaussians where the strategy wants it, after the optimisers have stepped."""
+        """Change the Gaussians as the strategy decides, after the steps of the optimisers."""
         assert self._model is not None, "attach comes first"
         parameters = {name: getattr(self._model, name) for name in PARAMETERS}
         self._advance(parameters, step, screen)
@@ -94,19 +94,19 @@ class Densification(ABC):
 
     @abstractmethod
     def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
-        """Let the strategy act; it puts new parameters into the dictionary."""
+        """Run the strategy; it puts new parameters into the dictionary."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the strategy accumulated since it last changed the Gaussians."""
+        """Everything accumulated by the strategy since it last changed the Gaussians."""
         return dict(self._state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a state when the model is attached next."""
+        """Use a state when a model is attached next."""
         self._restored = dict(state)
 
 
 class NoDensification(Densification):
-    """The number of Gaussians stays."""
+    """The number of Gaussians does not change."""
 
     def make_strategy(self, device: torch.device) -> None:
         """None is needed."""
@@ -128,12 +128,12 @@ class NoDensification(Densification):
 class DefaultDensification(Densification):
     """Copy, split and prune by the gradient on the screen: gsplat's ``DefaultStrategy`` (Kerbl et al. 2023).
 
-    On any device. In gsplat 1.5.3 opacities are never reset, as its condition for it cannot hold;
-    ``reset_opacity`` does it here.
+    Works on any device. gsplat 1.5.3 never resets opacities, as its condition is never true; ``reset_opacity`` does it
+    here.
 
     Args:
         start: Step after which Gaussians may change.
-        stop: Step from which on they do not.
+        stop: Step from which they no longer do.
         every: Steps between changes.
         grow_grad2d: Gradient on the screen (in units of half the picture) above which a Gaussian is copied or split;
             about 0.0008 with ``absgrad``.
@@ -141,16 +141,16 @@ class DefaultDensification(Densification):
         prune_opacity: Opacity below which it is removed.
         prune_scale3d: Scale above which it is removed after ``reset_every``, as a share of the scene's extent.
         reset_every: Steps between resets of the opacities; large Gaussians are pruned after the first.
-        reset_opacity: Whether opacities are lowered to twice ``prune_opacity`` then.
+        reset_opacity: Whether a reset lowers opacities to twice ``prune_opacity``.
         pause_after_reset: Steps after a reset without changes; 0 for none.
         absgrad: Use absolute gradients (Ye et al. 2024, "AbsGS"); CUDA only.
-        revised_opacity: Opacities of split Gaussians after Rota Bulo et al. 2024 (arXiv 2404.06109).
+        revised_opacity: Set opacities of split Gaussians as Rota Bulo et al. 2024 (arXiv 2404.06109).
         split_at: Step at which all large Gaussians are split, at ``stop`` or later (see
-            :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. Where a surface is of one
-            colour nothing else makes them small, and large ones blur the folds of a cloth that moves.
-        split_size: Largest standard deviation of what they become [scene units], and of all Gaussians from then on.
-            Rotations are held from then on: the tilt of a small Gaussian shows in no picture, so that training would
-            turn it by degrees from where the large one was right, and wind acts on normals.
+            :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. On a surface of one colour
+            nothing else makes Gaussians small, and large ones blur the folds of moving cloth.
+        split_size: Largest standard deviation of the resulting Gaussians [scene units], and of all Gaussians from then
+            on. From then on rotations are also fixed: the tilt of a small Gaussian is not visible, so training would
+            turn it away from the correct normal of the large one by several degrees, and wind acts on normals.
 
     Raises:
         ValueError: If an argument is negative, ``every`` or ``reset_every`` is 0, or ``split_at`` is before ``stop``.
@@ -251,7 +251,7 @@ class DefaultDensification(Densification):
             parameter = nn.Parameter(values.contiguous(), requires_grad=before.requires_grad)
             optimizer = self._optimizers[name]
             kept = optimizer.state.pop(before, {})
-            # what was there goes on with its momenta, what is new starts without
+            # old Gaussians keep their momenta, new ones start with zero
             room = {k: v.new_zeros(len(values) - old, *v.shape[1:]) for k, v in kept.items() if _is_per_row(v, old)}
             optimizer.state[parameter] = kept | {k: torch.cat([kept[k], zeros]) for k, zeros in room.items()}
             optimizer.param_groups[0]["params"] = [parameter]
@@ -275,7 +275,7 @@ def _is_per_row(value: Any, rows: int) -> bool:
 class MCMCDensification(Densification):
     """Move faint Gaussians to opaque ones and add noise: gsplat's ``MCMCStrategy`` (Kheradmand et al. 2024). CUDA only.
 
-    It expects penalties on opacity and scale among the losses, with a weight of 0.01 each:
+    The losses must include penalties on opacity and scale, with a weight of 0.01 each:
     :class:`~gaussian_swaying.training.losses.MeanOpacityLoss` and
     :class:`~gaussian_swaying.training.losses.MeanScaleLoss`.
 
@@ -283,9 +283,9 @@ class MCMCDensification(Densification):
         cap: Largest number of Gaussians.
         noise_rate: Noise on the centres, as a multiple of their learning rate.
         start: Step after which Gaussians may move.
-        stop: Step from which on they do not.
+        stop: Step from which they no longer do.
         every: Steps between moves.
-        min_opacity: Opacity up to which a Gaussian counts as dead.
+        min_opacity: A Gaussian with at most this opacity counts as dead.
 
     Raises:
         ValueError: If an argument is negative, or ``cap`` or ``every`` is 0.
@@ -327,7 +327,7 @@ class MCMCDensification(Densification):
         return MCMCStrategy(**self._options)
 
     def before_backward(self, step: int, screen: ScreenGaussians) -> None:
-        """Nothing to prepare: no gradient on the screen is looked at."""
+        """Nothing to prepare: gradients on the screen are not used."""
 
     def _advance(self, parameters: dict[str, nn.Parameter], step: int, screen: ScreenGaussians) -> None:
         rate = float(self._optimizers["means"].param_groups[0]["lr"])
@@ -335,5 +335,5 @@ class MCMCDensification(Densification):
             self._strategy.step_post_backward(parameters, self._optimizers, self._state, step, screen.info(), lr=rate)
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing: its table of binomials is made anew."""
+        """Empty: its table of binomials is computed again."""
         return {}

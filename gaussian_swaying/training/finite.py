@@ -1,4 +1,4 @@
-"""The check that the loss stays finite: a copy that nothing waits for, and the error."""
+"""The check that the loss stays finite, without waiting for the GPU, and the error if it does not."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class TrainingDiverged(RuntimeError):  # noqa: N818
-    """A loss or a Gaussian is not finite any more; the message names the step and the last good checkpoint.
+    """A loss or a Gaussian is no longer finite; the message names the step and the last good checkpoint.
 
     Args:
         step: Number of images trained on before the one that failed.
@@ -25,7 +25,7 @@ class TrainingDiverged(RuntimeError):  # noqa: N818
 
 
 class PendingLoss:
-    """The last loss, on its way to the host, which does not wait for it."""
+    """The last loss, copied to the host in the background."""
 
     def __init__(self, device: torch.device) -> None:
         self.step: int | None = None
@@ -41,7 +41,7 @@ class PendingLoss:
             self._arrived.record()
 
     def take(self) -> float:
-        """Wait for the loss and forget it."""
+        """Wait for the loss, return it and forget it."""
         if self._arrived is not None:
             self._arrived.synchronize()
         self.step = None

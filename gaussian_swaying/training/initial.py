@@ -1,4 +1,4 @@
-"""Gaussians to start a training from."""
+"""Initial Gaussians for training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a training step minimises: the terms of Gaussian Swaying ("Training") and their weighted sum."""
+"""The loss of a training step: the terms of Gaussian Swaying ("Training") and their weighted sum."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
     Args:
         image: Picture, shape (..., H, W, C).
         target: Picture to compare it with, of the same shape.
-        padding: ``valid`` looks only at windows that lie in the picture, as fused-ssim's option of that name.
-            ``reflect`` mirrors both pictures at their edges, and its mean is the SSIM of torchmetrics 1.9. ``zeros``
-            continues them with zeros, as Kerbl et al. 2023.
+        padding: ``valid`` uses only windows inside the picture, like fused-ssim's option with that name. ``reflect``
+            mirrors both pictures at their edges, and its mean is the SSIM of torchmetrics 1.9. ``zeros`` pads them with
+            zeros, as Kerbl et al. 2023 do.
 
     Returns:
         Similarity up to 1, shape (..., H - 10, W - 10, C) with ``valid``, else that of the pictures.
@@ -127,7 +127,7 @@ def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", re
 def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
     r"""Entropy of the opacities, :math:`-\sigma \log \sigma` (Gaussian Swaying, "Training"; Duan et al. 2024).
 
-    Literally: it pushes opacities above 1/e towards 1 and those below towards 0.
+    This is the literal formula. It pushes opacities above 1/e towards 1 and those below towards 0.
 
     Args:
         opacities: Opacities from 0 to 1, shape (N,); values below 1e-7 count as that, where the gradient is zero.
@@ -175,7 +175,7 @@ def _check_pictures(image: Tensor, target: Tensor) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LossInputs:
-    """What a loss term may look at in a training step.
+    """The inputs of a loss term in a training step.
 
     Attributes:
         image: Rendered picture, shape (H, W, 3).
@@ -201,7 +201,7 @@ class LossInputs:
 
 
 class LossTerm(nn.Module, ABC):
-    """Base of all terms; a subclass anywhere can be named in a YAML by its class path."""
+    """Base class of all terms; a YAML can name any subclass by its class path."""
 
     @abstractmethod
     def forward(self, inputs: LossInputs) -> Tensor:
@@ -235,7 +235,7 @@ class AnisotropyLoss(LossTerm):
     """Penalty on elongated Gaussians, see :func:`anisotropy_loss`.
 
     Args:
-        a: Ratio from which on a Gaussian counts as elongated, at least 1.
+        a: Ratio from which a Gaussian counts as elongated, at least 1.
         ratio: ``paper`` (largest over second largest scale) or ``max_min``.
         reduction: ``mean`` or ``sum`` over the Gaussians.
 
@@ -279,9 +279,9 @@ class OpacityEntropyLoss(LossTerm):
 class SizeLoss(LossTerm):
     """Penalty on large Gaussians, see :func:`size_loss`.
 
-    The paper does not say how it goes over the Gaussians. As a mean with the paper's weight of 0.01 it changes nothing
-    that could be measured; as a sum it holds the Gaussians to ``b``, which a simulation needs where a surface has no
-    texture: its particles lie as densely as the Gaussians.
+    The paper does not say how the penalty is summed over the Gaussians. As a mean with the paper's weight of 0.01 it
+    has no measurable effect. As a sum it limits the Gaussians to ``b``. A simulation needs this where a surface has no
+    texture, since its particles are as dense as the Gaussians.
 
     Args:
         b: Scale from which on a Gaussian counts as large [scene units].
@@ -303,7 +303,7 @@ class SizeLoss(LossTerm):
 
 
 class MeanOpacityLoss(LossTerm):
-    """Mean opacity: what Kheradmand et al. 2024 ("3DGS as Markov Chain Monte Carlo") add so that Gaussians can die."""
+    """Mean opacity. Kheradmand et al. 2024 ("3DGS as Markov Chain Monte Carlo") add it so that Gaussians can fade."""
 
     def forward(self, inputs: LossInputs) -> Tensor:
         """The mean."""
@@ -325,12 +325,12 @@ DEFAULT_WEIGHTS = {"rgb": 1.0, "anisotropy": 10.0, "entropy": 0.01, "size": 0.01
 class TotalLoss(nn.Module):
     r"""Weighted sum of named terms, :math:`\mathcal L = \sum_k \lambda_k \mathcal L_k`.
 
-    The four terms of Gaussian Swaying are there with its weights: ``rgb`` 1, ``anisotropy`` 10, ``entropy`` 0.01 and
+    The four terms of Gaussian Swaying are included with its weights: ``rgb`` 1, ``anisotropy`` 10, ``entropy`` 0.01 and
     ``size`` 0.01. A term with weight 0 is not computed.
 
     Args:
         terms: Further terms by name, or others in place of the four.
-        weights: Weights by name, in place of those above; 1 for a further term that is not named.
+        weights: Weights by name, in place of those above; the default for a further term is 1.
 
     Raises:
         ValueError: If a weight is not finite or belongs to no term, or all are zero.
@@ -354,7 +354,7 @@ class TotalLoss(nn.Module):
             if not math.isfinite(weight):
                 raise ValueError(f"Expected `loss_weights.{name}` to be finite, but got {weight}.")
         if not any(self.weights.values()):
-            raise ValueError("Expected one of `loss_weights` to be other than zero.")
+            raise ValueError("Expected one of `loss_weights` not to be zero.")
         self.terms = nn.ModuleDict({name: term for name, term in named.items() if self.weights[name] != 0.0})
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
@@ -371,5 +371,5 @@ class TotalLoss(nn.Module):
                     "or the sum."
                 )
         total = sum(self.weights[name] * value for name, value in values.items())
-        assert isinstance(total, Tensor)  # one weight at least is not zero
+        assert isinstance(total, Tensor)  # at least one weight is not zero
         return total, {name: value.detach() for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""The training of surface-aligned Gaussians as a Lightning module."""
+"""Training of surface-aligned Gaussians as a Lightning module."""
 
 from __future__ import annotations
 
@@ -30,41 +30,41 @@ from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
 from gaussian_swaying.training.random_stream import random_state, set_random_state
 from gaussian_swaying.training.rates import LearningRates, means_rate
 
-_CLOCK_STEP = 20_000_000  # [ns] by which times of files may lag behind the clock
+_CLOCK_STEP = 20_000_000  # [ns] by which file times may lag behind the clock
 
 
 class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
-    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one. Its
-    random numbers come from a stream of their own, which starts from the seed and is kept in checkpoints, so that
-    nothing else changes them and a resumed training continues exactly.
+    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one.
+    Random numbers come from a separate stream, which starts from the seed and is stored in checkpoints. So nothing else
+    changes them, and a resumed run continues exactly.
 
-    Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. Where there is an
-    alpha, the image holds colours that are not multiplied with it. The Gaussians to start from come from ``init_ply``,
-    or else from ``datamodule.initial_cloud(sh_degree)``, and the extent of the scene from ``datamodule.scene_scale``.
+    Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
+    the colours of the image are not premultiplied. The initial Gaussians come from ``init_ply``, or else from
+    ``datamodule.initial_cloud(sh_degree)``, and the extent of the scene from ``datamodule.scene_scale``.
 
     Args:
         loss_weights: Weights of the losses by name (``rgb``, ``anisotropy``, ``entropy``, ``size`` and further terms),
             in place of the paper's, see :class:`~gaussian_swaying.training.losses.TotalLoss`; 0 leaves one out.
         loss_terms: Further losses by name, or others in place of those four.
-        densification: Which Gaussians are copied, split and removed.
+        densification: How Gaussians are copied, split and removed.
         rates: Learning rates.
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
         sh_every: Steps after which the degree in use rises by one; 0 for all from the start.
-        background: Behind the Gaussians: ``random`` in each step where a photo has an alpha and black where it has
-            none, ``black``, ``white``, or one colour from 0 to 1.
-        scene_scale: Extent of the scene [scene units], which learning rates and thresholds refer to; that of the
-            cameras (``datamodule.scene_scale``) by default.
+        background: Colour behind the Gaussians: ``random`` (a new one in each step for photos with alpha, else black),
+            ``black``, ``white``, or a colour from 0 to 1.
+        scene_scale: Extent of the scene [scene units], to which learning rates and thresholds are relative; by default
+            that of the cameras (``datamodule.scene_scale``).
         seed: Seed of backgrounds and new Gaussians.
-        panels: Number of validation images that are written as panels of photo, render, normals and area.
+        panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
-        output: Folder of panels and of the ``point_cloud.ply`` at the end; ``trainer.default_root_dir`` by default.
-        init_ply: Splat to start from.
+        output: Folder of the panels and the final ``point_cloud.ply``; ``trainer.default_root_dir`` by default.
+        init_ply: Splat with the initial Gaussians.
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
 
     Attributes:
-        renderer: What draws; that of :func:`~gaussian_swaying.rendering.factory.make_renderer` if it is None.
+        renderer: The renderer; None for that of :func:`~gaussian_swaying.rendering.factory.make_renderer`.
 
     Raises:
         ValueError: If a value is out of range.
@@ -115,12 +115,12 @@ class SplatTrainer(lightning.LightningModule):
         self.model: GaussianSurfaceModel | None = None
         self._metrics: dict[str, list[Tensor]] = {}  # of each image of an evaluation
         self._lpips_net = lpips
-        self._lpips: list[Any] = []  # in a list, so that its weights stay out of the checkpoints
+        self._lpips: list[Any] = []  # in a list, so that its weights are not stored in checkpoints
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
         self._pending: PendingLoss | None = None
-        self._seen = 0  # images that a checkpoint was trained on
-        self._begun = 0  # [ns] when the training did
+        self._seen = 0  # number of images that the checkpoint was trained on
+        self._begun = 0  # [ns] start of the training
         self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
 
     fixed_background: Tensor
@@ -135,7 +135,7 @@ class SplatTrainer(lightning.LightningModule):
         return self.model
 
     def setup(self, stage: str) -> None:
-        """Make the Gaussians to start from, unless a checkpoint has brought them."""
+        """Make the initial Gaussians, unless they come from a checkpoint."""
         datamodule: Any = getattr(self.trainer, "datamodule", None)
         if self.scene_scale is None:
             self.scene_scale = float(getattr(datamodule, "scene_scale", 1.0))
@@ -152,9 +152,9 @@ class SplatTrainer(lightning.LightningModule):
             elif hasattr(datamodule, "initial_cloud"):
                 cloud = datamodule.initial_cloud(self.sh_degree)
             else:
-                raise ValueError("Expected Gaussians to start from: give `init_ply`, or data that bring points.")
+                raise ValueError("Expected initial Gaussians: set `init_ply`, or use data with points.")
             self.model = GaussianSurfaceModel.from_cloud(cloud)
-        # normals of a file would have to follow every split
+        # normals of a file cannot follow splits
         self.model.reference_normals = None
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
@@ -169,11 +169,11 @@ class SplatTrainer(lightning.LightningModule):
         ]
 
     def on_fit_start(self) -> None:
-        """Refuse what would train wrongly without a word."""
+        """Refuse settings that would silently train wrongly."""
         self._begun = time.time_ns()
         if self.trainer.world_size > 1:
             raise ValueError(
-                f"Expected one device for a training, but got {self.trainer.world_size}: use trainer.devices 1."
+                f"Expected one device for training, but got {self.trainer.world_size}: use trainer.devices 1."
             )
         if self.trainer.precision not in ("32-true", "32"):
             raise ValueError(
@@ -181,7 +181,7 @@ class SplatTrainer(lightning.LightningModule):
             )
 
     def on_train_start(self) -> None:
-        """Hand the Gaussians and their optimisers to the densification, after a checkpoint has been read."""
+        """Attach the Gaussians and their optimisers to the densification, after a checkpoint has been read."""
         assert self.scene_scale is not None
         optimizers = dict(zip(PARAMETERS, self._raw_optimizers(), strict=True))
         self.densification.attach(self.splat, optimizers, self.scene_scale)
@@ -205,7 +205,7 @@ class SplatTrainer(lightning.LightningModule):
             camera: The camera.
             background: Colour behind them, shape (3,); black when None.
             degree: Degree of the harmonics in use; all when None.
-            absgrad: Whether absolute gradients are wanted.
+            absgrad: Whether to compute absolute gradients.
 
         Returns:
             The picture.
@@ -246,13 +246,13 @@ class SplatTrainer(lightning.LightningModule):
         means_optimizer.param_groups[0]["lr"] = rate
         target, alpha, background = self._target(batch, train=True)
         output = self.render(batch["camera"], background, self.active_degree(step), self.densification.absgrad)
-        self._check_pending()  # of the step before: gsplat has waited for the GPU by now anyway
+        self._check_pending()  # of the previous step: gsplat has already waited for the GPU
         splat = self.splat
         inputs = LossInputs(
             output.color, target, output.alpha, alpha, splat.means, splat.quats, splat.scales, splat.opacity(), step
         )
         loss, terms = self.loss(inputs)
-        if not loss.requires_grad:  # a picture without Gaussians under a loss that looks only at it
+        if not loss.requires_grad:  # no Gaussian in the picture, and the loss depends only on the picture
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
         self.manual_backward(loss)
@@ -272,7 +272,7 @@ class SplatTrainer(lightning.LightningModule):
         if len(splat) == 0:
             raise ValueError(
                 f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
-                "losses that make Gaussians fade."
+                "losses that lower opacities."
             )
         if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
@@ -306,7 +306,7 @@ class SplatTrainer(lightning.LightningModule):
             raise TrainingDiverged(step, "the loss", self.last_checkpoint())
 
     def last_checkpoint(self) -> str | None:
-        """The newest checkpoint of this training, or the one that it continues; None if there is none."""
+        """The newest checkpoint of this run, or the one that it resumes; None if there is none."""
         folders = [getattr(callback, "dirpath", None) for callback in self.trainer.checkpoint_callbacks]
         files = [file for folder in folders if folder for file in Path(folder).glob("*.ckpt")]
         files = [file for file in files if file.stat().st_mtime_ns >= self._begun - _CLOCK_STEP]  # of this run
@@ -333,14 +333,14 @@ class SplatTrainer(lightning.LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Give the model as many Gaussians as the checkpoint has, before Lightning loads them."""
+        """Make a model with as many Gaussians as the checkpoint, before Lightning loads them."""
         stored = checkpoint.get("splat_training")
         if stored is None:
-            raise ValueError("The checkpoint holds no Gaussians: it was not written by this training.")
+            raise ValueError("The checkpoint has no Gaussians: it was not written by this package.")
         if stored["sh_degree"] != self.sh_degree:
             raise ValueError(
                 f"The checkpoint was trained with `sh_degree` {stored['sh_degree']}, but the configuration says "
-                f"{self.sh_degree}: give the same."
+                f"{self.sh_degree}: use the same."
             )
         state = {name: checkpoint["state_dict"][f"model.{name}"] for name in PARAMETERS}
         device = self.device if self.model is None else self.model.means.device
@@ -358,14 +358,12 @@ class SplatTrainer(lightning.LightningModule):
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
         else:
-            warnings.warn(
-                f"The checkpoint was trained with {stored['kind']}, so its state is not taken over.", stacklevel=2
-            )
+            warnings.warn(f"The checkpoint was trained with {stored['kind']}, so its state is not used.", stacklevel=2)
 
     # ---- evaluation
 
     def on_validation_epoch_start(self) -> None:
-        """Start the metrics anew."""
+        """Reset the metrics."""
         if self._lpips_net is not None:
             metric = lpips_metric(self._lpips_net)
             self._lpips_net = None
@@ -381,7 +379,7 @@ class SplatTrainer(lightning.LightningModule):
         self._log_metrics("val")
 
     def on_test_epoch_start(self) -> None:
-        """Start the metrics anew."""
+        """Reset the metrics."""
         self.on_validation_epoch_start()
 
     def test_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
@@ -417,7 +415,7 @@ class SplatTrainer(lightning.LightningModule):
         self.log(f"{stage}/gaussians", float(len(self.splat)))
 
     def _degree_reached(self) -> int:
-        """Degree in use when the checkpoint was written; all of it without one."""
+        """Degree in use when the checkpoint was written; the full degree without a checkpoint."""
         return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
 
     def _write_panel(self, batch: Mapping[str, Any], target: Tensor, image: Tensor, name: str, step: int) -> None:
@@ -437,7 +435,7 @@ class SplatTrainer(lightning.LightningModule):
 
     @property
     def folder(self) -> Path:
-        """Folder of what is written."""
+        """The output folder."""
         return Path(self.output if self.output is not None else self.trainer.default_root_dir)
 
     def on_train_end(self) -> None:

@@ -1,4 +1,4 @@
-"""Pictures to look at while training, and the metric that needs weights."""
+"""Panels to look at during training, and the LPIPS metric."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.protocol import Renderer
 
-# the very files that torchvision would download
+# the files that torchvision would download
 _BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
 LPIPS_SIDE = 32
 """Fewest pixels on a side that the backbones of LPIPS take."""
@@ -27,15 +27,15 @@ def panel(
 ) -> Tensor:
     """Photo, render, normals and area side by side.
 
-    Normals are those of the patches, turned to the camera, in its axes: red to the right, green up, blue towards it.
+    Normals are those of the patches, flipped to the camera, in its axes: red to the right, green up, blue towards it.
     Areas are pi s1 s2 on a logarithmic scale from the 5th to the 95th percentile.
 
     Args:
         model: The Gaussians.
-        renderer: What draws them.
-        camera: Where from.
+        renderer: The renderer.
+        camera: The camera.
         photo: Photo, shape (H, W, 3).
-        image: Render, shape (H, W, 3); drawn before black when None.
+        image: Render, shape (H, W, 3); rendered over black if None.
 
     Returns:
         Picture from 0 to 1, shape (H, 4 W, 3).
@@ -51,7 +51,7 @@ def panel(
     normal_colors = 0.5 + 0.5 * (normals @ axes.T)
     areas = model.areas("paper").log()
     if len(areas):
-        some = areas[:: len(areas) // 100_000 + 1]  # quantile takes only so many
+        some = areas[:: len(areas) // 100_000 + 1]  # quantile is limited in size
         low, high = some.quantile(0.05), some.quantile(0.95)
         areas = (areas - low) / (high - low).clamp_min(1e-6)
     drawn = [renderer(*gaussians, colors, camera).color for colors in (normal_colors, colormap(areas))]
@@ -59,7 +59,7 @@ def panel(
 
 
 def lpips_metric(net: str = "alex") -> Any | None:
-    """The LPIPS metric (Zhang et al. 2018) of torchmetrics, if everything it needs is on this machine.
+    """The LPIPS metric (Zhang et al. 2018) of torchmetrics, if all that it needs is on this machine.
 
     Args:
         net: Backbone: ``alex``, ``vgg`` or ``squeeze``.

@@ -1,4 +1,4 @@
-"""What Lightning says that is of no use here: advertisements, and warnings about what is taken care of."""
+"""Messages of Lightning that are not useful here: advertisements, and warnings about things that are taken care of."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _WARNINGS = (
     "Using ModelCheckpoint with manual optimization",  # checkpoints are written after the step, as a resumed run needs
     "(?s).*does not have many workers",
     ".*LeafSpec",
-    "Checkpoint directory .* exists and is not empty",  # it is moved aside, or of the training that is continued
+    "Checkpoint directory .* exists and is not empty",  # it is moved aside, or it belongs to the run that is resumed
     # the order of images follows from the step
     "(?s)You're resuming from a checkpoint that ended before the epoch ended",
     "LightningCLI's args parameter is intended",
@@ -21,7 +21,7 @@ def _is_useful(record: logging.LogRecord) -> bool:
 
 
 def silence_advertisements() -> None:
-    """Leave out Lightning's tips on other products, and nothing else that it says."""
+    """Hide Lightning's tips about other products, and nothing else."""
     for name in ("lightning.fabric.utilities.rank_zero", "lightning.pytorch.utilities.rank_zero"):
         logger = logging.getLogger(name)
         if _is_useful not in logger.filters:
@@ -29,6 +29,6 @@ def silence_advertisements() -> None:
 
 
 def silence_warnings() -> None:
-    """Leave out warnings of Lightning and torch about what is taken care of here."""
+    """Hide warnings of Lightning and torch about things that are taken care of here."""
     for message in _WARNINGS:
         warnings.filterwarnings("ignore", message=message)

@@ -36,7 +36,7 @@ class LearningRates:
 
 
 def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: int) -> float:
-    """Learning rate of the centres at a step: from ``rates.means`` times the scene's extent, exponentially downwards.
+    """Learning rate of the centres at a step: decays exponentially from ``rates.means`` times the scene's extent.
 
     Args:
         rates: The rates.

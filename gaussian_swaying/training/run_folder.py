@@ -1,4 +1,4 @@
-"""The folder of a training: taken when its first image is there, so that one that is refused changes nothing."""
+"""The folder of a training run. It is taken with the first image, so that a run that is refused changes nothing."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _OURS = ["point_cloud.ply", *_FOLDERS]
 
 
 class RunFolder(Callback):
-    """Holds the folder of a training from its first image to its end.
+    """Locks the folder of a training run from the first image to the end.
 
-    An earlier training found there is moved aside, unless this one continues from a checkpoint in it. Loggers are made
-    and the configuration is written only then.
+    An earlier run in it is moved aside, unless this run resumes from a checkpoint in it. Loggers are made and the
+    configuration is written only after that.
 
     Attributes:
         root: The folder, ``trainer.default_root_dir``.
-        loggers: Makes the loggers; None if the trainer has its own.
-        save_config: Writes the configuration below a folder.
-        begun: Whether the folder was taken.
-        keep: Hold it until :meth:`release`, not only to the end of Lightning's part.
+        loggers: Function that makes the loggers; None if the trainer has loggers.
+        save_config: Function that writes the configuration to a folder.
+        begun: Whether the folder is taken.
+        keep: Lock it until :meth:`release`, not only to the end of Lightning's part.
     """
 
     def __init__(self) -> None:
@@ -43,37 +43,37 @@ class RunFolder(Callback):
         self._newest: Callable[[], str | None] = lambda: None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Take the folder before the first image is trained on."""
+        """Take the folder before training on the first image."""
         self._begin(trainer, pl_module)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Likewise where a continued training validates first; a folder for results alone is marked as ours."""
+        """The same for a resumed run that validates first; a folder only for results is marked as ours."""
         if trainer.state.fn != "fit":
             self._mark(pl_module)
         elif not trainer.sanity_checking:
             self._begin(trainer, pl_module)
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Mark a folder for results alone as ours."""
+        """Mark a folder only for results as ours."""
         self._mark(pl_module)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Let the folder go when the training fails or is stopped."""
+        """Unlock the folder when training fails or is stopped."""
         self.release()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Let the folder go at the end."""
+        """Unlock the folder at the end."""
         if not self.keep:
             self.release()
 
     def release(self) -> None:
-        """Let other trainings write to the folder."""
+        """Unlock the folder for other runs."""
         for lock in self._locks:
             lock.release()
         self._locks = []
 
     def newest_checkpoint(self) -> str | None:
-        """The last checkpoint of a training that has begun, or the one that it continued; None if there is none."""
+        """The last checkpoint of a started run, or the one that it resumed; None if there is none."""
         return self._newest()
 
     def _mark(self, pl_module: Any) -> None:
@@ -98,7 +98,7 @@ class RunFolder(Callback):
 
 
 def _apart(options: dict[Path, str]) -> list[tuple[Path, str]]:
-    """The folders, outer ones first, without those within another."""
+    """The folders, outer ones first, without those inside another."""
     kept: list[tuple[Path, str]] = []
     for folder in sorted(options, key=lambda folder: len(folder.resolve().parts)):
         if not any(folder.resolve().is_relative_to(other.resolve()) for other, _ in kept):

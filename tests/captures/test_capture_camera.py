@@ -102,7 +102,7 @@ def test_bad_views(capture, tmp_path):
         CaptureCamera(capture, view="d")(0, 0.0, CENTER, UP, 1.0)
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match=r"holds no cameras: give a transforms\.json"):
+    with pytest.raises(ValueError, match=r"has no cameras: give a transforms\.json"):
         CaptureCamera(empty)(0, 0.0, CENTER, UP, 1.0)
 
 

@@ -93,7 +93,7 @@ def test_bad_images_are_named(tmp_path, pixels):
     with pytest.raises(ValueError, match=r"a\.png has 9 x 6 pixels, but its camera has 8 x 6"):
         load_image(tmp_path / "a.png", _plain(8, 6))
     Image.fromarray(np.zeros((4, 4), dtype=np.float32)).save(tmp_path / "float.tiff")
-    with pytest.raises(ValueError, match=r"float\.tiff holds floating-point numbers"):
+    with pytest.raises(ValueError, match=r"float\.tiff has floating-point numbers"):
         read_image(tmp_path / "float.tiff")
 
 

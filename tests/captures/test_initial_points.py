@@ -107,7 +107,7 @@ def test_ply_with_and_without_faces(tmp_path, capture):
 
 
 def test_bad_sources_are_named(tmp_path, capture, capture_tools):
-    with pytest.raises(ValueError, match="came with no points"):
+    with pytest.raises(ValueError, match="has no points"):
         initial_points(capture, "capture")
     with pytest.raises(ValueError, match=r"points\.xyz.*\.ply or \.obj"):
         initial_points(capture, "points.xyz")
@@ -137,5 +137,5 @@ def test_cameras_that_look_apart_need_points(tmp_path, capture_tools):
     eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
     capture = read_capture(capture_tools.transforms(tmp_path, outward, [f"{i}.png" for i in range(4)]), test_every=0)
-    with pytest.raises(ValueError, match="look at no common point"):
+    with pytest.raises(ValueError, match="do not look at a common point"):
         initial_points(capture)

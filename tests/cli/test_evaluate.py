@@ -101,9 +101,9 @@ def test_options(tool, folders, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["nowhere", "REFERENCE"], ["There is no run folder nowhere", "folder of a simulation"]),
-        (["RUN", "nowhere"], ["There is no reference folder nowhere"]),
-        (["RUN", "REFERENCE", "--reference-offset", "1"], ["4 pictures of", "--frames 3"]),
+        (["nowhere", "REFERENCE"], ["The run folder nowhere does not exist", "folder of a simulation"]),
+        (["RUN", "nowhere"], ["The reference folder nowhere does not exist"]),
+        (["RUN", "REFERENCE", "--reference-offset", "1"], ["4 pictures in", "--frames 3"]),
         (["RUN", "REFERENCE", "--i3d", "i3d.pt"], ["There is no file i3d.pt", "none is downloaded"]),
         (["RUN", "REFERENCE", "--points", "0"], ["`points`", "positive"]),
         pytest.param(

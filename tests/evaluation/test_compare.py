@@ -138,7 +138,7 @@ def test_the_line_for_people_is_understood(make_run, make_reference):
     line = SimFrame.fit(points, metres_per_unit=1.0).describe()
     found = compare_run(make_run(frame=line), make_reference(), points=POINTS)
     assert found["mean"]["chamfer_m"] < 0.02
-    with pytest.raises(ValueError, match="it has no `sim_frame`"):
+    with pytest.raises(ValueError, match="has no usable `frame`"):
         compare_run(make_run("other", frame="somewhere"), make_reference("another"))
 
 
@@ -236,7 +236,7 @@ def test_nothing_is_left_of_a_comparison_that_fails(make_run, make_reference, tm
     with pytest.raises(ValueError, match=r"00002\.png cannot be read"):
         evaluate(run, reference, tmp_path / "a/b")
     assert not (tmp_path / "a").exists()
-    with pytest.raises(ValueError, match=r"There is no run folder .*nowhere"):
+    with pytest.raises(ValueError, match=r"The run folder .*nowhere does not exist"):
         evaluate(tmp_path / "nowhere", reference, tmp_path / "nowhere/eval")
     assert not (tmp_path / "nowhere").exists()
 
@@ -290,8 +290,8 @@ def _nan(folder):
     [
         (_resize, r"have 48 x 16 pixels, but those of .*reference 24 x 16: render the run"),
         (_one_smaller, r"00002\.png has 23 x 16 pixels, but the first one 24 x 16"),
-        (_gap, r"Between .*00001\.png and 00003\.png frames are missing"),
-        (_foreign, r"Expected .*last\.png to be named by the number"),
+        (_gap, r"missing or duplicated between .*00001\.png and 00003\.png"),
+        (_foreign, r"Expected the name of .*last\.png to be the number"),
         (_transparent, r"00002\.png has transparent pixels"),
         (_no_summary, r"has no readable summary\.json"),
         (_no_trajectory, r"trajectory\.npz cannot be read as a trajectory"),
@@ -307,7 +307,7 @@ def test_a_bad_run(make_run, make_reference, spoil, message):
 
 def test_numbers_of_frames_that_differ(make_run, make_reference):
     run, reference = make_run(frames=4), make_reference(frames=6)
-    message = r"differ: there are 4 pictures of .*run and 6 of .*reference, .*surfaces.* with --frames 4"
+    message = r"differ: there are 4 pictures in .*run and 6 in .*reference, .*surfaces.* with --frames 4"
     with pytest.raises(ValueError, match=message):
         compare_run(run, reference)
     assert compare_run(run, reference, frames=4, points=100)["frames"] == 4
@@ -319,7 +319,7 @@ def test_numbers_of_frames_that_differ(make_run, make_reference):
 
 def test_nothing_to_compare(make_run, make_reference, tmp_path):
     run = make_run()
-    with pytest.raises(ValueError, match=r"There is no reference folder .*nowhere"):
+    with pytest.raises(ValueError, match=r"The reference folder .*nowhere does not exist"):
         compare_run(run, tmp_path / "nowhere")
     with pytest.raises(ValueError, match=r"Nothing can be compared \(pictures: .*; surface: there is no .*cloth\.npz"):
         compare_run(run, make_reference(cloth=False, pictures=False))

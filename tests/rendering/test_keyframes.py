@@ -85,7 +85,7 @@ def test_eyes_look_at_their_targets():
         ([], "at least one key"),
         ([CameraKey(0.0)], "neither"),
         ([CameraKey(0.0, eye=[1, 2, 3], radius=1.0)], "both"),
-        ([CameraKey(0.0, azimuth=0.0, radius=1.0)], "lacks `elevation`"),
+        ([CameraKey(0.0, azimuth=0.0, radius=1.0)], "has no `elevation`"),
         ([CameraKey(0.0, azimuth=0.0, elevation=90.0, radius=1.0)], "`keys.elevation`"),
         ([CameraKey(0.0, azimuth=0.0, elevation=0.0, radius=0.0)], "`keys.radius`"),
         ([CameraKey(1.0, eye=[0, 1, 2]), CameraKey(1.0, eye=[0, 1, 3])], "to increase"),

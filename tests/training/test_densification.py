@@ -138,10 +138,10 @@ def test_mcmc_adds_up_to_its_cap():
 def test_foreign_optimizers_are_refused():
     model = _model()
     optimizers = _optimizers(model)
-    with pytest.raises(ValueError, match="optimiser of `means` alone"):
+    with pytest.raises(ValueError, match="optimiser with only `means`"):
         DefaultDensification().attach(_model(), optimizers, 1.0)
     del optimizers["shN"]
-    with pytest.raises(ValueError, match="optimiser of `shN` alone"):
+    with pytest.raises(ValueError, match="optimiser with only `shN`"):
         DefaultDensification().attach(model, optimizers, 1.0)
 
 

@@ -192,7 +192,7 @@ def test_total_with_a_term_of_ones_own():
     [
         (lambda: TotalLoss(weights={"depth": 1.0}), r"`loss_weights` for rgb.*but got one for depth"),
         (lambda: TotalLoss(weights={"size": math.nan}), "`loss_weights.size` to be finite"),
-        (lambda: TotalLoss(weights={"rgb": 0, "anisotropy": 0, "entropy": 0, "size": 0}), "other than zero"),
+        (lambda: TotalLoss(weights={"rgb": 0, "anisotropy": 0, "entropy": 0, "size": 0}), "not to be zero"),
         (lambda: PhotometricLoss(1.5), "`ssim_weight` between 0 and 1"),
         (lambda: AnisotropyLoss(0.5), "`a` to be at least 1"),
         (lambda: AnisotropyLoss(ratio="min_max"), "paper, max_min"),

@@ -1,1 +1,1 @@
-"""What a training sees."""
+"""Training data: images and their order."""

@@ -25,25 +25,25 @@ from gaussian_swaying.training.data.order import EndlessShuffle
 class TrainingImage:
     """One batch: an image and the camera that took it.
 
-    It holds bytes and computes colours where they are used, so that little goes to a GPU. Fields and properties are
-    there as items too: ``batch["image"]``.
+    It holds bytes and computes colours where they are used, so that little is copied to a GPU. Fields and properties
+    are also available as items: ``batch["image"]``.
 
     Attributes:
-        pixels: Dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha.
+        pixels: Dtype uint8, shape (H, W, 3), or (H, W, 4) with premultiplied alpha.
         camera: Camera of the image.
-        name: Path of the image as the capture's files give it.
-        index: Place of the view in ``Capture.split(...)``.
+        name: Path of the image as written in the capture's files.
+        index: Index of the view in ``Capture.split(...)``.
     """
 
     pixels: Tensor
     camera: Camera
     name: str
     index: int
-    _cameras: dict[torch.device, Camera] = field(default_factory=dict, repr=False)  # on devices, kept by the dataset
+    _cameras: dict[torch.device, Camera] = field(default_factory=dict, repr=False)  # by device, cached by the dataset
 
     @property
     def image(self) -> Tensor:
-        """Colours in 0 to 1, not multiplied with alpha, float32, shape (H, W, 3)."""
+        """Colours in 0 to 1, without premultiplied alpha, float32, shape (H, W, 3)."""
         return straight_colors(self.pixels)[0]
 
     @property
@@ -52,13 +52,13 @@ class TrainingImage:
         return straight_colors(self.pixels)[1]
 
     def __getitem__(self, name: str) -> Any:
-        """Field or property of this name."""
+        """Field or property with this name."""
         if name not in ("image", "alpha", "pixels", "camera", "name", "index"):
             raise KeyError(name)
         return getattr(self, name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Field or property of this name, or ``default`` if there is none."""
+        """Field or property with this name, or ``default`` if there is none."""
         try:
             return self[name]
         except KeyError:
@@ -82,7 +82,7 @@ class CaptureDataset(Dataset[TrainingImage]):
 
     Args:
         views: The views.
-        cache: Keep the pixels in memory, as bytes of the size that the views have; page-locked if there is a GPU.
+        cache: Keep the pixels in memory, as bytes in the size of the views; page-locked if there is a GPU.
         threads: Threads that read images into the cache.
 
     Raises:
@@ -112,23 +112,23 @@ class CaptureDataset(Dataset[TrainingImage]):
 class CaptureDataModule(LightningDataModule):
     """Training, validation and test images of a capture.
 
-    A batch is one :class:`TrainingImage`. Training images come without end, in rounds that are shuffled by ``seed``
-    alone; a run resumed from a checkpoint goes on with the image that comes next, one image being one step of the
-    trainer. Validation and test images come in the order of their names. Validation uses the split ``val`` of the
-    capture, or ``test`` if it has none. Alpha is handed on: who draws the picture knows what is behind it.
+    A batch is one :class:`TrainingImage`. There is no end of training images: they come in rounds whose order depends
+    only on ``seed``. A run resumed from a checkpoint continues with the next image; one image is one step of the
+    trainer. Validation and test images are sorted by name. Validation uses the split ``val`` of the capture, or
+    ``test`` if there is none. Alpha is passed on, as the trainer chooses the background.
 
     Args:
         path: Folder or transforms.json, see :func:`~gaussian_swaying.captures.capture.read_capture`.
         format: ``auto``, ``colmap`` or ``transforms``.
-        downscale: How many pixels on a side become one.
-        test_every: Every how many-th image is for testing, 0 for none, where the files do not say.
+        downscale: Factor by which width and height are reduced.
+        test_every: Every n-th image is for testing, 0 for none; not used if the files define the splits.
         images: Folder of the images of a COLMAP model.
-        workers: With ``cache`` the number of threads that read the images when the run starts, without it the number
-            of processes that read them as they are needed.
-        cache: Keep the images in memory, as bytes of the size that is trained on.
-        points: What the Gaussians start from, see :func:`~gaussian_swaying.captures.initial_points.initial_points`.
+        workers: With ``cache`` the number of threads that read the images at the start of the run; without it the
+            number of processes that read them when needed.
+        cache: Keep the images in memory, as bytes in the size used for training.
+        points: Initial points of the Gaussians, see :func:`~gaussian_swaying.captures.initial_points.initial_points`.
         point_count: Number of points, where they are drawn at random.
-        seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
+        seed: Seed of the order and of random points; by default that of ``seed_everything``, or 0.
         initial_opacity: Opacity of the Gaussians at these points, between 0 and 1; 0.5 suits MCMC.
         initial_scale: Their standard deviation as a multiple of the distance to their neighbours; 0.1 suits MCMC.
 
@@ -164,7 +164,7 @@ class CaptureDataModule(LightningDataModule):
         self.seed = int(os.environ.get("PL_GLOBAL_SEED", "0")) if seed is None else seed
         self._capture: Capture | None = None
         self._datasets: dict[str, CaptureDataset] = {}
-        self._seen = 0  # training images of the run before this one
+        self._seen = 0  # training images of the run that this one resumes
 
     @property
     def capture(self) -> Capture:
@@ -179,13 +179,13 @@ class CaptureDataModule(LightningDataModule):
         return self.capture.extent
 
     def initial_cloud(self, sh_degree: int = 3) -> GaussianCloud:
-        """Gaussians to start the training from.
+        """The initial Gaussians.
 
         Args:
             sh_degree: Degree of their spherical harmonics.
 
         Raises:
-            ValueError: If ``points`` cannot be had from this capture.
+            ValueError: If this capture cannot provide ``points``.
         """
         from gaussian_swaying.training.initial import gaussians_from_points
 
@@ -211,7 +211,7 @@ class CaptureDataModule(LightningDataModule):
             if stage in ("validate", "test") and not self.capture.split(split):
                 raise ValueError(
                     f"The split `{split}` of {self.path} is empty, so there is nothing to {stage}: set `test_every`, "
-                    "or name the images in the capture's files."
+                    "or list the images in the capture's files."
                 )
             self._dataset(split)
 
@@ -223,7 +223,7 @@ class CaptureDataModule(LightningDataModule):
     def _options(self) -> dict[str, Any]:
         workers = 0 if self.cache else self.workers
         return {
-            "batch_size": None,  # an item is a batch
+            "batch_size": None,  # each item is a batch
             "num_workers": workers,
             "persistent_workers": workers > 0,
             "pin_memory": torch.cuda.is_available() and not self.cache,
@@ -232,24 +232,24 @@ class CaptureDataModule(LightningDataModule):
     def transfer_batch_to_device(
         self, batch: TrainingImage, device: torch.device, dataloader_idx: int
     ) -> TrainingImage:
-        """The image on the device; Lightning would look through its fields at every step."""
+        """The image on the device; Lightning would search its fields at every step."""
         return batch.to(device, non_blocking=True)
 
     def train_dataloader(self) -> DataLoader[TrainingImage]:
-        """Training images, shuffled, without end."""
+        """Training images, shuffled and endless."""
         dataset = self._dataset("train")
         return DataLoader(dataset, sampler=EndlessShuffle(len(dataset), self.seed, self._seen), **self._options())
 
     def state_dict(self) -> dict[str, int]:
-        """Number of training images seen, and what their order depends on; Lightning keeps it in checkpoints."""
+        """Number of training images seen, and what defines their order; Lightning stores it in checkpoints."""
         seen = self._seen if self.trainer is None else self.trainer.global_step
         return {"seed": self.seed, "count": len(self.capture.split("train")), "seen": seen}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Go on with the training image that comes next.
+        """Continue with the next training image.
 
         Raises:
-            ValueError: If the seed or the training images are others.
+            ValueError: If the seed or the number of training images has changed.
         """
         now = {"seed": self.seed, "count": len(self.capture.split("train"))}
         fitting = self.trainer is None or self.trainer.state.fn == "fit"
@@ -257,7 +257,7 @@ class CaptureDataModule(LightningDataModule):
             if fitting and state_dict[name] != now[name]:
                 raise ValueError(
                     f"The {what} of {self.path} was {state_dict[name]} in the checkpoint and is {now[name]} now: set "
-                    "what it was, or start a new run."
+                    "the old value, or start a new run."
                 )
         self._seen = int(state_dict["seen"])
 

@@ -1,4 +1,4 @@
-"""A capture made in code as training data, so that a training runs with nothing downloaded."""
+"""A capture made in code as training data, so that training works without downloads."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from gaussian_swaying.training.data.datamodule import CaptureDataModule
 class GeneratedDataModule(CaptureDataModule):
     """Images of a :class:`~gaussian_swaying.captures.generated_capture.GeneratedCapture`, drawn at the first run.
 
-    They are kept in a folder, which later runs with the same settings use again, and which
-    :class:`~gaussian_swaying.training.data.datamodule.CaptureDataModule` reads as any other capture.
+    They are stored in a folder, which later runs with the same settings reuse.
+    :class:`~gaussian_swaying.training.data.datamodule.CaptureDataModule` reads it like any other capture.
 
     Args:
-        path: Folder of the images; made if it is missing.
-        capture: What is drawn.
-        test_every: Every how many-th image is for testing.
+        path: Folder of the images; created if it does not exist.
+        capture: The capture to draw.
+        test_every: Every n-th image is for testing.
         workers: Threads that draw and read the images.
-        points: What the Gaussians start from: ``random`` in the space that the cameras see, or a file.
+        points: Initial points of the Gaussians: ``random`` in the space that the cameras see, or a file.
         point_count: Number of points, where they are drawn at random.
         seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
         initial_opacity: Opacity of the Gaussians at these points, between 0 and 1.
         initial_scale: Their standard deviation as a multiple of the distance to their neighbours.
 
     Raises:
-        ValueError: In ``setup``, if the folder holds something else, or images of another flag.
+        ValueError: In ``setup``, if the folder contains something else, or images of another flag.
     """
 
     def __init__(
@@ -58,13 +58,13 @@ class GeneratedDataModule(CaptureDataModule):
         self.generated = capture
 
     def setup(self, stage: str | None = None) -> None:
-        """Draw the images if they are not there, then read them.
+        """Draw the images if they do not exist yet, then read them.
 
         Args:
             stage: ``fit``, ``validate``, ``test``, or None for all.
 
         Raises:
-            ValueError: If the folder holds something else.
+            ValueError: If the folder contains something else.
         """
         self._make()
         super().setup(stage)
@@ -78,9 +78,9 @@ class GeneratedDataModule(CaptureDataModule):
             if held == settings:
                 return
             other = ", ".join(name for name in settings if held.get(name) != settings[name])
-            raise ValueError(f"{folder} holds images that were made with another {other}: remove it or set `path`.")
+            raise ValueError(f"{folder} contains images that were made with another {other}: remove it or set `path`.")
         if folder.exists():
-            raise ValueError(f"{folder} exists and holds no generated capture: set another `path`.")
+            raise ValueError(f"{folder} exists and is not a generated capture: set another `path`.")
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
             made = Path(temporary) / "capture"

@@ -1,4 +1,4 @@
-"""The order in which a training sees its images."""
+"""The order of training images."""
 
 from collections.abc import Iterator
 
@@ -7,9 +7,9 @@ from torch.utils.data import Sampler
 
 
 class EndlessShuffle(Sampler[int]):
-    """Indices of ``count`` images without end: each round is a permutation that follows from the seed and its number.
+    """Endless indices of ``count`` images: each round is a permutation given by the seed and the number of the round.
 
-    A training that goes on after ``start`` images sees exactly the images that it would have seen.
+    A run that continues after ``start`` images gets exactly the same images as one without a stop.
 
     Args:
         count: Number of images.

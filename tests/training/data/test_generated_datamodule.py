@@ -39,7 +39,7 @@ def test_other_things_are_left_alone(tmp_path):
     with pytest.raises(ValueError, match="made with another ripple: remove it or set `path`"):
         _data(tmp_path / "flag", ripple=0.1).setup("fit")
     (tmp_path / "mine").mkdir()
-    with pytest.raises(ValueError, match="holds no generated capture"):
+    with pytest.raises(ValueError, match="is not a generated capture"):
         _data(tmp_path / "mine").setup("fit")
 
 
