@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gaussian_swaying._files import kind_of
 
@@ -95,6 +98,34 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
     return path
 
 
+def read_arrays(
+    path: str | os.PathLike[str], what: str, needed: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """Read arrays of a .npz; no code in it is executed.
+
+    Args:
+        path: The file.
+        what: What it should be, for the message, for example "the reference".
+        needed: Names of arrays that it must have.
+        optional: Names of arrays that it may have.
+
+    Returns:
+        Those that are there, by name.
+
+    Raises:
+        ValueError: If the file is missing or damaged, or lacks an array.
+    """
+    try:
+        with np.load(check_archive(path, what)) as archive:
+            found = {name: archive[name] for name in (*needed, *optional) if name in archive}
+    except Exception as error:  # not there, not a zip, pickled, ...
+        raise ValueError(f"{path} cannot be read ({error}): make {what} again.") from error
+    for name in needed:
+        if name not in found:
+            raise ValueError(f"{path} has no array `{name}`: make {what} again.")
+    return found
+
+
 class _LongNumberError(ValueError):
     """A whole number that no field can hold."""
 
@@ -105,4 +136,4 @@ def _whole(digits: str) -> int:
     return int(digits)
 
 
-__all__ = ["check_archive", "check_regular", "read_json"]
+__all__ = ["check_archive", "check_regular", "read_arrays", "read_json"]

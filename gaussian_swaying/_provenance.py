@@ -1,8 +1,9 @@
-"""Where and with what a number was made: device and versions."""
+"""Where and with what a number was made: device, versions and memory."""
 
 from __future__ import annotations
 
 import platform
+import sys
 
 import torch
 
@@ -14,6 +15,16 @@ def describe_device(device: torch.device) -> str:
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
+
+
+def peak_memory() -> int | None:
+    """Largest memory of the process so far [bytes]; None on Windows, which does not say."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def versions() -> dict[str, str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as functional
+from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
@@ -237,7 +238,7 @@ class GeneratedCapture:
         hit, _, x, z = self._cast(camera, row, column)
         packed = torch.zeros(*hit.shape, 4)
         packed[hit] = functional.pad(self.colors(x[hit], z[hit]), (0, 1), value=1.0)
-        return functional.avg_pool2d(packed.permute(2, 0, 1)[None], n)[0].permute(1, 2, 0)
+        return rearrange(functional.avg_pool2d(rearrange(packed, "h w c -> 1 c h w"), n), "1 c h w -> h w c")
 
     def _cast(self, camera: Camera, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Whether each ray hits, the depth of the hit, and its x and z, each of shape (rows, columns)."""

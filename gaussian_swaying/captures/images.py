@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 import torch.nn.functional as functional
+from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
@@ -125,14 +126,14 @@ def load_image(path: str | Path, lens: Lens, downscale: int = 1) -> Tensor:
     check_image_size(path, (pixels.shape[1], pixels.shape[0]), lens)
     if downscale == 1 and not lens.distorted and pixels.shape[-1] == 3:
         return pixels
-    image = pixels.permute(2, 0, 1).float()
+    image = rearrange(pixels, "h w c -> c h w").float()
     if len(image) == 4:
         image[:3] *= image[3:] / 255
     if lens.distorted:
         image = remap(image, lens, lens.undistorted())
     if downscale > 1:
         image = average_down(image, downscale)
-    return image.round_().clamp_(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous()
+    return rearrange(image.round_().clamp_(0, 255).to(torch.uint8), "c h w -> h w c").contiguous()
 
 
 def check_image_size(path: str | Path, size: tuple[int, int], lens: Lens) -> None:

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
@@ -138,7 +139,7 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
     clear = _clear(capture, center, points)
     seen, total, squares = torch.zeros(len(points)), torch.zeros(len(points), 3), torch.zeros(len(points))
     for view in capture.split("train"):
-        pixels = view.load()[..., :3].permute(2, 0, 1)[None].float() / 255
+        pixels = rearrange(view.load()[..., :3], "h w c -> 1 c h w").float() / 255
         height = max(round(_WIDTH * pixels.shape[2] / pixels.shape[3]), 1)
         photo = torch.nn.functional.interpolate(pixels, (height, _WIDTH), mode="area")[0]
         camera = view.camera

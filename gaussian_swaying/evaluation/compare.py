@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from einops import rearrange
 from torch import Tensor
 from tqdm import tqdm
 
@@ -57,7 +58,7 @@ def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
         raise ValueError(
             f"Expected pictures of at least 11 x 11 pixels, but got {target.shape[1]} x {target.shape[0]}."
         )
-    one, two = (picture.permute(2, 0, 1)[None] for picture in (image, target))
+    one, two = (rearrange(picture, "h w c -> 1 c h w") for picture in (image, target))
     return {
         "psnr_db": float(peak_signal_noise_ratio(one, two, data_range=1.0)),
         "ssim": float(structural_similarity_index_measure(one, two, data_range=1.0)),  # type: ignore[arg-type]
@@ -174,7 +175,7 @@ def compare_run(
                     encoder.write(comparison_picture(target, image, labels))
                 if fvd is not None:
                     for real, picture in ((True, target), (False, image)):
-                        small[real].append(fvd.prepare(picture.permute(2, 0, 1)))
+                        small[real].append(fvd.prepare(rearrange(picture, "h w c -> c h w")))
             if surface is not None:
                 row |= surface.distances(first + number, first_reference + number)
             rows.append(row)

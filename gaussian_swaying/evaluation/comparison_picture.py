@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying.captures.images import average_down
@@ -14,6 +15,11 @@ from gaussian_swaying.rendering.colormap import colormap
 
 ERROR_SCALE = 0.25  # absolute error at the bright end of the error map
 PANEL_WIDTH = 640  # pixels; wider pictures are averaged down by a whole number in the video
+
+
+def _smaller(picture: Tensor, factor: int) -> Tensor:
+    """Average a picture (H, W, 3) down by a whole number."""
+    return rearrange(average_down(rearrange(picture, "h w c -> c h w"), factor), "c h w -> h w c")
 
 
 def comparison_picture(
@@ -37,7 +43,7 @@ def comparison_picture(
 
     factor = math.ceil(reference.shape[1] / PANEL_WIDTH)
     error = colormap((image - reference).abs().mean(-1) / ERROR_SCALE)
-    panels = [average_down(p.permute(2, 0, 1).float(), factor).permute(1, 2, 0) for p in (reference, image, error)]
+    panels = [_smaller(picture.float(), factor) for picture in (reference, image, error)]
     height, width = panels[0].shape[:2]
     band, gap = max(16, height // 14), 2
     ramp = colormap(torch.linspace(0, 1, width // 4)).expand(band // 2, -1, 3)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._inputs import check_archive
+from gaussian_swaying._inputs import read_arrays
 from gaussian_swaying.captures.point_cloud import PointCloud, sample_mesh
 
 
@@ -42,14 +42,7 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
     Raises:
         ValueError: If the file or an array is missing, damaged, or has a wrong shape or value.
     """
-    try:
-        with np.load(check_archive(path, "the reference")) as arrays:
-            found = {name: arrays[name] for name in ("positions", "faces", "side", "settings") if name in arrays}
-    except Exception as error:  # missing, not a zip, pickled, ...
-        raise ValueError(f"The surface {path} cannot be read ({error}): make the reference again.") from error
-    for name in ("positions", "faces"):
-        if name not in found:
-            raise ValueError(f"The surface {path} has no array `{name}`: make the reference again.")
+    found = read_arrays(path, "the reference", ("positions", "faces"), ("side", "settings"))
     positions = torch.from_numpy(found["positions"].astype(np.float32))
     faces = torch.from_numpy(found["faces"].astype(np.int64))
     if positions.dim() != 3 or positions.shape[-1] != 3 or len(positions) == 0:

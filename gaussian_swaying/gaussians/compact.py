@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from einops import rearrange
 
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -158,7 +159,7 @@ def _harmonics(path: Path, rows: np.ndarray, count: int) -> np.ndarray:
         )
     table = np.stack([rows[name] for name in names], -1).astype(np.float32)
     values: np.ndarray = ((table + 0.5) / 256 - 0.5) * 8
-    return values.reshape(count, 3, -1).transpose(0, 2, 1)
+    return rearrange(values, "n (c k) -> n k c", c=3)
 
 
 def _cloud(

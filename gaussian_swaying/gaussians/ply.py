@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from einops import rearrange
 
 from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -78,7 +79,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     check_sizes_and_rotations(path, scales, quats)
     sh = columns(_DC)[:, None, :]
     if rest:
-        sh = np.concatenate([sh, columns(rest).reshape(len(data), 3, -1).transpose(0, 2, 1)], axis=1)
+        sh = np.concatenate([sh, rearrange(columns(rest), "n (c k) -> n k c", c=3)], axis=1)
     normals = columns(_NORMALS) if has_normals else None
     if normals is not None and not normals.any():
         normals = None
@@ -117,7 +118,7 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
         raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
     normals = smallest_axis_normal(cloud.quats, cloud.scales) if cloud.normals is None else cloud.normals
     count, rest_count = len(cloud), 3 * (cloud.sh.shape[1] - 1)
-    parts = [cloud.means, normals, cloud.sh[:, 0], cloud.sh[:, 1:].transpose(1, 2).reshape(count, rest_count)]
+    parts = [cloud.means, normals, cloud.sh[:, 0], rearrange(cloud.sh[:, 1:], "n k c -> n (c k)")]
     parts += [cloud.opacities[:, None], cloud.scales, cloud.quats]
     table = torch.cat([part.detach().to("cpu", torch.float32) for part in parts], dim=1).contiguous().numpy()
     rest = tuple(f"f_rest_{index}" for index in range(rest_count))

@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as functional
+from einops import rearrange
 from torch import Tensor
 from torchmetrics import Metric  # noqa: TID253 - a class of torchmetrics, imported when it is used
 
@@ -84,7 +85,7 @@ def cut_clips(video: Tensor, length: int, stride: int) -> Tensor:
         raise ValueError(
             f"A video has {len(video)} frames, but a clip needs {length}: give a longer video, or lower `clip_length`."
         )
-    return video.unfold(0, length, stride).movedim(-1, 1)
+    return rearrange(video.unfold(0, length, stride), "n c h w t -> n t c h w")
 
 
 class FrechetVideoDistance(Metric):
@@ -199,8 +200,8 @@ class FrechetVideoDistance(Metric):
         (self.real_features if real else self.fake_features).extend(features)
 
     def _features(self, clips: Tensor) -> Tensor:
-        self.network.eval()  # also inside a module in training mode
-        features = self.network(clips.transpose(1, 2).contiguous(), **self.options)
+        self.network.eval()  # also within a module that is in training
+        features = self.network(rearrange(clips, "n t c h w -> n c t h w").contiguous(), **self.options)
         if not isinstance(features, Tensor) or features.dim() != 2 or len(features) != len(clips):
             shape = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
             raise ValueError(

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import lightning
 import torch
+from einops import rearrange
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
@@ -395,7 +396,7 @@ class SplatTrainer(lightning.LightningModule):
         fitting = self.trainer.state.fn == "fit"
         degree = self.active_degree(max(self.global_step - 1, 0)) if fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
-        one, two = (picture.movedim(-1, 0)[None].float() for picture in (image, target))
+        one, two = (rearrange(picture, "h w c -> 1 c h w").float() for picture in (image, target))
         values = {"psnr": peak_signal_noise_ratio(one, two, data_range=1.0)}
         if min(image.shape[:2]) >= SSIM_TAPS:
             ssim = structural_similarity_index_measure(one, two, data_range=1.0)

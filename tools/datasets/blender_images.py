@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from blender_cloth import require_bpy
 
+from gaussian_swaying._files import atomic
+
 TRANSFERS = ("linear", "srgb")
 
 
@@ -154,11 +156,9 @@ class Studio:
         render.resolution_x, render.resolution_y = view.width, view.height
         self._camera.data.angle = view.angle_x
         self._camera.matrix_world = Matrix(view.pose.tolist())
-        partial = path.with_name(f".partial-{path.name}")
-        render.filepath = str(partial)
-        with _quiet():
+        with atomic(path) as temporary, _quiet():
+            render.filepath = str(temporary)
             self._bpy.ops.render.render(write_still=True)
-        os.replace(partial, path)
 
 
 @contextmanager

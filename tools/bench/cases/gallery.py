@@ -75,6 +75,7 @@ def strip(frames: Path, target: Path) -> None:
     """Make a picture of five frames side by side."""
     import numpy as np
     import torch
+    from einops import rearrange
     from imageio.v3 import imread, imwrite
 
     files = sorted(frames.glob("*.png"))
@@ -83,8 +84,8 @@ def strip(frames: Path, target: Path) -> None:
         pixels = torch.from_numpy(imread(files[min(round(share * len(files)), len(files) - 1)])).float()
         height = round(pixels.shape[0] * _STRIP_WIDTH / pixels.shape[1])
         size = (height, _STRIP_WIDTH)
-        small = torch.nn.functional.interpolate(pixels.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
-        pictures.append(small.round().to(torch.uint8).numpy())
+        small = torch.nn.functional.interpolate(rearrange(pixels, "h w c -> 1 c h w"), size, mode="area")
+        pictures.append(rearrange(small, "1 c h w -> h w c").round().to(torch.uint8).numpy())
     target.parent.mkdir(parents=True, exist_ok=True)
     imwrite(target, np.concatenate(pictures, axis=1))
 

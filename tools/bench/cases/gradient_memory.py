@@ -5,12 +5,12 @@
 
 import dataclasses
 import json
-import resource
 import sys
 import time
 
 import torch
 
+from gaussian_swaying._provenance import peak_memory
 from gaussian_swaying.aero.force import aero_force
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -18,15 +18,14 @@ from gaussian_swaying.validation.flags import HEIGHT, WIDTH, flag_points
 from gaussian_swaying.validation.settings import Settings
 
 
-def peak() -> float:
-    """Largest resident memory of the process so far [MiB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+def _peak_mib() -> float:
+    return (peak_memory() or 0) / 2**20
 
 
 def main() -> None:
     """Simulate a flag of about a thousand particles and compute the gradient with respect to E and the wind."""
     formulation, steps, checkpoint = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    before = peak()
+    before = _peak_mib()
     settings = Settings(formulation=formulation, dtype=torch.float32)
     points = flag_points(0.03, settings, 6e3, 30.0)
     youngs_modulus = torch.tensor(6e3, requires_grad=True)
@@ -46,7 +45,7 @@ def main() -> None:
     state.position.square().sum().backward()
     assert youngs_modulus.grad is not None
     row = {"formulation": formulation, "particles": points.count, "substeps": steps, "checkpoint": checkpoint}
-    row |= {"memory_MiB": peak() - before, "seconds": time.perf_counter() - begin}
+    row |= {"memory_MiB": _peak_mib() - before, "seconds": time.perf_counter() - begin}
     print(json.dumps(row | {"gradient_E": float(youngs_modulus.grad)}))
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from einops import rearrange
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
@@ -125,7 +126,7 @@ def evaluate(model: GaussianSurfaceModel, views: list[TrainingImage], background
         drawn = renderer.render_splat(
             model.means, model.quats, model.scales, model.opacity(), model.sh, on_device.camera, background
         )
-        one, two = (picture.movedim(-1, 0)[None] for picture in (drawn.color.clamp(0, 1), target))
+        one, two = (rearrange(picture, "h w c -> 1 c h w") for picture in (drawn.color.clamp(0, 1), target))
         found["psnr_db"].append(float(peak_signal_noise_ratio(one, two, data_range=1.0)))
         ssim: Any = structural_similarity_index_measure(one, two, data_range=1.0)
         found["ssim"].append(float(ssim))
@@ -252,7 +253,8 @@ def _flag_look(picture: Path | None) -> Callable[[GaussianSurfaceModel, Generate
             alpha = view.alpha
             photo = view.image if alpha is None else view.image * alpha
             pixels = panel(model, make_renderer(model.means.device), view.camera, photo)
-            small = torch.nn.functional.avg_pool2d(pixels.movedim(-1, 0)[None], 2)[0].movedim(0, -1)
+            small = torch.nn.functional.avg_pool2d(rearrange(pixels, "h w c -> 1 c h w"), 2)
+            small = rearrange(small, "1 c h w -> h w c")
             picture.parent.mkdir(parents=True, exist_ok=True)
             imwrite(picture, (small * 255).round().to(torch.uint8).cpu().numpy())
         return surface_quality(model, data.generated)
