@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+
+from gaussian_swaying._provenance import peak_memory
 
 
 class WallClock:
@@ -62,12 +63,5 @@ class PeakMemory:
 
     def read(self) -> dict[str, int | None]:
         """Bytes of the process and of torch's allocator; None where it is not known."""
-        try:
-            import resource
-        except ImportError:  # Windows
-            host = None
-        else:
-            unit = 1 if sys.platform == "darwin" else 1024
-            host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
         device = torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
-        return {"host": host, "device": device}
+        return {"host": peak_memory(), "device": device}

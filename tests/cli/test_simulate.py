@@ -11,9 +11,10 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.cli.simulate import config_text, main, output_folder
+from gaussian_swaying.cli.simulate import main, output_folder
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.config import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]

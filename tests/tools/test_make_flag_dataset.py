@@ -271,7 +271,7 @@ def test_motion_is_solved_once_and_says_what_changed(reference, flag_motion, mon
 def test_what_is_no_motion_is_an_error(flag_motion, tmp_path):
     np.savez(tmp_path / "other.npz", x=1)
     for name in ("other.npz", "missing.npz"):
-        with pytest.raises(ValueError, match="not the motion of a flag"):
+        with pytest.raises(ValueError, match="make the motion of a flag again"):
             flag_motion.read_cloth(tmp_path / name)
 
 

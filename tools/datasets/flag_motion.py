@@ -14,6 +14,9 @@ import numpy as np
 from blender_cloth import solve_cloth
 from flag_reference import FlagPattern
 
+from gaussian_swaying._files import atomic
+from gaussian_swaying._inputs import read_arrays
+
 UNITS = {
     "positions": "m",
     "rest_normals": "1",
@@ -52,19 +55,6 @@ def check_settings(where: Path, found: dict[str, Any], wanted: dict[str, Any]) -
             f"{where} was made with other settings: {'; '.join(changed)}. Give another `--out`, the old settings, or "
             "remove it."
         )
-
-
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let ``write`` fill a temporary file and then rename it to ``path``, so that no half-written file is left."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    write(partial)
-    os.replace(partial, path)
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write JSON, completely or not at all."""
-    write_whole(path, lambda partial: partial.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +145,9 @@ def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None
         "hash": settings_hash(settings),
     }
 
-    def write(partial: Path) -> None:
-        with partial.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-
-    write_whole(path, write)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(path) as temporary:
+        np.savez_compressed(temporary, **arrays)
     return True
 
 
@@ -174,10 +162,6 @@ def read_cloth(path: str | os.PathLike[str]) -> Cloth:
     Raises:
         ValueError: If it is not such a file.
     """
-    try:
-        with np.load(path) as data:
-            settings = json.loads(str(data["settings"]))
-            positions, faces, uv = (data[name] for name in ("positions", "faces", "uv"))
-            return Cloth(positions, faces, uv, int(data["columns"]), int(data["rows"]), settings)
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is not the motion of a flag ({error}): make it again.") from error
+    found = read_arrays(path, "the motion of a flag", ("positions", "faces", "uv", "columns", "rows", "settings"))
+    positions, faces, uv = (found[name] for name in ("positions", "faces", "uv"))
+    return Cloth(positions, faces, uv, int(found["columns"]), int(found["rows"]), json.loads(str(found["settings"])))

@@ -31,9 +31,11 @@ from blender_checks import check_relations
 from blender_cloth import require_bpy
 from blender_images import TRANSFERS, Studio
 from flag_difference import VARIANTS, difference, variants
-from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern, write_json, write_whole
+from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
 from flag_reference import PATTERNS, FlagPattern, least_quality
+
+from gaussian_swaying._files import atomic, write_json
 
 PARTS = ("cloth", "train", "video")
 Report = Callable[[str], None]
@@ -75,6 +77,7 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
     if path.exists():
         check_settings(folder, json.loads(path.read_text(encoding="utf-8")), settings)
     else:
+        folder.mkdir(parents=True, exist_ok=True)
         write_json(path, settings)
 
 
@@ -104,12 +107,11 @@ def make_truth(pattern: FlagPattern, folder: Path) -> None:
     triangles["vertex_indices"] = truth["faces"]
     ply = PlyData([PlyElement.describe(rows, "vertex"), PlyElement.describe(triangles, "face")], byte_order="<")
 
-    def write_npz(partial: Path) -> None:
-        with partial.open("wb") as file:
-            np.savez_compressed(file, area=np.float64(pattern.width * pattern.height), **truth)  # type: ignore[arg-type]
-
-    write_whole(folder / "truth.npz", write_npz)
-    write_whole(folder / "mesh.ply", lambda partial: ply.write(str(partial)))
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic(folder / "truth.npz") as temporary:
+        np.savez_compressed(temporary, area=np.float64(pattern.width * pattern.height), **truth)  # type: ignore[arg-type]
+    with atomic(folder / "mesh.ply") as temporary:
+        ply.write(str(temporary))
 
 
 def make_train(pattern: FlagPattern, folder: Path, pictures: Pictures, report: Report) -> int:
@@ -178,11 +180,12 @@ def write_film(path: Path, frames: list[Path], fps: int) -> bool:
         import imageio_ffmpeg  # noqa: F401
     except ImportError:
         return False
-    partial = path.with_name(f".partial-{path.name}")
-    with imageio.get_writer(partial, format="FFMPEG", fps=fps, quality=9, macro_block_size=1) as writer:
+    with (
+        atomic(path) as temporary,
+        imageio.get_writer(temporary, format="FFMPEG", fps=fps, quality=9, macro_block_size=1) as writer,
+    ):
         for frame in frames:
             writer.append_data(imageio.imread(frame))
-    partial.replace(path)
     return True
 
 
@@ -346,6 +349,7 @@ def main(argv: list[str] | None = None) -> int:
         if options.check:
             path = options.json or options.out / "check.json"
             rows = check_relations()
+            path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, rows)
             for row in rows["checks"]:
                 print(f"{row['name']}: {row['measured']:.4g} {row['unit']}, {row['ratio']:.4f} of what was expected")

@@ -3,7 +3,8 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.mpm.triton.shared import VARIES, keep_largest, load3, load9, wave_speed
+from gaussian_swaying.geometry.linalg_triton import load3, load9
+from gaussian_swaying.mpm.triton.shared import VARIES, keep_largest, wave_speed
 
 
 @triton.jit(do_not_specialize=VARIES)

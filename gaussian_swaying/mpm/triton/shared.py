@@ -8,7 +8,7 @@ stay loops in Triton's intermediate code: unrolled, its passes take minutes.
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, matmul, transpose
+from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, load3, matmul, transpose
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
@@ -36,42 +36,6 @@ def axis_weights(f, inverse_dx):
     w1, g1 = node_weight(f, 1, inverse_dx)
     w2, g2 = node_weight(f, 2, inverse_dx)
     return (w0, w1, w2), (g0, g1, g2)
-
-
-@triton.jit
-def load3(pointer, stride, index, mask):
-    return (
-        tl.load(pointer + index, mask, 0.0),
-        tl.load(pointer + stride + index, mask, 0.0),
-        tl.load(pointer + 2 * stride + index, mask, 0.0),
-    )
-
-
-@triton.jit
-def load9(pointer, stride, index, mask):
-    return (
-        tl.load(pointer + index, mask, 0.0),
-        tl.load(pointer + stride + index, mask, 0.0),
-        tl.load(pointer + 2 * stride + index, mask, 0.0),
-        tl.load(pointer + 3 * stride + index, mask, 0.0),
-        tl.load(pointer + 4 * stride + index, mask, 0.0),
-        tl.load(pointer + 5 * stride + index, mask, 0.0),
-        tl.load(pointer + 6 * stride + index, mask, 0.0),
-        tl.load(pointer + 7 * stride + index, mask, 0.0),
-        tl.load(pointer + 8 * stride + index, mask, 0.0),
-    )
-
-
-@triton.jit
-def store3(pointer, stride, index, value, mask):
-    for k in tl.static_range(3):
-        tl.store(pointer + k * stride + index, value[k], mask)
-
-
-@triton.jit
-def store9(pointer, stride, index, value, mask):
-    for k in tl.static_range(9):
-        tl.store(pointer + k * stride + index, value[k], mask)
 
 
 @triton.jit

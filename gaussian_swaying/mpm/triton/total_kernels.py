@@ -11,7 +11,7 @@ four columns, or eight where boundaries ask for positions.
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, scale9
+from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.triton.shared import (
@@ -20,7 +20,6 @@ from gaussian_swaying.mpm.triton.shared import (
     add_given,
     axis_weights,
     keep_largest,
-    load3,
     node_weight,
     twin_force,
     wave_speed,

@@ -11,7 +11,7 @@ implicit drag.
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, matmul, scale9, transpose
+from gaussian_swaying.geometry.linalg_triton import axpy9, load3, load9, matmul, scale9, store3, store9, transpose
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.triton.shared import (
@@ -20,11 +20,7 @@ from gaussian_swaying.mpm.triton.shared import (
     add_given,
     axis_weights,
     keep_largest,
-    load3,
-    load9,
     node_weight,
-    store3,
-    store9,
     twin_force,
     wave_speed,
 )
