@@ -131,7 +131,7 @@ def test_bad_names_and_renders(make_cloud, make_pipeline):
 
     one = make_pipeline()
     parts = (one.scene, one.solver, one.wind, one.aero, None, one.camera)
-    with pytest.raises(ValueError, match=r"name of `cameras` .* but got '\.\./up'"):
+    with pytest.raises(ValueError, match=r"names of `cameras` .* but got '\.\./up'"):
         SimulationPipeline(*parts, cameras={"../up": SIDE})
     inside = _cameras(
         make_pipeline(make_cloud(), pinned=False), near=OrbitCamera(width=8, height=8, radius=0.01, elevation=0.1)

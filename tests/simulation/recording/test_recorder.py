@@ -156,7 +156,7 @@ def test_the_trajectory_holds_every_frame(make_pipeline, tmp_path):
         position, F = load_trajectory(tmp_path / "run" / "trajectory.npz", frame)
         assert torch.equal(position, state.position)
         torch.testing.assert_close(F, state.F_total, rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="holds no frame 3: it has 3 frames"):
+    with pytest.raises(ValueError, match="has no frame 3: it has 3 frames"):
         load_trajectory(tmp_path / "run" / "trajectory.npz", 3)
 
 
