@@ -119,7 +119,7 @@ class Normalisation:
         low, high = turned.amin(0), turned.amax(0)
         extent = float((high - low).amax())
         if extent <= 0:
-            raise ValueError("`normalisation` cannot scale a simulated part without extent.")
+            raise ValueError("The simulated part has no extent for `normalisation` to scale.")
         scale = self.scale / extent
         origin = torch.tensor(CENTER, dtype=torch.float64) - scale * 0.5 * (low + high)
         return SimFrame(origin, rotation.T.contiguous(), 1 / scale)

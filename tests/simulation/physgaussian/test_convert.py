@@ -537,7 +537,7 @@ def test_a_region_that_selects_nothing_says_where_the_splat_is_in_its_own_axes(t
     low, high = (corner.tolist() for corner in (turned.amin(0), turned.amax(0)))
     config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "sim_area": [90, 91, 90, 91, 90, 91]}
     settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
-    with pytest.raises(ValueError, match=r"No Gaussian is selected.*in the axes of the region, 0 lie in Box") as caught:
+    with pytest.raises(ValueError, match=r"No Gaussian is selected.*in the axes of the region, 0 are in Box") as caught:
         build_pipeline(PARSER, settings)
     found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("span")[1].split(" in ")[0])]
     assert found == pytest.approx([*low, *high], abs=1e-4)

@@ -680,7 +680,7 @@ def test_foreign_files_are_not_overwritten(name, make_pipeline, tmp_path):
     file = tmp_path / "mine" / name
     file.parent.mkdir(parents=True)
     file.write_text("precious")
-    with pytest.raises(ValueError, match=r"mine holds \w+.* choose another with --output"):
+    with pytest.raises(ValueError, match=r"mine contains \w+.* choose another with --output"):
         _run(make_pipeline(), tmp_path / "mine", 1)
     assert file.read_text() == "precious"
     assert len([path for path in (tmp_path / "mine").rglob("*") if path.is_file()]) == 1
