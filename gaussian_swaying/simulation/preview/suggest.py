@@ -371,7 +371,7 @@ def given_region(
     if int(inside.sum()) < FEWEST:
         span = [[round(float(v), 4) for v in corner] for corner in (points.amin(0), points.amax(0))]
         raise ValueError(
-            f"The box of `--region` contains {int(inside.sum())} Gaussians, too few for an object: the splat is from "
+            f"The box of `--region` contains {int(inside.sum())} Gaussians, too few for an object: the splat spans "
             f"{span[0]} to {span[1]}."
         )
     threshold = suggest_threshold(opacity[inside], weight[inside])

@@ -52,7 +52,7 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
             if name not in checkpoint:
                 raise ValueError(f"it has no `{name}`")
             if type(checkpoint[name]) is not kind:
-                raise ValueError(f"its `{name}` is not a {kind.__name__}")
+                raise ValueError(f"its `{name}` is not of type {kind.__name__}")
     except Exception as error:
         raise unreadable(path, error) from error
     if config and checkpoint["config"] != config:
