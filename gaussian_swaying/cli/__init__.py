@@ -1,8 +1,8 @@
-"""What the commands share: settings of the process, streams that may fail, and errors as one sentence.
+"""Shared by all commands: settings of the process, streams that may fail, and errors as one sentence.
 
-Imported before torch: how long OpenMP's threads spin before they sleep is read once, when torch is loaded. The default,
-much longer, is no faster on a quiet machine, but makes a run tens of times slower as soon as another program wants a
-core.
+It must be imported before torch, since torch reads once how long OpenMP's threads spin before they sleep. The default
+is much longer. On a quiet machine it is not faster, but it makes a run tens of times slower as soon as another program
+needs a core.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""What is said when a run ends early: which checkpoint is there, and the command that goes on from it."""
+"""The message when a run ends early: its last checkpoint, and the command that continues from it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from gaussian_swaying import _program as program
 
 
 def command(arguments: Sequence[str], *more: str, without: str | None = None) -> str:
-    """The command line of this program with some arguments added, ready to be pasted into a shell.
+    """The command line of this program with additional arguments, ready to paste into a shell.
 
     Args:
-        arguments: Those that it was started with.
-        more: To be added at the end, unless they are there already.
-        without: An option that is left out with its value, as ``more`` gives it anew.
+        arguments: The arguments with which it was started.
+        more: Arguments to add at the end, unless they are already there.
+        without: An option to remove with its value, because ``more`` sets it again.
     """
     kept, skip = [], False
     for argument in arguments:
@@ -35,9 +35,9 @@ def how_to_resume(checkpoint: Path, frame: int, arguments: Sequence[str], diverg
         checkpoint: The file.
         frame: Its frame.
         arguments: Command line of the run.
-        diverged: The run diverged, so that the same settings would do so again.
+        diverged: Whether the run diverged, so that the same settings would diverge again.
     """
-    held = f"{checkpoint} holds the run up to frame {frame}"
+    held = f"{checkpoint} contains the run up to frame {frame}"
     if diverged:
-        return f"{held}; going on from it would diverge again, so change the settings and start without --resume."
-    return f"{held}; to go on:\n  {command(arguments, '--resume')}"
+        return f"{held}; continuing from it would diverge again, so change the settings and start without --resume."
+    return f"{held}; to continue:\n  {command(arguments, '--resume')}"

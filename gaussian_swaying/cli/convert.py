@@ -13,10 +13,10 @@ from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the YAML to a file or to the standard output; 2 on bad input."""
+    """Write the YAML to a file or to standard output; 2 on bad input."""
     parser = argparse.ArgumentParser(
         prog=program.name("convert"),
-        description="PhysGaussian's JSON to YAML for --config; docs/physgaussian.md has the differences.",
+        description="Convert PhysGaussian's JSON to a YAML for --config; docs/physgaussian.md lists the differences.",
     )
     parser.add_argument("config", type=Path, help="A configuration of PhysGaussian.")
     parser.add_argument("--output", type=Path, help="YAML file to write; by default it is printed.")
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def write(options: argparse.Namespace) -> None:
-    """Convert, write or print, and say what was written and what means something else."""
+    """Convert, write or print, and report the file and everything whose meaning differs."""
     settings, notes = convert(read_config(options.config), options.cameras, options.sticky_planes)
     text = to_yaml(settings, notes, options.config.name)
     if options.output is None:

@@ -1,4 +1,4 @@
-"""Errors of a command as one sentence and an exit code; all commands go through :func:`run_command`."""
+"""Errors of a command as one sentence and an exit code; all commands use :func:`run_command`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gaussian_swaying.runs.signals import exit_code
 
 OK, BUG, BAD_INPUT = 0, 1, 2
 
-# what torch and numpy say when an array is beyond the memory or beyond counting
+# messages of torch and numpy when an array exceeds the memory or its size cannot be counted
 _MEMORY = re.compile(
     r"can't allocate memory|not enough memory|out of memory|Storage size calculation overflowed|"
     r"multiplication overflow|Unable to allocate|Maximum allowed (size|dimension)|array is too big|"
@@ -39,22 +39,22 @@ def run_command(
     arguments: Sequence[str] | None = None,
     advice: Callable[[BaseException], str | None] | None = None,
 ) -> int:
-    """Run a command, and turn what it raises into a sentence on standard error and an exit code.
+    """Run a command, and turn exceptions into a sentence on standard error and an exit code.
 
-    Standard output or error that is closed, full or cannot show a letter does not stop the command.
+    If standard output or error is closed, full or cannot show a character, the command still runs.
 
     Args:
         command: Does the work and gives an exit code; None is 0.
-        stopped: What is said after Ctrl-C.
-        memory: Remedy that is named if the memory is not enough.
-        expected: Further exceptions whose message is meant for people.
-        arguments: Command line, for messages about it; that of the process if None.
-        advice: Gives what to say after the error or the stop, if anything.
+        stopped: Message after Ctrl-C.
+        memory: Remedy to name if there is not enough memory.
+        expected: Further exceptions whose message is meant for users.
+        arguments: Command line, for messages; that of the process if None.
+        advice: Returns an additional message after an error or stop, or None.
 
     Returns:
-        What the command gave; 2 for bad input or a machine that is not enough, 130 after Ctrl-C, 128 and the number of
-        another signal that stopped it, 1 for an error that is a bug. With the environment variable
-        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        The command's exit code; 2 for bad input or insufficient resources, 130 after Ctrl-C, 128 plus the number of
+        another signal that stopped it, 1 for a bug. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors
+        keep their traceback.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     with safe_streams() as (output, _):
@@ -68,7 +68,7 @@ def run_command(
 
 
 def _was_written(output: SafeStream) -> bool:
-    """Whether standard output took everything, which is said otherwise; a reader that has seen enough is no error."""
+    """Whether all standard output was written; if not, print an error. A pipe closed by its reader is no error."""
     output.flush()
     number = getattr(output.error, "errno", None) or errno.EBADF
     if output.error is None or number == errno.EPIPE:
@@ -116,7 +116,7 @@ def _advise(advice: Callable[[BaseException], str | None] | None, error: BaseExc
 
 
 def _once(shown: set[str]) -> Callable[..., None]:
-    """How to show a warning: one line, without the line of code that gave it, and not again."""
+    """A function that shows each warning once, in one line, without its line of code."""
 
     def show(message: Warning | str, *where: object, **named: object) -> None:
         text = str(message)
@@ -133,26 +133,26 @@ def sentence(
     expected: tuple[type[BaseException], ...] = (),
     arguments: Sequence[str] = (),
 ) -> str | None:
-    """What an error says to people, in one line; None if it is a bug.
+    """The message of an error for users, in one line; None if it is a bug.
 
     Args:
         error: The error.
-        memory: Remedy if the memory is not enough.
-        expected: Further exceptions whose message is meant for people.
-        arguments: Command line, for messages about it.
+        memory: Remedy if there is not enough memory.
+        expected: Further exceptions whose message is meant for users.
+        arguments: Command line, for messages.
     """
     text = _first_line(error)
     if isinstance(error, MemoryError | torch.OutOfMemoryError) or (
         isinstance(error, RuntimeError | ValueError) and _MEMORY.search(text)
     ):
         what = text.rstrip(".") if text.startswith("Unable") else _asked_for(text)
-        return f"The memory is not enough{what and ' (' + what + ')'}. Remedy: {memory}."
+        return f"There is not enough memory{what and ' (' + what + ')'}. Remedy: {memory}."
     if isinstance(error, RecursionError):
         return "The input is nested too deeply: make it flatter."
     if isinstance(error, UnicodeError):
         return f"A file or an option is not UTF-8 text ({text}): save it as UTF-8."
     if isinstance(error, ArithmeticError) or (isinstance(error, RuntimeError) and _NUMBER.search(text)):
-        return f"A number is too large or too small to compute with ({text}): check the values that were given."
+        return f"A number is too large or too small to compute with ({text}): check the given values."
     if isinstance(error, OSError):
         return _of_the_system(error)
     if isinstance(error, RuntimeError) and _WRITER.search(text):
@@ -167,10 +167,10 @@ def sentence(
 
 
 def parser_sentence(message: str, arguments: Sequence[str] = ()) -> str:
-    """The part of a message that concerns people, in one line.
+    """The part of a message that is useful for users, in one line.
 
-    That is the value and the reason, if it comes from the parser, which names the configuration if it cannot be
-    parsed; and the last line of the traceback of a worker process.
+    For the parser it is the value and the reason, or the configuration that cannot be parsed. For a worker process it
+    is the last line of its traceback.
     """
     if message.startswith("Caught "):
         return message.strip().rpartition("Error: ")[2]
@@ -192,16 +192,16 @@ def _first_line(error: BaseException) -> str:
 
 
 def _asked_for(text: str) -> str:
-    """How much memory was asked for, where the message says so."""
+    """How much memory was requested, if the message says so."""
     found = re.search(r"allocate (\d+) bytes", text)
     if found:
-        return f"{int(found[1]) / 2**30:,.3g} GiB were asked for"
+        return f"{int(found[1]) / 2**30:,.3g} GiB were requested"
     found = re.search(r"allocate ([\d.]+ [KMGT]iB)", text)
-    return f"{found[1]} were asked for" if found else ""
+    return f"{found[1]} were requested" if found else ""
 
 
 def _of_the_system(error: OSError) -> str:
-    """A sentence from an error of the system, which has a number and a file, or from one of ours, which is one."""
+    """A sentence from an error of the system, with a number and a file, or the message of one of our errors."""
     if error.errno is None or error.strerror is None:
         return parser_sentence(str(error))
     where = error.filename or "A file"

@@ -1,7 +1,7 @@
 """Compare a run with a reference: ``gaussian-swaying eval RUN REFERENCE --output DIR``.
 
-RUN is what ``gaussian-swaying sim`` wrote. REFERENCE has ``frames/*.png`` and, for the Chamfer distance, ``cloth.npz``
-with ``positions`` (T, V, 3) [m] and ``faces``. Writes eval.json, eval.md and comparison.mp4.
+RUN is an output folder of ``gaussian-swaying sim``. REFERENCE has ``frames/*.png`` and, for the Chamfer distance,
+``cloth.npz`` with ``positions`` (T, V, 3) [m] and ``faces``. Writes eval.json, eval.md and comparison.mp4.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def build_parser() -> argparse.ArgumentParser:
     add("run", help="folder of a run")
     add("reference", help="folder with frames/*.png and, for the Chamfer distance, cloth.npz")
     add("--output", help="where to write eval.json, eval.md and comparison.mp4; RUN/eval if left out")
-    add("--reference-offset", type=int, default=0, help="frame of the reference that belongs to frame 0 of the run")
-    add("--frames", type=int, help="compare only so many frames")
+    add("--reference-offset", type=int, default=0, help="frame of the reference to compare with frame 0 of the run")
+    add("--frames", type=int, help="compare only this many frames")
     add("--side", type=float, help="longer side of the surface [m]; that of cloth.npz if left out")
     add("--points", type=int, default=10_000, help="points on the surface, and largest number of particles")
     add("--seed", type=int, default=0, help="seed of the points")
@@ -35,8 +35,10 @@ def build_parser() -> argparse.ArgumentParser:
     fvd = parser.add_argument_group("Fréchet video distance")
     fvd.add_argument("--i3d", metavar="FILE", help="I3D network as TorchScript; without it there is no FVD")
     fvd.add_argument("--clip-length", type=int, default=16, help="frames in a clip")
-    fvd.add_argument("--clip-stride", type=int, default=1, help="frames between the begins of clips")
-    fvd.add_argument("--resize", type=int, default=224, help="height and width that the network sees [pixels]")
+    fvd.add_argument("--clip-stride", type=int, default=1, help="frames between the starts of clips")
+    fvd.add_argument(
+        "--resize", type=int, default=224, help="height and width of the frames given to the network [pixels]"
+    )
     return parser
 
 
@@ -56,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Compare, print the table and say what was written."""
+    """Compare, print the table and report the files."""
     from gaussian_swaying.evaluation.compare import evaluate, table  # they need torchmetrics
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 

@@ -35,7 +35,7 @@ def build_options() -> argparse.ArgumentParser:
 
 
 def run_of(source: Path) -> Path | None:
-    """The summary of the run that wrote a splat or a folder of them, None if no run did."""
+    """The summary of the run that wrote a splat or a folder of splats; None if they are not from a run."""
     for folder in (source.parent, source.parent.parent):
         if (folder / "summary.json").is_file() and (folder / "run.json").is_file():
             return folder / "summary.json"
@@ -43,7 +43,7 @@ def run_of(source: Path) -> Path | None:
 
 
 def usd_settings(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
-    """Frames per second, frame and where they come from, for a USD file.
+    """Frames per second, frame and the source of both, for a USD file.
 
     Raises:
         ValueError: If an option is bad, or the summary of the run cannot be read.
@@ -59,7 +59,7 @@ def usd_settings(options: argparse.Namespace) -> tuple[float, SimFrame, str]:
             frame, fps = SimFrame.from_summary(known), 1 / float(known["frame_dt_s"])
         except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
             raise ValueError(
-                f"{summary} cannot be used ({error}): give --up, --metres-per-unit and --fps instead."
+                f"{summary} cannot be used ({error}): set --up, --metres-per-unit and --fps instead."
             ) from error
         origin = f"from {summary.name} of the run"
     metres = frame.metres_per_unit if options.metres_per_unit is None else options.metres_per_unit
@@ -79,14 +79,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def export(options: argparse.Namespace) -> None:
-    """Convert, and say what was written."""
+    """Convert, and report the file."""
     if options.fps is not None:
         check_positive("--fps", options.fps)
     if format_of(options.target) != "usd":
         if options.up is not None or options.metres_per_unit is not None:
             raise ValueError(
-                "--up and --metres-per-unit are for USD files, as no other format says which way is up: leave them "
-                "out, or let the target end in .usdc."
+                "--up and --metres-per-unit are only for USD files, as other formats have no up direction: leave them "
+                "out, or use a target that ends in .usdc."
             )
         convert(options.source, options.target)
     else:

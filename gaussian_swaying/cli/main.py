@@ -11,21 +11,21 @@ import gaussian_swaying
 from gaussian_swaying import _program as program
 
 COMMANDS = {
-    "sim": ("gaussian_swaying.cli.simulate", "let the wind move a scene: splat in, video out"),
-    "train": ("gaussian_swaying.cli.train", "train Gaussians that lie on surfaces, from photos"),
-    "preview": ("gaussian_swaying.cli.preview", "look at a splat, and guess its first configuration"),
+    "sim": ("gaussian_swaying.cli.simulate", "simulate a scene in the wind: splat in, video out"),
+    "train": ("gaussian_swaying.cli.train", "train surface-aligned Gaussians from photos"),
+    "preview": ("gaussian_swaying.cli.preview", "look at a splat and suggest a first configuration"),
     "eval": ("gaussian_swaying.cli.evaluate", "compare a run with a reference"),
     "export": ("gaussian_swaying.cli.export", "convert a splat, or a run's splats to USD"),
     "convert": ("gaussian_swaying.cli.convert", "turn a PhysGaussian configuration into a YAML file"),
 }
-"""Module with a ``main(arguments)``, and what it does, of each command."""
+"""For each command a module with ``main(arguments)``, and a description."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Args:
-        arguments: Its name and its own arguments; those of the process if None.
+        arguments: Its name and its arguments; those of the process if None.
 
     Returns:
         The exit code of the command; 2 if there is no such command.
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[0] not in COMMANDS:
         close = difflib.get_close_matches(given[0], COMMANDS, 1)
         hint = f" (did you mean {close[0]}?)" if close else ""
-        print(f"error: There is no command {given[0]!r}{hint}: give one of {', '.join(COMMANDS)}.", file=sys.stderr)
+        print(f"error: There is no command {given[0]!r}{hint}: use one of {', '.join(COMMANDS)}.", file=sys.stderr)
         return 2
     program.called(given[0])
     code: int = import_module(COMMANDS[given[0]][0]).main(given[1:])

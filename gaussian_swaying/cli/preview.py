@@ -41,11 +41,11 @@ from gaussian_swaying.simulation.preview.suggest import gaussian_statistics, sug
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
-LOADED = time.process_time()  # s; the interpreter and the imports so far, which a run takes too
+LOADED = time.process_time()  # s; for the interpreter and the imports so far, which a run needs too
 
 
 def build_options() -> argparse.ArgumentParser:
-    """The options."""
+    """The options of the command."""
     parser = argparse.ArgumentParser(
         prog=program.name("preview"),
         description="Bounds, up axis, Gaussians, region, pins, grid and cost of a splat; a picture of them; and a "
@@ -59,7 +59,11 @@ def build_options() -> argparse.ArgumentParser:
         metavar="FILE",
         help="show what this configuration does, instead of guessing one; may be given several times, as for sim.py",
     )
-    add("--capture", metavar="DIR", help="photos' cameras (COLMAP or transforms.json): they tell up and the object")
+    add(
+        "--capture",
+        metavar="DIR",
+        help="cameras of the photos (COLMAP or transforms.json), to find up and the object",
+    )
     add("--output", metavar="DIR", help="folder of the results; default: outputs/preview/<name of the splat>")
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, -x, ... or -z, instead of a guess")
@@ -80,11 +84,11 @@ def build_options() -> argparse.ArgumentParser:
 
 
 def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
-    """Guess a configuration for a splat, try its stiffness in short runs, and look at it.
+    """Suggest a configuration for a splat, find its stiffness in short runs, and draw it.
 
     Args:
         options: From :func:`build_options`.
-        folder: Where the configurations will be, for the report.
+        folder: Folder where the configurations will be, for the report.
 
     Returns:
         The preview.
@@ -103,7 +107,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
     startup = LOADED + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
-        raise ValueError(f"The path {options.scene!r} means something else in YAML: rename the file, without a colon.")
+        raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
     found = calibrated_suggestion(found, draft, options.sway)
     texts = {
         "draft": draft_yaml(found, options.scene),
@@ -139,7 +143,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
 
 
 def preview_config(options: argparse.Namespace) -> Preview:
-    """Look at a given configuration.
+    """Preview a given configuration.
 
     Args:
         options: From :func:`build_options`, with ``config``.
@@ -175,7 +179,7 @@ def preview_config(options: argparse.Namespace) -> Preview:
 
 
 def _pipeline(arguments: list[str], text: str | None = None) -> tuple[Simulation, Any]:
-    """The run of a configuration, given by options or as text, and its settings."""
+    """The simulation of a configuration, given by options or as text, and its settings."""
     parser = Simulation.parser()
     check_config_files(arguments)
     try:
@@ -207,7 +211,7 @@ def _up(values: Sequence[str]) -> list[float] | str:
 
 
 def _joined(arguments: Sequence[str]) -> list[str]:
-    """The command line with ``--up -y`` as ``--up=-y``, which argparse would take for an option."""
+    """The command line with ``--up=-y`` for ``--up -y``, where argparse would take -y for an option."""
     joined: list[str] = []
     for argument in arguments:
         if joined and joined[-1] in ("--up", "--hold") and argument in DIRECTIONS:
@@ -218,7 +222,7 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Look, report, write.
+    """Preview, print the report and write the files.
 
     Args:
         arguments: Command line; that of the process if None.
@@ -238,11 +242,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _preview(options: argparse.Namespace) -> None:
-    """Look, report, write."""
+    """Preview, print the report and write the files."""
     if options.scene is None and options.config is None:
-        raise ValueError("Nothing to look at: give SCENE.ply, or --config with a scene of its own.")
+        raise ValueError("There is nothing to preview: give SCENE.ply, or --config with a scene.")
     if options.capture is not None and options.config is not None:
-        raise ValueError("`--capture` is for guesses, but `--config` is shown as it is: leave out one of them.")
+        raise ValueError("`--capture` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
     if options.frames < 1:
         raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
     if not 64 <= options.height <= 4320:

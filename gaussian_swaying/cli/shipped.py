@@ -1,4 +1,4 @@
-"""Configurations that come with the package, by name: ``--config flag`` for ``configs/sim/flag.yaml``."""
+"""Configurations shipped with the package, by name: ``--config flag`` for ``configs/sim/flag.yaml``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import gaussian_swaying
 
 
 def folder() -> Path | None:
-    """Where the configurations are: within the installed package, or beside it in a checkout; None if nowhere."""
+    """The folder of the configurations: in the installed package, or beside it in a checkout; None if missing."""
     package = Path(gaussian_swaying.__file__).parent
     found = [path for path in (package / "configs", package.parent / "configs") if (path / "sim").is_dir()]
     return found[0] if found else None
@@ -24,14 +24,14 @@ def names(kind: str) -> list[str]:
 
 
 def with_shipped(arguments: Sequence[str], kind: str) -> list[str]:
-    """A command line whose ``--config NAME`` is the file of that name, where the name is no file of its own.
+    """The command line with ``--config NAME`` replaced by the shipped file, unless there is a file NAME.
 
     Args:
         arguments: The command line.
         kind: ``sim`` or ``train``.
 
     Raises:
-        ValueError: If a name is neither a file nor a configuration that is shipped.
+        ValueError: If a name is neither a file nor a shipped configuration.
     """
     found: list[str] = []
     for argument in arguments:
@@ -54,6 +54,6 @@ def _file(given: str, kind: str) -> str:
     close = difflib.get_close_matches(given, known, 1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     raise ValueError(
-        f"There is no file and no configuration {given!r}{hint}: give a YAML file to `--config`, or one of "
+        f"There is no file and no configuration {given!r}{hint}: set `--config` to a YAML file, or to one of "
         f"{', '.join(known) or 'those of a checkout'}."
     )

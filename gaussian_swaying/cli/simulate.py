@@ -35,14 +35,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started: list[Simulation] = []
 
     def advice(error: BaseException) -> str | None:
-        """How to go on from the checkpoint that the run has left, if it has left one."""
+        """How to continue from the last checkpoint of the run, if there is one."""
         if not started or started[0].resumable is None:
             return None
         return how_to_resume(*started[0].resumable, arguments, isinstance(error, SimulationDiverged))
 
     return run_command(
         lambda: _simulate(parser, arguments, started),
-        stopped="Stopped; what was recorded is kept.",
+        stopped="Stopped; everything recorded so far is kept.",
         advice=advice,
         memory="a smaller `scene.region`, a coarser `solver.dx` or a smaller picture",
         expected=(SimulationDiverged,),
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Simulation]) -> None:
-    """Parse, build, run, and say what was written; ``started`` takes the run once it may leave something."""
+    """Parse, build, run, and report the files; the simulation is put into ``started`` before it writes anything."""
     arguments = with_shipped(arguments, "sim")
     check_config_files(arguments)
     with guessing(parser):
@@ -82,7 +82,7 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
 
 
 def output_folder(settings: Namespace) -> Path:
-    """The folder asked for, or one named after the config file."""
+    """The given folder, or one named after the config file."""
     if settings.output:
         return Path(settings.output)
     files = [str(file) for file in settings.config or []]

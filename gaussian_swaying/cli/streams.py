@@ -1,4 +1,4 @@
-"""Standard output and error that may be closed, full or unable to show a letter, without a command dying of it."""
+"""Standard output and error that do not end a command when they are closed, full or cannot show a character."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any, TextIO, cast
 
 
 class SafeStream:
-    """A text stream whose failures are kept instead of raised; what comes after the first one is dropped.
+    """A text stream that stores its first failure instead of raising it, and drops everything after it.
 
-    Letters that its encoding lacks are written as their nearest plain ones: ``kg/m³`` as ``kg/m3``.
+    Characters missing in its encoding are replaced by similar plain ones: ``kg/m³`` becomes ``kg/m3``.
 
     Args:
         stream: The stream to write to.
 
     Attributes:
-        error: Why writing failed; None while it works.
+        error: Why writing failed; None if it did not.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -49,7 +49,7 @@ class SafeStream:
 
 
 def encodable(text: str, encoding: str | None) -> str:
-    """The text, with letters that an encoding lacks replaced by the nearest that it has, or by a question mark.
+    """The text, with characters missing in an encoding replaced by similar ones, or by a question mark.
 
     Example:
         >>> encodable("5 kg/m³", "ascii"), encodable("5 kg/m³", "utf-8")
@@ -65,7 +65,7 @@ def encodable(text: str, encoding: str | None) -> str:
 
 
 def _lead_nowhere(stream: TextIO) -> None:
-    """Let what is still in a stream's buffer go nowhere; the interpreter would stumble over it at its end."""
+    """Discard the rest of a stream's buffer; otherwise the interpreter fails to flush it at its end."""
     try:
         descriptor = stream.fileno()
     except (OSError, ValueError):
@@ -77,9 +77,9 @@ def _lead_nowhere(stream: TextIO) -> None:
 
 
 def _open_closed() -> None:
-    """Give a process that was started without standard streams ones that lead nowhere.
+    """Open null devices for a process that was started without standard streams.
 
-    Otherwise the next file that is opened takes their number, and what a library prints ends up in it.
+    Otherwise the next opened file gets their number, and output of libraries is written to it.
     """
     for descriptor in (0, 1, 2):
         try:
@@ -90,7 +90,7 @@ def _open_closed() -> None:
 
 @contextmanager
 def safe_streams() -> Iterator[tuple[SafeStream, SafeStream]]:
-    """Let ``sys.stdout`` and ``sys.stderr`` be :class:`SafeStream` within the block, and give them."""
+    """Replace ``sys.stdout`` and ``sys.stderr`` by a :class:`SafeStream` each inside the block, and return them."""
     before = sys.stdout, sys.stderr
     if None in before:
         _open_closed()

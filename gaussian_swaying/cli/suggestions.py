@@ -1,4 +1,4 @@
-"""A guess at what a misspelt option was meant to be."""
+"""Suggestions for misspelt options."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gaussian_swaying.cli.errors import parser_sentence
 if TYPE_CHECKING:
     from argparse import ArgumentParser
 
-# how argparse and jsonargparse name what they do not know
+# messages of argparse and jsonargparse about unknown options
 _UNKNOWN = (
     re.compile(r"unrecognized arguments: (?P<name>--[\w.\-]+)"),
     re.compile(r"Group '(?P<group>[^']+)' does not accept option '(?P<name>[^']+)'"),
@@ -25,7 +25,7 @@ _UNKNOWN = (
 
 @contextmanager
 def guessing(parser: ArgumentParser) -> Iterator[None]:
-    """Add a guess to what the parser says about an unknown option within the block."""
+    """Inside the block, add a suggestion to the parser's messages about unknown options."""
     try:
         yield
     except ArgumentError as error:
@@ -38,8 +38,8 @@ def did_you_mean(message: str, parser: ArgumentParser) -> str:
     """A question to add to a message about an unknown option; empty if nothing comes close.
 
     Args:
-        message: What the parser said.
-        parser: The parser, for the options that it has.
+        message: The parser's message.
+        parser: The parser, for the names of its options.
     """
     for pattern in _UNKNOWN:
         found = pattern.search(message)
@@ -56,13 +56,13 @@ def did_you_mean(message: str, parser: ArgumentParser) -> str:
 
 
 def _nearest(name: str, known: dict[str, str]) -> str | None:
-    """How the name that is most like another is written; None if none is."""
+    """The spelling of the most similar known name; None if none is similar."""
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.75)
     return known[near[0]] if near else None
 
 
 def _options(parser: Any) -> dict[str, str]:
-    """Names of all options of a parser and its commands, as they are compared and as they are written."""
+    """Names of all options of a parser and its commands: the form used to compare, and the spelling."""
     names: dict[str, str] = {}
     for action in parser._actions:
         for choice in (getattr(action, "_name_parser_map", None) or {}).values():

@@ -1,4 +1,4 @@
-"""The command line of the training: ``fit``, ``validate`` and ``test`` of Lightning, with what they need here."""
+"""The command line for training: ``fit``, ``validate`` and ``test`` of Lightning, adapted to splats."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from gaussian_swaying.training.run_folder import RunFolder
 
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_steps": 60_000,
-    "max_epochs": -1,  # images are counted, not rounds of them
+    "max_epochs": -1,  # training counts images, not epochs
     "accelerator": "auto",
     "devices": 1,
     "check_val_every_n_epoch": None,
@@ -46,7 +46,7 @@ TRAINER_DEFAULTS: dict[str, Any] = {
     "enable_model_summary": False,
     "default_root_dir": "outputs/train/run",
 }
-"""What ``tools/train.py`` sets where a YAML does not."""
+"""Defaults of ``tools/train.py``."""
 
 
 def default_loggers(folder: Path) -> list[Logger]:
@@ -58,11 +58,11 @@ def default_loggers(folder: Path) -> list[Logger]:
 
 
 class TrainCLI(LightningCLI):
-    """LightningCLI with the trainer's defaults, loggers and checkpoints of a splat training.
+    """LightningCLI with trainer defaults, loggers and checkpoints for training splats.
 
     Args:
-        run_folder: What takes the folder of the training.
-        settings: As for LightningCLI.
+        run_folder: Callback that takes the folder of the run.
+        settings: Arguments of LightningCLI.
     """
 
     def __init__(self, *settings: Any, run_folder: RunFolder | None = None, **more: Any) -> None:
@@ -70,7 +70,7 @@ class TrainCLI(LightningCLI):
         super().__init__(*settings, **more)
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        """Add the checkpoints as options of their own."""
+        """Add separate options for checkpoints."""
         parser.add_lightning_class_args(ModelCheckpoint, "checkpoint")
         parser.set_defaults(
             {
@@ -82,7 +82,7 @@ class TrainCLI(LightningCLI):
         )
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Make the trainer, with loggers and a folder of checkpoints below its folder."""
+        """Make the trainer, with loggers and a folder of checkpoints inside its folder."""
         settings = self._get(self.config_init, "trainer", default={})
         root = Path(settings["default_root_dir"])
         evaluating = self.subcommand not in (None, "fit")
@@ -96,7 +96,7 @@ class TrainCLI(LightningCLI):
             checkpoint.dirpath = str(root / "checkpoints")
         callbacks = [*(settings.get("callbacks") or []), self.run_folder]
         if settings.get("enable_progress_bar") is not False and not any(isinstance(c, ProgressBar) for c in callbacks):
-            # Lightning would draw it anew after every image
+            # Lightning would redraw it after every image
             callbacks.append(TQDMProgressBar(refresh_rate=20))
         kwargs["callbacks"] = callbacks
         plugins = settings.get("plugins") or []
@@ -122,11 +122,11 @@ class TrainCLI(LightningCLI):
             read_training_checkpoint(Path(str(path)))
 
     def after_fit(self) -> None:
-        """Keep a checkpoint of the last image too, where ``every_n_train_steps`` does not divide their number."""
+        """Also write a checkpoint after the last image, if ``every_n_train_steps`` does not divide their number."""
         if not self.run_folder.begun:
             raise ValueError(
-                f"The training has seen {self.trainer.global_step} images already, and `trainer.max_steps` asks for "
-                f"{self.trainer.max_steps}: ask for more."
+                f"The run has already trained on {self.trainer.global_step} images, and `trainer.max_steps` is "
+                f"{self.trainer.max_steps}: raise it."
             )
         try:
             checkpoint = self._get(self.config_init, "checkpoint")
@@ -140,12 +140,12 @@ class TrainCLI(LightningCLI):
 
 
 def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folder: RunFolder | None = None) -> TrainCLI:
-    """Parse a command line and, with ``run``, do what it says.
+    """Parse a command line and, with ``run``, run it.
 
     Args:
         arguments: Command line; that of the process if None. Without ``run`` it has no subcommand.
         run: Whether to run the subcommand.
-        run_folder: What takes the folder of the training, for asking it afterwards.
+        run_folder: Callback that takes the folder of the run, to be asked afterwards.
 
     Returns:
         The command line interface, with its ``model``, ``datamodule`` and ``trainer``.
@@ -153,7 +153,7 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
     Raises:
         ArgumentError: If an option is unknown or a value has the wrong type.
         ValueError: If a value is out of range or the data are bad.
-        TrainingDiverged: If a loss or a Gaussian is not finite any more.
+        TrainingDiverged: If a loss or a Gaussian is no longer finite.
     """
     limit_yaml()
     given = with_shipped(sys.argv[1:] if arguments is None else arguments, "train")
@@ -164,7 +164,7 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         subclass_mode_data=True,
         trainer_defaults=dict(TRAINER_DEFAULTS),
         seed_everything_default=0,
-        save_config_callback=None,  # the run folder writes it, once the training has begun
+        save_config_callback=None,  # the run folder writes it, once training has started
         run_folder=run_folder,
         parser_kwargs={
             "prog": program.name("train"),
@@ -177,11 +177,11 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
 
 
 def next_step(folder: Path, data: object) -> str:
-    """The command that looks at a trained splat with the cameras of its photos.
+    """The command that previews a trained splat with the cameras of its photos.
 
     Args:
-        folder: Folder of the training.
-        data: What it was trained on; its ``path`` is the folder of the photos.
+        folder: Folder of the training run.
+        data: The training data; its ``path`` is the folder of the photos.
     """
     words = [*program.words("preview"), str(folder / "point_cloud.ply")]
     path = getattr(data, "path", None)
@@ -195,8 +195,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command line; that of the process if None.
 
     Returns:
-        0 if all went well, 2 on bad input or a training that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM, 129
-        by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        0 if all went well, 2 on bad input or if training diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM, 129 by
+        SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
     run_folder = RunFolder()
     given = sys.argv[1:] if arguments is None else list(arguments)
@@ -214,14 +214,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
-    """Parse and run, and say what was written."""
+    """Parse and run, and report the files."""
     silence_warnings()
     silence_advertisements()
     try:
         with stop_signals():
             cli = make_cli(arguments, run_folder=run_folder)
     except SystemExit as stop:
-        if stop.code != 1:  # Lightning leaves with 1 after Ctrl-C
+        if stop.code != 1:  # Lightning exits with 1 after Ctrl-C
             raise
         raise (stop.__context__ if isinstance(stop.__context__, KeyboardInterrupt) else KeyboardInterrupt()) from None
     run_folder.release()
@@ -236,10 +236,10 @@ def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
 
 
 def how_to_continue(run_folder: RunFolder, arguments: Sequence[str]) -> str | None:
-    """A sentence that names the last checkpoint of a training that ended early, and the command that continues it."""
+    """A sentence with the last checkpoint of a run that ended early, and the command that continues it."""
     path = run_folder.newest_checkpoint()
     if path is None:
         return None
     path = os.path.relpath(path) if Path(path).is_relative_to(Path.cwd()) else path
     again = command(arguments, "--ckpt_path", path, without="--ckpt_path")
-    return f"{path} is the last checkpoint; to go on:\n  {again}"
+    return f"{path} is the last checkpoint; to continue:\n  {again}"

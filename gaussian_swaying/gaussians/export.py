@@ -76,7 +76,7 @@ def export_cloud(path: str | os.PathLike[str], cloud: GaussianCloud, format: str
     Raises:
         FileNotFoundError: If the folder does not exist.
         ValueError: If the format is none of these, or no Gaussian is left.
-        ImportError: If ``usd`` is asked for and usd-core is not installed.
+        ImportError: If the format is ``usd`` and usd-core is not installed.
 
     Warns:
         UserWarning: If Gaussians were left out because they are not finite.

@@ -147,8 +147,8 @@ def sh_to_color(sh: Tensor, directions: Tensor) -> Tensor:
 def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     r"""Rotate the coefficients with an object, so that the colour in direction d becomes that in R^T d.
 
-    Each band is rotated separately. Its matrix follows exactly from 2l + 1 fixed directions :math:`d_k`, :math:`D_l =
-    Y_l(d_k)^{-1} Y_l(R^T d_k)`, without Wigner recurrences. Differentiable.
+    Each band is rotated separately. Its matrix follows exactly from 2l + 1 fixed directions :math:`d_k`,
+    :math:`D_l = Y_l(d_k)^{-1} Y_l(R^T d_k)`, without Wigner recurrences. Differentiable.
 
     Args:
         sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.

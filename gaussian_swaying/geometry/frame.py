@@ -84,9 +84,7 @@ class SimFrame:
             check_positive("longest_side", longest_side)
             extent = float((high - low).amax())
             if extent <= 0:
-                raise ValueError(
-                    "`longest_side` cannot scale an object without extent: give `metres_per_unit` instead."
-                )
+                raise ValueError("The object has no extent for `longest_side` to scale: set `metres_per_unit` instead.")
             scale = float(longest_side) / extent
         return cls((0.5 * (low + high)) @ rotation, rotation, scale)
 

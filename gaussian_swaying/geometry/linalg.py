@@ -36,10 +36,11 @@ def determinant(matrix: Tensor, cofactors: Tensor | None = None) -> Tensor:
 def polar_rotation(matrix: Tensor, iterations: int | None = None) -> Tensor:
     r"""The rotation nearest to F: the factor R of the polar decomposition F = R S, by the scaled Newton iteration.
 
-    :math:`X_{k+1} = \tfrac12 (\zeta_k X_k + \zeta_k^{-1} X_k^{-T})` with :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F /
-    \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar decomposition - with applications"). It converges
-    quadratically to the nearest orthogonal matrix. Where that is a reflection (an inverted element), its axis of
-    smallest stretch is reversed, which gives the nearest rotation (Irving, Teran & Fedkiw 2004).
+    :math:`X_{k+1} = \tfrac12 (\zeta_k X_k + \zeta_k^{-1} X_k^{-T})` with
+    :math:`\zeta_k = (\lVert X_k^{-1} \rVert_F / \lVert X_k \rVert_F)^{1/2}` (Higham 1986, "Computing the polar
+    decomposition - with applications"). It converges quadratically to the nearest orthogonal matrix. Where that is a
+    reflection (an inverted element), its axis of smallest stretch is reversed, which gives the nearest rotation
+    (Irving, Teran & Fedkiw 2004).
 
     The first derivative is the exact one of the limit, :math:`dR = R \Omega` with
     :math:`\Omega S + S \Omega = R^T dF - dF^T R`, not that of the iteration: it is finite for every F, while that of an
@@ -233,9 +234,9 @@ def spectrum(F: Tensor) -> Spectrum:
     elementary floating point operations"). U and V are rotations for any F, singular or inverted.
 
     For the derivatives write :math:`B = U^T \, dF \, V`. Then :math:`da_i = B_{ii}`, and off the diagonal the spin of R
-    and the change of the symmetric factor are :math:`W_{ij} = (B_{ij} - B_{ji}) / (a_i + a_j)` and :math:`\tfrac12
-    (B_{ij} + B_{ji}) + \tfrac12 (a_i - a_j) W_{ij}`: neither divides by differences of stretches, as an SVD does. Only
-    at :math:`a_i = -a_j`, where R jumps, is the derivative limited.
+    and the change of the symmetric factor are :math:`W_{ij} = (B_{ij} - B_{ji}) / (a_i + a_j)` and
+    :math:`\tfrac12 (B_{ij} + B_{ji}) + \tfrac12 (a_i - a_j) W_{ij}`: neither divides by differences of stretches, as an
+    SVD does. Only at :math:`a_i = -a_j`, where R jumps, is the derivative limited.
 
     Args:
         F: Shape (..., 3, 3).

@@ -67,8 +67,8 @@ def project_gaussians(
         J = \frac{1}{z} \begin{pmatrix} f_x & 0 & -f_x \hat x \\ 0 & f_y & -f_y \hat y \end{pmatrix}.
 
     A Gaussian is left out if it is not finite, if its centre is in front of the near plane, if its opacity is below
-    1/255, or if the ellipse where its alpha reaches 1/255 is outside the image. That ellipse has :math:`\sqrt{2
-    \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
+    1/255, or if the ellipse where its alpha reaches 1/255 is outside the image. That ellipse has
+    :math:`\sqrt{2 \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
 
     Args:
         means: Centres [scene units], shape (N, 3).

@@ -65,7 +65,7 @@ class CsvLog(Logger):
 
     @property
     def version(self) -> str:
-        """Empty, likewise."""
+        """Empty, for the same reason."""
         return ""
 
     @property

@@ -132,7 +132,7 @@ class SplatTrainer(lightning.LightningModule):
     def splat(self) -> GaussianSurfaceModel:
         """The Gaussians; RuntimeError before there are any."""
         if self.model is None:
-            raise RuntimeError("There are no Gaussians yet: they are made when the training starts.")
+            raise RuntimeError("There are no Gaussians yet: they are made when training starts.")
         return self.model
 
     def setup(self, stage: str) -> None:

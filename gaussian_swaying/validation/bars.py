@@ -1,4 +1,4 @@
-r"""Bars along x: a standing wave, a bar under its own weight, and a block that vibrates freely.
+r"""Bars along x: a standing wave, a bar under its weight, and a block that vibrates freely.
 
 Fixed corotated elasticity is linear in one dimension at any strain: :math:`P_{11} = (\lambda + 2 \mu)(F_{11} - 1)` in a
 bar that is confined laterally and :math:`E (F_{11} - 1)` for :math:`\nu = 0`, both from its energy by hand. So the
@@ -20,7 +20,7 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.validation.settings import Axial, Result, Settings, block, fit_sinusoid, follow
 
 LENGTH, YOUNG, DENSITY = 25.0, 100.0, 1.0  # [m], [Pa], [kg/m³]: the vibrating bar of Buzzi et al. 2008, c = 10 m/s
-_CLAMP = 2  # cells of material inside a clamp: no stencil reaches beyond
+_CLAMP = 2  # cells of material inside a clamp: no stencil extends beyond it
 
 
 def vibrating_bar(
@@ -33,26 +33,26 @@ def vibrating_bar(
     strain: float = 0.1,
     shift: float = 0.0,
 ) -> Result:
-    r"""The lowest standing wave of a bar, started from its velocity.
+    r"""The lowest standing wave of a bar, started with its velocity.
 
     :math:`u = a\, \varphi(X) \sin \omega t` with :math:`c = \sqrt{(\lambda + 2 \mu) / \rho}` and, for ``free`` ends,
     :math:`\varphi = \cos(\pi X / L),\ \omega = \pi c / L`; ``fixed``: :math:`\varphi = \sin(\pi X / L)`, the same
     :math:`\omega`; ``fixed-free``: :math:`\varphi = \sin(\pi X / 2L),\ \omega = \pi c / 2L` (textbook wave equation).
-    The middle of the free bar stands still, so either half of it is a fixed-free bar with an ideal clamp.
+    The middle of the free bar is at rest, so each half is a fixed-free bar with an ideal clamp.
 
     Args:
         cells: Cells along the bar.
         settings: The numerics.
         ends: ``free``, ``fixed-free`` or ``fixed``; a fixed end is a :class:`PinnedRegion` of two cells beyond it.
-        confined: Hold all motion across the bar; needed unless ``poisson_ratio`` is 0.
+        confined: Prevent all motion across the bar; needed unless ``poisson_ratio`` is 0.
         poisson_ratio: Poisson's ratio.
-        periods: Periods to follow.
+        periods: Number of periods to simulate.
         strain: Amplitude of the strain.
         shift: How far the bar is moved off the planes of the nodes [cells].
 
     Returns:
-        ``error`` (of the frequency, relative), ``frequency`` [Hz], ``loss`` (part of the amplitude lost per period),
-        ``end_shift`` (by how many cells each fixed end seems further out than it is) and the common quantities.
+        ``error`` (of the frequency, relative), ``frequency`` [Hz], ``loss`` (share of the amplitude lost per period),
+        ``end_shift`` (by how many cells each fixed end appears farther out than it is) and the common quantities.
     """
     check_choice("ends", ends, ("free", "fixed-free", "fixed"))
     nu, dx = poisson_ratio, LENGTH / cells
@@ -107,24 +107,24 @@ def hanging_bar(
     settle: float = 16.0,
     shift: float = 0.0,
 ) -> Result:
-    r"""A bar hung at its top, stretched by its own weight: :math:`u = \rho g (L X - X^2 / 2) / E`, X from the top.
+    r"""A bar that hangs from its top, stretched by its weight: :math:`u = \rho g (L X - X^2 / 2) / E`, X from the top.
 
     Exact at finite strain for fixed corotated elasticity with :math:`\nu = 0` (equilibrium in the rest configuration).
-    The load acts at once, and critical damping of the lowest mode brings the bar to rest.
+    The full load acts from the start, and critical damping of the lowest mode brings the bar to rest.
 
     Args:
         cells: Cells along the bar.
         settings: The numerics.
-        clamp: ``mirror`` pulls a bar of twice the length apart from its middle, which stands still by symmetry: an
-            ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end.
+        clamp: ``mirror`` pulls both halves of a bar of twice the length away from its middle, which is at rest by
+            symmetry: an ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end.
         strain: Strain at the top, rho g L / E; twice the stretch of the bar as a whole.
-        settle: Time to follow, in units of 1 / circular frequency of the lowest mode.
+        settle: Time to simulate, in units of 1 / circular frequency of the lowest mode.
         shift: How far the bar is moved off the planes of the nodes [cells].
 
     Returns:
         ``error`` (of the displacement of the lowest points, relative to the closed form there), ``profile`` (root mean
-        square of the error of all points, relative to the tip), ``end_shift`` (by how many cells the clamp seems
-        further up than it is), ``residual`` (speed of the tip, relative to its displacement and frequency) and the
+        square of the error of all points, relative to the tip), ``end_shift`` (by how many cells the clamp appears
+        farther up than it is), ``residual`` (speed of the tip, relative to its displacement and frequency) and the
         common quantities.
     """
     check_choice("clamp", clamp, ("mirror", "pin"))
@@ -167,15 +167,15 @@ def hanging_bar(
 def free_block(
     settings: Settings, periods: int = 100, cells: int = 4, strain: float = 0.05, window: int = 10
 ) -> Result:
-    r"""An elastic cube that vibrates freely, mostly stretching, and spins and flies slowly.
+    r"""An elastic cube that vibrates freely, mostly by stretching, and slowly spins and moves.
 
-    Symplectic Euler holds the velocity half a substep before the displacement, so its energy swings by up to
-    :math:`\omega \Delta t / 2`, relative, about a mean that stays. A cube has many modes and no period common to them:
-    the mean is taken over several periods of the wave that crosses the cube and comes back, 2 L / c.
+    In symplectic Euler the velocity is half a substep before the displacement, so its energy oscillates by up to
+    :math:`\omega \Delta t / 2`, relative, about a constant mean. A cube has many modes without a common period, so the
+    mean is taken over several periods 2 L / c of the wave that crosses the cube and returns.
 
     Args:
         settings: The numerics.
-        periods: Periods 2 L / c to follow.
+        periods: Number of periods 2 L / c to simulate.
         cells: Cells along an edge of 1 m.
         strain: Amplitude of the strain rate in units of the circular frequency of that wave.
         window: Periods of a mean; ``periods`` must be a multiple of it.
@@ -183,8 +183,8 @@ def free_block(
     Returns:
         ``error`` (the largest change of the mean energy, relative to the first mean), ``kept`` (last mean over the
         first), ``rise`` (largest growth from one mean to the next, relative), ``growth`` (the largest energy at the end
-        of any frame over the first one, less 1), ``swing`` (the bound omega dt / 2 on what symplectic Euler may show of
-        that), ``linear`` and ``angular`` (largest relative change of the momenta) and the common quantities.
+        of any frame over the first one, less 1), ``swing`` (the bound omega dt / 2 of that for symplectic Euler),
+        ``linear`` and ``angular`` (largest relative change of the momenta) and the common quantities.
     """
     dx, young, density, nu = 1.0 / cells, 1e4, 100.0, 0.3
     points = block(dx, (0, 0, 0), (cells,) * 3, settings, density=density, youngs_modulus=young, poisson_ratio=nu)

@@ -1,4 +1,4 @@
-r"""A cantilever that sags under its own weight, against the elastica."""
+r"""A cantilever that sags under its weight, compared with the elastica."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.validation.settings import Axial, Result, Settings, block, follow
 
-HEIGHT, YOUNG, DENSITY = 1.0, 1e4, 1.0  # thickness [m], [Pa], [kg/m³]; only b and L / h matter
+HEIGHT, YOUNG, DENSITY = 1.0, 1e4, 1.0  # thickness [m], [Pa], [kg/m³]; the result depends only on b and L / h
 
 
 def elastica(b: float, steps: int = 400) -> tuple[float, float, float]:
-    r"""The inextensible cantilever under its own weight, clamped level.
+    r"""The inextensible cantilever under its weight, clamped horizontally.
 
     Solves :math:`\theta'' = -b\,(1 - s) \cos \theta,\ \theta(0) = 0,\ \theta'(1) = 0` (Euler's elastica with a
     distributed load; Rohde 1953) from the tip, by bisection for its slope and the classical Runge-Kutta rule.
@@ -62,34 +62,34 @@ def cantilever(
     settle: float = 12.0,
     per_cell: int = 2,
 ) -> Result:
-    r"""A level cantilever in plane strain with :math:`\nu = 0`, released under its weight and damped critically.
+    r"""A horizontal cantilever in plane strain with :math:`\nu = 0`, released under its weight and damped critically.
 
     Thickness h, weight :math:`w = \rho g h` and :math:`I = h^3 / 12` to a unit of width make
-    :math:`b = w L^3 / (E I) = 12 \rho g L^3 / (E h^2)`. Two effects are known beforehand:
+    :math:`b = w L^3 / (E I) = 12 \rho g L^3 / (E h^2)`. Two effects are known in advance:
 
-    - Shear, which the elastica leaves out: Timoshenko's beam (1921; shear coefficient 5/6, :math:`G = E / 2`) drops
+    - Shear, which the elastica neglects: Timoshenko's beam (1921; shear coefficient 5/6, :math:`G = E / 2`) drops
       further by :math:`4 E I / (\tfrac56 G h L^2) = 0.8\, (h / L)^2`, relative, at small deflection.
-    - Quadrature: splines hold bending exactly, but m equal layers of points have the second moment of area
+    - Quadrature: splines represent bending exactly, but m equal layers of points have the second moment of area
       :math:`(1 - 1 / m^2)\, I`, so the discrete beam is the elastica of a larger b.
 
-    One cell with two layers is no beam at all: a quadratic spline across it can have the value 0 and the slope 1 at
-    both layers, which is bending without strain. Three layers to the cell leave no such motion.
+    One cell with two layers is not a beam: a quadratic spline across it can have the value 0 and the slope 1 at both
+    layers, which is bending without strain. With three layers per cell there is no such motion.
 
     Args:
         cells: Cells n through the thickness.
         settings: The numerics.
         b: Weight over stiffness.
         slenderness: Length over thickness.
-        clamp: ``mirror`` carries a beam of twice the length at its middle, whose section stays upright by symmetry: an
-            ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end.
-        settle: Time to follow, in units of 1 / circular frequency of the lowest mode of bending.
-        per_cell: Points to a cell and axis.
+        clamp: ``mirror`` supports a beam of twice the length at its middle, where the section stays upright by
+            symmetry: an ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end.
+        settle: Time to simulate, in units of 1 / circular frequency of the lowest bending mode.
+        per_cell: Points per cell and axis.
 
     Returns:
         ``error`` (of the drop of the tip against the elastica, relative), ``drop`` and ``shortening`` over the length,
         ``shortening_error`` (relative), ``shear`` and ``quadrature`` (by how much the two effects raise the drop),
-        ``unexplained`` (what is left of the drop once they are taken into account, relative), ``residual`` (speed of
-        the tip, relative to its drop and frequency) and the common quantities.
+        ``unexplained`` (the rest of the error after these two effects, relative), ``residual`` (speed of the tip,
+        relative to its drop and frequency) and the common quantities.
     """
     check_choice("clamp", clamp, ("mirror", "pin"))
     dx, length = HEIGHT / cells, slenderness * HEIGHT
@@ -130,7 +130,7 @@ def cantilever(
     moved = run.series[-1] - run.series[0]
     if clamp == "mirror":
         moved = moved - moved[1]
-    # the last points lie before the tip: carry the line on with the slope of the elastica there
+    # the last points are before the tip: extend the line with the slope of the elastica there
     known, short, slope = elastica(b)
     gap = 0.5 * dx / per_cell
     drop = (-float(moved[0, 2]) + gap * math.sin(slope)) / length

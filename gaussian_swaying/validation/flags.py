@@ -1,4 +1,4 @@
-"""A flag in the wind. It has no closed form: runs are compared with the finest one, and looked at for tears."""
+"""A flag in the wind. There is no closed form: runs are compared with the finest one, and checked for tears."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def flag_points(spacing: float, settings: Settings, youngs_modulus: float, densi
     """A sheet of one layer of particles in the x-z plane, 1.2 m by 0.8 m and 0.01 m thick, with a slight ripple.
 
     Args:
-        spacing: Distance of the particles [m].
+        spacing: Distance between particles [m].
         settings: Type and device.
         youngs_modulus: Young's modulus [Pa].
         density: Density [kg/m³].
@@ -58,7 +58,7 @@ def flag(
         dx: Grid spacing [m].
         settings: The numerics.
         frames: Frames of 0.04 s.
-        spacing: Distance of the particles [m]; keep it when ``dx`` changes, so that runs can be compared.
+        spacing: Distance between particles [m]; keep it when ``dx`` changes, so that runs can be compared.
         youngs_modulus: Young's modulus [Pa].
         density: Density [kg/m³].
         wind: Mean air velocity [m/s]; its largest component sways by half with a period of 1.5 s.
@@ -100,10 +100,10 @@ def distance(series: Tensor, reference: Tensor) -> float:
 
     Args:
         series: Positions of each frame [m], shape (frames + 1, P, 3).
-        reference: The same of the run to compare with.
+        reference: The same for the run to compare with.
 
     Returns:
-        The share; infinite if a position is.
+        The share; infinite if a position is infinite.
     """
     apart = torch.linalg.vector_norm(series - reference, dim=-1).mean()
     return float(apart) / WIDTH if bool(torch.isfinite(apart)) else float("inf")

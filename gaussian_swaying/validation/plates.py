@@ -1,4 +1,4 @@
-"""A stiff plate on a hinge in a steady wind, against the equilibrium of the wind law itself."""
+"""A stiff plate on a hinge in a steady wind, compared with the equilibrium of the wind law."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _FRAME = 0.04
 
 
 class Hinge(Boundary):
-    r"""Lets the material turn about the x axis: keeps the point of it that lies on the axis where it is.
+    r"""Lets the material rotate about the x axis: the material on the axis does not move.
 
-    A pinned row of particles holds up to three rows of nodes and clamps the turn. Held here is only the interpolated
-    velocity on the axis, :math:`\sum_i w_i v_i = 0`, by taking it from the nodes around; a rotation about the axis
-    passes unchanged. The reaction passes through the axis, without a moment, if the material around is symmetric about
-    it, and all motion is in the y-z plane, the same along x.
+    A pinned row of particles would hold up to three rows of nodes and prevent rotation. Here only the interpolated
+    velocity on the axis is held, :math:`\sum_i w_i v_i = 0`, by subtracting it from the nodes around; a rotation about
+    the axis does not change. The reaction passes through the axis, without a moment, if the material around is
+    symmetric about it, and all motion is in the y-z plane, the same along x.
 
     Args:
         dx: Grid spacing [m].
@@ -41,12 +41,12 @@ class Hinge(Boundary):
         self.dx, self.rest = float(dx), rest
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Take the velocity of the axis from the nodes around it."""
+        """Subtract the velocity of the axis from the nodes around it."""
         place = nodes.lattice if self.rest is None else self.rest
         assert place is not None
         y, z = (place[..., a].abs() / self.dx for a in (1, 2))
         weight = (_bspline(y) * _bspline(z))[..., None]
-        # a node without mass has no velocity, and no say
+        # a node without mass has no velocity and no weight
         moving = weight * (velocity != 0).any(-1, keepdim=True)
         slip = (moving * velocity).sum(-2, keepdim=True) / moving.sum(-2, keepdim=True).clamp(min=1e-6)
         return torch.where(moving > 0, velocity - slip, velocity)
@@ -65,8 +65,9 @@ def hinged_plate_angle(k: float, law: str) -> float:
     :math:`m g \sin\theta` equals the normal force. ``paper``: :math:`q A C_D`, so :math:`\sin\theta = k`.
     ``projected``: :math:`q A C_D \cos\theta`, so :math:`\tan\theta = k`.
 
-    For k >= 1 the ``paper`` law has no equilibrium short of the horizontal. There its force changes side, as the normal
-    turns along the flow: the plate is driven up from below and down from above, and stays edge-on (a sliding mode).
+    For k >= 1 the ``paper`` law has no equilibrium below the horizontal. At the horizontal its force changes sides, as
+    the normal is flipped along the flow: the plate is driven up from below and down from above, and stays edge-on (a
+    sliding mode).
 
     Args:
         k: :math:`q A C_D / (m g)` with :math:`q = \rho U^2 / 2`.
@@ -91,10 +92,10 @@ def hinged_plate(
 ) -> Result:
     r"""Let a stiff plate on a hinge come to rest in a steady horizontal wind.
 
-    The plate, one cell thick, hangs half a metre down from the hinge, and a little reaches above it; it moves in plane
-    strain, in wind along y. At rest pressure balances the weight across the plate everywhere, not only on average, so
-    that bending does not enter; its stiffness keeps the stretch below one percent. The angle is that of the line from
-    the hinge to the centre of mass.
+    The plate, one cell thick, hangs half a metre down from the hinge and extends a little above it. It moves in plane
+    strain, in wind along y. At rest the pressure balances the weight across the plate everywhere, not only on average,
+    so there is no bending. Its stiffness keeps the stretch below one percent. The angle is that of the line from the
+    hinge to the centre of mass.
 
     Args:
         k: Pressure over weight, :math:`q A C_D / (m g)`.
@@ -103,12 +104,12 @@ def hinged_plate(
         cells: Grid cells from the hinge to the lower edge; more than 3.
         seconds: Time to come to rest [s].
         damping: Rate at which velocities decay [1/s], near critical for the swing.
-        per_cell: Particles to a cell and axis.
+        per_cell: Particles per cell and axis.
 
     Returns:
-        ``error`` [degrees] with its sign, ``angle`` and ``exact`` [degrees], ``drift``: how far the angle still went in
-        the last fifth of the time [degrees], ``slip``: how far the centre came off its distance from the hinge, as a
-        share of it, ``particles``, ``simulated_s``, ``substeps`` and ``wall_s``.
+        ``error`` [degrees] with its sign, ``angle`` and ``exact`` [degrees], ``drift``: change of the angle in the last
+        fifth of the time [degrees], ``slip``: relative change of the distance between the centre and the hinge,
+        ``particles``, ``simulated_s``, ``substeps`` and ``wall_s``.
     """
     settings = Settings() if settings is None else settings
     exact = hinged_plate_angle(k, law)

@@ -1,4 +1,4 @@
-"""What the problems share: the numerics to be judged, bodies on a lattice, and the rollout that is timed."""
+"""Shared by all problems: the numerics under test, bodies on a lattice, and the timed rollout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
 Result = dict[str, float]
 """What a problem returns: ``error``, relative to the closed form, ``simulated_s``, ``substeps``, ``wall_s`` (the time
-of the rollout alone) and quantities of its own."""
+of the rollout alone) and further quantities."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Settings:
         formulation: ``total`` or ``updated``.
         mls: Whether ``updated`` is MLS-MPM.
         cfl: Courant number of the adaptive substep.
-        substep: Fixed substep [s] in its place, or None.
+        substep: Fixed substep [s] instead, or None.
         dtype: Type of every field of the state.
-        device: Where the run takes place.
+        device: Device of the run.
     """
 
     formulation: str = "total"
@@ -42,7 +42,7 @@ class Settings:
     device: str = "cpu"
 
     def solver(self, dx: float, **more: Any) -> MPMSolver:
-        """A solver with these numerics, grid spacing ``dx`` [m] and no gravity unless ``more`` says so."""
+        """A solver with these numerics, grid spacing ``dx`` [m] and no gravity unless it is in ``more``."""
         return MPMSolver(
             dx=dx,
             formulation=self.formulation,
@@ -54,10 +54,10 @@ class Settings:
 
 
 class Axial(Boundary):
-    """Lets nothing move along the given axes: lateral confinement, or plane strain.
+    """Prevents motion along the given axes: lateral confinement, or plane strain.
 
     Args:
-        axes: The axes held, 0 to 2.
+        axes: The axes, 0 to 2.
     """
 
     def __init__(self, axes: Sequence[int]) -> None:
@@ -65,7 +65,7 @@ class Axial(Boundary):
         self.axes = tuple(axes)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Take away the components along the axes."""
+        """Set the components along the axes to zero."""
         free = [0.0 if axis in self.axes else 1.0 for axis in range(3)]
         return velocity * velocity.new_tensor(free)
 
@@ -76,9 +76,10 @@ def lattice(dx: float, low: Sequence[int], high: Sequence[int], settings: Settin
     Args:
         dx: Grid spacing [m].
         low: Lower corner [cells].
-        high: Upper corner [cells]; where it equals the lower one there is a single layer, on the nodes.
+        high: Upper corner [cells]; along an axis where it equals the lower corner there is a single layer, on the
+            nodes.
         settings: Type and device.
-        per_cell: Points to a cell and axis.
+        per_cell: Points per cell and axis.
 
     Returns:
         Positions [m], shape (P, 3).
@@ -114,7 +115,7 @@ def block(
         density: Density [kg/m³].
         youngs_modulus: Young's modulus [Pa].
         poisson_ratio: Poisson's ratio.
-        per_cell: Points to a cell and axis.
+        per_cell: Points per cell and axis.
         shift: How far the body is moved along x, off the planes of the nodes [cells].
 
     Returns:
@@ -133,13 +134,13 @@ def block(
 
 @dataclass(frozen=True)
 class Run:
-    """What a rollout gave.
+    """The result of a rollout.
 
     Attributes:
         state: The last state.
-        time: When it was observed [s], shape (N,), the start included.
-        series: What was observed, shape (N, ...).
-        substeps: Substeps taken.
+        time: Times of the observations [s], shape (N,), including the start.
+        series: The observations, shape (N, ...).
+        substeps: Number of substeps.
         wall_s: Wall-clock time of the rollout [s].
     """
 
@@ -150,7 +151,7 @@ class Run:
     wall_s: float
 
     def result(self, error: float, **more: float) -> Result:
-        """The quantities that every problem returns, and ``more``."""
+        """The quantities returned by every problem, and ``more``."""
         seconds = float(self.state.time)
         numbers = {"error": error, "simulated_s": seconds, "substeps": self.substeps, "wall_s": self.wall_s} | more
         return {name: float(value) for name, value in numbers.items()}
@@ -164,18 +165,18 @@ def follow(
     observe: Callable[[MPMState], Tensor],
     force: ForceFunction | None = None,
 ) -> Run:
-    """Roll out frame by frame, each in equal substeps as the solver asks for, and observe after each.
+    """Roll out frame by frame, each in equal substeps chosen by the solver, and observe after each.
 
     Args:
         solver: The solver that made ``state``.
         state: The first state.
         frame: Length of a frame [s].
         frames: Number of frames.
-        observe: What to keep of a state.
+        observe: Function that returns the observation of a state.
         force: External force on each particle [N].
 
     Returns:
-        The last state, the observations and the time they took.
+        The last state, the observations and the time taken.
     """
     cuda = state.position.is_cuda
     with torch.inference_mode():
@@ -200,7 +201,7 @@ def fit_sinusoid(time: Tensor, values: Tensor) -> tuple[float, float]:
 
     Args:
         time: Times [s], shape (N,), float64.
-        values: The series, shape (N,), float64, with at least two changes of sign, which give the first guess.
+        values: The series, shape (N,), float64, with at least two changes of sign, from which the first guess is made.
 
     Returns:
         Circular frequency and decay rate, both [1/s].

@@ -1,4 +1,4 @@
-"""How well trained Gaussians lie on a surface that is known."""
+"""How well trained Gaussians match a known surface."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ def surface_quality(
     min_opacity: float = 0.1,
     near: float = 0.05,
 ) -> dict[str, float]:
-    """Shape, opacity, orientation, place and area of Gaussians against a generated surface.
+    """Shape, opacity, orientation, position and area of Gaussians compared with a generated surface.
 
-    Shape, orientation, place and area are those of the Gaussians that a simulation takes: those with an opacity of at
-    least ``min_opacity``.
+    Shape, orientation, position and area are those of the simulated Gaussians, which have an opacity of at least
+    ``min_opacity``.
 
     Args:
         model: The Gaussians, in metres.
         truth: The surface.
-        a: Ratio of the two largest scales up to which a Gaussian counts as round.
-        b: Scale up to which one counts as small [m].
-        min_opacity: Opacity from which on a Gaussian is simulated.
-        near: Distance up to which a Gaussian counts as one of the surface [m].
+        a: A Gaussian counts as round up to this ratio of the two largest scales.
+        b: A Gaussian counts as small up to this scale [m].
+        min_opacity: Smallest opacity of simulated Gaussians.
+        near: A Gaussian counts as near the surface up to this distance [m].
 
     Returns:
-        ``gaussians`` and ``simulated`` (numbers); ``round_share``, ``small_share`` and ``near_share`` of those that
-        are simulated; ``decided_share`` of all with an opacity outside [0.1, 0.9]; ``flatness_median`` (smallest over
-        second largest scale); ``angle_median_deg`` and ``angle_p90_deg`` between patch normals and the normals of the
-        nearest points, whatever their sign; ``distance_median_m`` and ``distance_p90_m``; ``area_paper_ratio`` and
+        ``gaussians`` and ``simulated`` (numbers); ``round_share``, ``small_share`` and ``near_share`` of the simulated
+        ones; ``decided_share`` of all with an opacity outside [0.1, 0.9]; ``flatness_median`` (smallest over second
+        largest scale); ``angle_median_deg`` and ``angle_p90_deg`` between patch normals and the normals of the nearest
+        points, ignoring the sign; ``distance_median_m`` and ``distance_p90_m``; ``area_paper_ratio`` and
         ``area_coverage_ratio``, sums of areas over the true area of one side.
     """
     opacity = model.opacity()

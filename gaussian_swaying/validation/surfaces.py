@@ -1,4 +1,4 @@
-"""The force of a steady wind on surfaces made of Gaussians, against the integral over the true surface."""
+"""The force of a steady wind on surfaces made of Gaussians, compared with the integral over the true surface."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def surface_drag(shape: str, count: int, overlap: float, area: str, law: str) ->
     """Drag on a plate across the flow or on a sphere, as a share of the exact one.
 
     With C_D = 1 and the dynamic pressure q the plate of side L feels q L² in either law. Both halves of a sphere of
-    radius R feel the wind, as normals turn along the flow: the integral of abs(n.d) gives 2 pi R² q in the law
+    radius R feel the wind, as normals are flipped along the flow: the integral of abs(n.d) gives 2 pi R² q in the law
     ``paper``, that of (n.d)² gives 4 pi R² q / 3 in ``projected``.
 
     Args:
         shape: ``plate`` or ``sphere``.
-        count: About how many Gaussians carry it.
+        count: Approximate number of Gaussians.
         overlap: Standard deviation of a Gaussian over the spacing.
         area: ``coverage`` or ``paper``.
         law: ``paper`` or ``projected``.

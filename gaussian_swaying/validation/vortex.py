@@ -1,9 +1,9 @@
 r"""A manufactured solution with large rotation and shear: the generalised vortex (Kamojjala et al. 2015).
 
 Kamojjala, Brannon, Sadeghirad & Guilkey, "Verification tests in solid mechanics", Engineering with Computers 31, 193:
-every circle of an annulus turns rigidly by :math:`\alpha(R, t) = G(t)\, h(R)`, with
-:math:`h = 1 - 32 (R - 1)^2 + 256 (R - 1)^4` on :math:`0.75 < R < 1.25`. Both h and its slope vanish on the rims, so
-these are free of load. Here :math:`G = A \sin^2(\pi t / T)`, which starts from rest.
+every circle of an annulus rotates rigidly by :math:`\alpha(R, t) = G(t)\, h(R)`, with
+:math:`h = 1 - 32 (R - 1)^2 + 256 (R - 1)^4` on :math:`0.75 < R < 1.25`. Both h and its slope are zero on the rims, so
+the rims are free of load. Here :math:`G = A \sin^2(\pi t / T)`, which starts from rest.
 
 The annulus is filled with rings of points, so that its rims are round and the error is that of the method.
 """
@@ -36,7 +36,7 @@ def _profile(radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def placement(rest: Tensor, time: Tensor, amplitude: float) -> Tensor:
-    """Where the points of the vortex are [m], shape (..., 3)."""
+    """Positions of the points of the vortex [m], shape (..., 3)."""
     angle = turning(time, amplitude)[0].to(rest) * _profile(rest[..., :2].norm(dim=-1))[0]
     c, s = torch.cos(angle), torch.sin(angle)
     x, y, z = rest.unbind(-1)
@@ -47,12 +47,12 @@ def body_force(rest: Tensor, time: Tensor, amplitude: float, mu: float, density:
     r"""Force per mass [m/s²] that drives the vortex: acceleration less :math:`\operatorname{Div} P / \rho`.
 
     In the polar basis turned by :math:`\alpha` the motion is a simple shear of amount :math:`\gamma = G R h'`. Its
-    rotation is :math:`\varphi = \arctan(\gamma / 2)` and its volume stays, so fixed corotated elasticity gives
+    rotation is :math:`\varphi = \arctan(\gamma / 2)` and its volume is constant, so fixed corotated elasticity gives
     :math:`P_{RR} = P_{\theta\theta} = 2 \mu (1 - \cos\varphi)`, :math:`P_{R\theta} = 2 \mu \sin\varphi` and
     :math:`P_{\theta R} = 2 \mu (\gamma - \sin\varphi)`; the divergence is taken in polar coordinates.
 
     Args:
-        rest: Rest position [m], shape (..., 3), its first two components within the annulus.
+        rest: Rest position [m], shape (..., 3), with the first two components inside the annulus.
         time: Time [s], scalar.
         amplitude: Largest turn A [rad].
         mu: Shear modulus [Pa].
@@ -80,7 +80,7 @@ def body_force(rest: Tensor, time: Tensor, amplitude: float, mu: float, density:
 
 
 def annulus(cells: int) -> tuple[Tensor, Tensor]:
-    """Rings of points, two to a cell along the radius and along each ring, one cell thick.
+    """Rings of points, two per cell along the radius and along each ring, one cell thick.
 
     Args:
         cells: Cells to a metre.
@@ -94,7 +94,7 @@ def annulus(cells: int) -> tuple[Tensor, Tensor]:
     for k in range(rings):
         radius = 0.75 + (k + 0.5) * spacing
         count = round(4 * math.pi * radius * cells)
-        # neighbouring rings out of step, and none of them in step with the axes
+        # neighbouring rings are shifted against each other, and none is aligned with the axes
         angle = (torch.arange(count, dtype=torch.float64) + 0.1 + 0.5 * (k % 2)) * (2 * math.pi / count)
         position.append(radius * torch.stack([torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)], dim=-1))
         volume.append(torch.full_like(angle, 2 * math.pi * radius * spacing / (count * cells)))
@@ -104,14 +104,14 @@ def annulus(cells: int) -> tuple[Tensor, Tensor]:
 def vortex(cells: int, settings: Settings, amplitude: float = 1.0, part: float = 0.5) -> Result:
     """Follow the vortex in plane strain.
 
-    The velocity of symplectic Euler stands half a substep before its displacement, so it starts with the exact velocity
-    there.
+    The velocity of symplectic Euler is half a substep before its displacement, so it starts with the exact velocity at
+    that time.
 
     Args:
-        cells: Cells to a metre; half as many across the annulus.
+        cells: Cells per metre; half as many across the annulus.
         settings: The numerics.
         amplitude: Largest turn A [rad].
-        part: Part of the period to follow; at 0.5 the turn is largest, at 1 all is back in place.
+        part: Share of the period to simulate; at 0.5 the rotation is largest, at 1 everything is back in place.
 
     Returns:
         ``error`` (root mean square of the error of the displacement at the end, relative to the largest root mean

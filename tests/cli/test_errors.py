@@ -44,12 +44,12 @@ def nested(depth=100_000):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (lambda: torch.empty(1 << 62), ["The memory is not enough", "coarser grid"]),
-        (lambda: torch.empty(1 << 45), ["The memory is not enough (", "were asked for", "coarser grid"]),
-        (lambda: torch.empty(1 << 31, 1 << 31, 1 << 31), ["The memory is not enough", "coarser grid"]),
-        (lambda: np.empty(1 << 50), ["The memory is not enough (Unable to allocate", "coarser grid"]),
-        (lambda: float(10**400), ["A number is too large", "check the values"]),
-        (lambda: torch.tensor([0.0]).fill_(1e300), ["A number is too large", "check the values"]),
+        (lambda: torch.empty(1 << 62), ["There is not enough memory", "coarser grid"]),
+        (lambda: torch.empty(1 << 45), ["There is not enough memory (", "were requested", "coarser grid"]),
+        (lambda: torch.empty(1 << 31, 1 << 31, 1 << 31), ["There is not enough memory", "coarser grid"]),
+        (lambda: np.empty(1 << 50), ["There is not enough memory (Unable to allocate", "coarser grid"]),
+        (lambda: float(10**400), ["A number is too large", "check the given values"]),
+        (lambda: torch.tensor([0.0]).fill_(1e300), ["A number is too large", "check the given values"]),
         (lambda: b"\xff\xfe".decode(), ["not UTF-8", "save it as UTF-8"]),
         (nested, ["nested too deeply"]),
         (Path("/nowhere/at/all").read_bytes, ["/nowhere/at/all does not exist", "check the path"]),

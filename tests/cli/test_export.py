@@ -84,7 +84,7 @@ def test_usd_as_given(tmp_path, capsys):
         (["film.usdc", "--up", "0", "0", "0"], "zero"),
         (["film.usdc", "--metres-per-unit", "-1"], "`--metres-per-unit` to be positive"),
         (["film.usdc", "--fps", "nan"], "--fps"),
-        (["film.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are for USD files"),
+        (["film.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are only for USD files"),
     ],
 )
 def test_bad_options(options, message, tmp_path, capsys):
@@ -103,7 +103,7 @@ def test_damaged_summary(changes, tmp_path, capsys):
     assert _main()([str(run / "ply"), str(tmp_path / "film.usdc")]) == 2
     error = capsys.readouterr().err
     assert "summary.json cannot be used" in error
-    assert "give --up, --metres-per-unit and --fps instead" in error
+    assert "set --up, --metres-per-unit and --fps instead" in error
 
 
 def test_files_of_viewers_are_read_again(tmp_path):

@@ -179,7 +179,7 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--sway", "nan"], "`--sway`"),
         (splat, ["--height", "7"], "`--height`"),
         (splat, ["--config", str(typo)], "dxx"),
-        (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for guesses, but"),
+        (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for suggestions, and"),
         (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
     ):

@@ -149,7 +149,7 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
     stored = yaml.safe_load((out / "config.yaml").read_text())
     assert stored["cameras"]["flight"]["init_args"]["keys"][1]["azimuth"] == -40
     (tmp_path / "more.yaml").write_text(yaml.safe_dump({"cameras": {"a/b": more["cameras"]["side"]}}))
-    words = ("name of `cameras`", "'a/b'")
+    words = ("names of `cameras`", "'a/b'")
     check_refused([*SMALL, "--config", str(tmp_path / "more.yaml")], tmp_path / "no", capsys, *words)
 
 

@@ -196,7 +196,7 @@ def test_a_training_that_ends_early_names_its_checkpoint(error, code, words, cap
     said = capsys.readouterr().err
     path = "run/checkpoints/step_000010.ckpt"
     assert words in said
-    assert f"{path} is the last checkpoint; to go on:\n  python tools/train.py fit --config" in said
+    assert f"{path} is the last checkpoint; to continue:\n  python tools/train.py fit --config" in said
     assert said.endswith(f" --ckpt_path {path}\n")
     assert [row["step"] for row in _rows(folder)] == ["1", "5", "9"]
     assert not [path for path in folder.rglob(".*")]
@@ -229,14 +229,14 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
         ({"data": json.dumps(data)}, ""),
         ({"ckpt_path": broken}, "checksum does not match its content"),
         ({"ckpt_path": folder / "csv"}, "it is a folder"),
-        ({"ckpt_path": last}, "has seen 3 images already, and `trainer.max_steps` asks for 3"),
+        ({"ckpt_path": last}, "has already trained on 3 images, and `trainer.max_steps` is 3"),
         ({"trainer.precision": "16-mixed"}, "precision"),
     ):
         assert main(["fit", *_arguments(capture, folder, **few), *(f"--{k}={v}" for k, v in options.items())]) == 2
         said = capsys.readouterr().err
         assert words in said, said
         assert "error: " in said
-        assert "to go on" not in said
+        assert "to continue" not in said
         assert _contents(tmp_path) == before, options
     lock = FolderLock(folder)
     assert main(["fit", *_arguments(capture, folder, **few)]) == 2

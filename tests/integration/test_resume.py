@@ -173,7 +173,7 @@ def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):
         process.kill()
         process.wait()
     assert "Traceback" not in error
-    assert f"{folder}/checkpoint.pt holds the run up to frame 3; to go on:\n" in error
+    assert f"{folder}/checkpoint.pt contains the run up to frame 3; to continue:\n" in error
     assert error.endswith(" --resume\n")
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["status"], summary["reason"]) == ("interrupted", f"stopped by {name}")
@@ -289,19 +289,19 @@ def test_the_end_of_a_run_names_its_checkpoint(tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
     for frame, error, words in (
         (0, OSError("the disk is full"), None),
-        (2, OSError("the disk is full"), "frame 1; to go on:\n  python tools/sim.py --config"),
-        (3, SimulationDiverged(0.12, 0, "broken", "mend it"), "frame 2; going on from it would diverge again"),
+        (2, OSError("the disk is full"), "frame 1; to continue:\n  python tools/sim.py --config"),
+        (3, SimulationDiverged(0.12, 0, "broken", "mend it"), "frame 2; continuing from it would diverge again"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(sys, "argv", ["tools/sim.py"])
             _stop_after(patch, frame, lambda _, error=error: error)
             assert main(_arguments(folder)) == 2
         said = capsys.readouterr().err
-        assert said.count("checkpoint.pt holds") == (words is not None)
+        assert said.count("checkpoint.pt contains") == (words is not None)
         assert words is None or words in said
         assert ("error: the disk is full" if frame < 3 else "mend it") in said
     assert main(_arguments(folder, "--frames", "1", "--resume")) == 2
-    assert "checkpoint.pt holds" not in capsys.readouterr().err
+    assert "checkpoint.pt contains" not in capsys.readouterr().err
 
 
 def test_nothing_to_resume(tmp_path, capsys):

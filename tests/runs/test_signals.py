@@ -72,11 +72,11 @@ def test_the_command_that_goes_on(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["tools/sim.py"])
     said = how_to_resume(Path("outputs/run/checkpoint.pt"), 11, ["--config", "my file.yaml"])
     assert said == (
-        "outputs/run/checkpoint.pt holds the run up to frame 11; to go on:\n"
+        "outputs/run/checkpoint.pt contains the run up to frame 11; to continue:\n"
         "  python tools/sim.py --config 'my file.yaml' --resume"
     )
     assert command(["--resume"], "--resume") == "python tools/sim.py --resume"
     monkeypatch.setattr(sys, "argv", ["/usr/bin/sway"])
     given = ["fit", "--ckpt_path", "old", "--ckpt_path=older", "--x", "1"]
     assert command(given, "--ckpt_path", "new", without="--ckpt_path") == "sway fit --x 1 --ckpt_path new"
-    assert "to go on" not in how_to_resume(Path("c.pt"), 1, [], diverged=True)
+    assert "to continue" not in how_to_resume(Path("c.pt"), 1, [], diverged=True)

@@ -139,7 +139,7 @@ def test_a_resumed_run_has_all_pictures(make_simulation, tmp_path):
 
 
 def test_bad_names_and_renders(make_cloud, make_simulation):
-    with pytest.raises(ValueError, match=r"name of `cameras` .* but got '\.\./up'"):
+    with pytest.raises(ValueError, match=r"names of `cameras` .* but got '\.\./up'"):
         make_simulation(parts={"cameras": {"../up": SIDE}})
     inside = _cameras(
         make_simulation(make_cloud(), pinned=False), near=OrbitCamera(width=8, height=8, radius=0.01, elevation=0.1)

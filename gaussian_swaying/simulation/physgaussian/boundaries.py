@@ -15,13 +15,13 @@ from gaussian_swaying.simulation.physgaussian.parts import box, box_about, part
 from gaussian_swaying.simulation.physgaussian.space import CENTER, tidy
 
 FOREVER = 999.0
-"""End from which a condition of PhysGaussian is taken to last for ever [s]."""
+"""A condition of PhysGaussian that ends at this time or later has no end here [s]."""
 
 PADDING = 3
-"""Nodes that a bounding box of PhysGaussian keeps to at each side of its grid."""
+"""Margin of PhysGaussian's bounding box on each side of its grid [nodes]."""
 
 RESET_SUBSTEPS = 15
-"""Substeps for which ``reset`` of a cuboid keeps all nodes at rest after the end of the cuboid."""
+"""Number of substeps after the end of a cuboid during which ``reset`` keeps all nodes at rest."""
 
 _TYPES = (
     "bounding_box",
@@ -33,12 +33,12 @@ _TYPES = (
     "surface_collider",
 )
 
-_HOLDS = "holds the nodes that its particles touch, where PhysGaussian sets the particles' velocities only."
+_HOLDS = "holds the nodes that its particles touch; PhysGaussian only sets the velocities of the particles."
 
 
 @dataclass(frozen=True)
 class Turned:
-    """What boundaries need to know of the grid: turned axes to simulation axes, spacing, side, substep."""
+    """Values of the grid that boundaries need: rotation from turned to simulation axes, spacing, side and substep."""
 
     turn: Tensor
     dx: float
@@ -51,7 +51,7 @@ class Turned:
 
 
 def boundary_settings(index: int, entry: Any, space: Turned, sticky: bool, notes: Notes) -> list[dict[str, Any]]:
-    """The boundaries that one entry of ``boundary_conditions`` becomes."""
+    """The boundaries for one entry of ``boundary_conditions``."""
     where = f"boundary_conditions[{index}]"
     take = Fields(entry, where)
     kind = take.get("type")
@@ -78,14 +78,14 @@ def boundary_settings(index: int, entry: Any, space: Turned, sticky: bool, notes
 
 
 def _window(take: Fields, required: bool) -> dict[str, Any]:
-    """``start`` and ``end`` of a boundary; those of PhysGaussian that end beyond any run have none."""
+    """``start`` and ``end`` of a boundary; an end far beyond any run becomes null."""
     start = take.number("start_time", *(() if required else (0.0,)))
     end = take.number("end_time", *(() if required else (1e3,)))
     return {"start": start, "end": None if end >= FOREVER else end}
 
 
 def _bounding_box(space: Turned) -> list[dict[str, Any]]:
-    # half a cell beyond the last node that is stopped, as faces on nodes would depend on round-off
+    # half a cell beyond the last stopped node, since faces exactly on nodes would depend on round-off
     low, high = (PADDING - 0.5) * space.dx, space.grid_lim - (PADDING + 0.5) * space.dx
     return [part("EnclosingBox", min=[round(low, 12)] * 3, max=[round(high, 12)] * 3, kind="separate")]
 
@@ -110,8 +110,8 @@ def _impulse(take: Fields, space: Turned, notes: Notes) -> list[dict[str, Any]]:
     start, seconds = take.number("start_time", 0.0), take.whole("num_dt", 1) * space.substep
     region = box_about(take.vector("point", CENTER), take.vector("size", CENTER))
     notes.add(
-        "`particle_impulse`: the same momentum in all, but spread by mass, where PhysGaussian gives each particle as "
-        "much, whatever its mass."
+        "`particle_impulse`: the total momentum is the same, but it is spread by mass; PhysGaussian gives each "
+        "particle the same share, whatever its mass."
     )
     impulse = [round(f * seconds, 18) + 0.0 for f in force]
     return [part("Impulse", region=region, impulse=impulse, start=start, end=start + seconds, per_particle=True)]
@@ -155,19 +155,19 @@ def _plane(take: Fields, sticky: bool, notes: Notes) -> dict[str, Any]:
         raise TypeError(f"Expected `surface` of a surface_collider to be a name, but got {surface!r}.")
     if surface == "cut":
         raise ValueError(
-            "The `surface` cut of a surface_collider has no counterpart, as it acts between two heights that are fixed "
+            "The `surface` cut of a surface_collider is not supported, as it acts between two heights that are fixed "
             "in PhysGaussian's code: use sticky, slip or separate, and a cuboid for the rest."
         )
     if surface == "sticky" and friction != 0:
         raise ValueError(f"Expected `friction` of a sticky surface_collider to be 0, but got {friction:g}.")
     kind = surface if surface in ("sticky", "slip", "separate") else "separate"
     if kind != surface:
-        notes.add(f"`surface` {surface!r} is taken for separate, as PhysGaussian takes what it does not know.")
+        notes.add(f"`surface` {surface!r} becomes separate, as in PhysGaussian, which treats unknown names like that.")
     if sticky and kind != "sticky":
         kind, friction = "sticky", 0.0
-        notes.add(f"`surface`: the {surface} plane sticks, as PhysGaussian's code makes it.")
+        notes.add(f"`surface`: the {surface} plane is sticky, as in PhysGaussian's code.")
     elif kind != "sticky":
-        notes.add(f"`surface`: the plane is {kind} here; PhysGaussian's code makes every plane stick.")
+        notes.add(f"`surface`: the plane is {kind} here; PhysGaussian's code makes every plane sticky.")
     return part("Plane", point=list(point), normal=list(normal), kind=kind, friction=friction, **_window(take, True))
 
 
@@ -176,7 +176,7 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
     axes = [axis for axis, component in enumerate(normal) if component != 0]
     if len(axes) != 1:
         raise ValueError(
-            "Expected `normal` of a release_particles_sequentially to lie along one axis, as PhysGaussian takes no "
+            "Expected `normal` of a release_particles_sequentially to be along one axis, as PhysGaussian supports no "
             f"other, but got {list(normal)}."
         )
     axis = axes[0]
@@ -186,13 +186,13 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
     start, end = take.number("start_time"), take.positive("end_time")
     if start != 0:
         raise ValueError(
-            f"Expected `start_time` of a release_particles_sequentially to be 0, but got {start:g}: a front that is on "
-            "its way before anything is held has no counterpart."
+            f"Expected `start_time` of a release_particles_sequentially to be 0, but got {start:g}: a front that moves "
+            "before anything is held is not supported."
         )
     take.whole("num_layers")
     notes.add(
-        "`release_particles_sequentially`: a continuous front between the two positions, where PhysGaussian has 50 "
-        f"layers whatever `num_layers` says, and as many mirrored beyond `end_position`; it {_HOLDS}"
+        "`release_particles_sequentially`: a continuous front between the two positions. PhysGaussian has 50 "
+        f"layers, whatever `num_layers` says, and as many mirrored beyond `end_position`. Here it {_HOLDS}"
     )
     low, high = [0.0] * 3, [2.0] * 3
     low[axis], high[axis] = min(first, last), max(first, last)

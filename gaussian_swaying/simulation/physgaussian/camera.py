@@ -1,4 +1,4 @@
-"""The camera of a PhysGaussian configuration, and reading those that 3DGS keeps beside its model."""
+"""The camera of a PhysGaussian configuration, and reading of the cameras of a 3DGS model."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 
 
 class PhysGaussianCamera(CameraPath):
-    """Camera of a PhysGaussian configuration: one of its model's, or one that looks at a point from a sphere.
+    """Camera of a PhysGaussian configuration: a camera of the model, or one on a sphere that looks at a point.
 
-    Azimuth is counted as in PhysGaussian: from the horizontal part of (1, 1, 1) [of (0.72, 0.37, -0.67) if that is
-    nearly across ``up``], clockwise about ``up`` as seen from above.
+    Azimuth is defined as in PhysGaussian: from the horizontal part of (1, 1, 1), or of (0.72, 0.37, -0.67) if (1, 1, 1)
+    is nearly perpendicular to ``up``, and clockwise about ``up`` as seen from above.
 
     Args:
-        cameras: ``cameras.json`` of the model, for the lens and for ``index``; without it ``fov_y`` and the size count.
-        index: Which of its cameras, from 0; -1 for the sphere.
+        cameras: ``cameras.json`` of the model, for the lens and for ``index``; without it ``fov_y`` and the size are
+            used.
+        index: Index of the camera, from 0; -1 for the sphere.
         azimuth: Angle about ``up`` in the first moving frame [degrees].
         elevation: Angle above the horizontal plane [degrees].
         radius: Distance [scene units].
         delta_azimuth: Change per frame [degrees].
         delta_elevation: Change per frame [degrees].
         delta_radius: Change per frame [scene units].
-        viewpoint: Point looked at, in the normalised space of ``normalisation``; in scene units if there is none.
-        up: Direction seen upwards, likewise.
+        viewpoint: Target point, in the normalised space of ``normalisation``; in scene units without it.
+        up: Direction seen upwards, in the same space.
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
@@ -62,7 +63,7 @@ class PhysGaussianCamera(CameraPath):
     ) -> None:
         check_positive("radius", radius)
         if index >= 0 and cameras is None:
-            raise ValueError(f"The camera {index} is one of the model's: give its `cameras.json` as `cameras`.")
+            raise ValueError(f"Camera {index} is a camera of the model: set `cameras` to its `cameras.json`.")
         self.cameras, self.index, self.radius = cameras, int(index), float(radius)
         self.azimuth, self.elevation = float(azimuth), float(elevation)
         self.delta = (float(delta_azimuth), float(delta_elevation), float(delta_radius))
@@ -75,8 +76,8 @@ class PhysGaussianCamera(CameraPath):
         self._model: Camera | None = None
 
     def eye(self, frame: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Where the sphere's camera stands in a frame, what it looks at, and up: scene units, shape (3,), float64."""
-        moved = max(frame - 1, 0)  # the first frame here is the rest, which PhysGaussian does not draw
+        """Position, target and up of the sphere's camera in a frame: scene units, shape (3,), float64."""
+        moved = max(frame - 1, 0)  # the first frame here is at rest, and PhysGaussian does not draw it
         azimuth = math.radians(self.azimuth + moved * self.delta[0])
         elevation = math.radians(self.elevation + moved * self.delta[1])
         radius = self.radius + moved * self.delta[2]
@@ -108,19 +109,19 @@ class PhysGaussianCamera(CameraPath):
 
 
 def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.01) -> Camera:
-    """Read a camera of the ``cameras.json`` that 3DGS keeps beside its model.
+    """Read a camera from the ``cameras.json`` of a 3DGS model.
 
     Args:
         path: The file: a list of cameras with ``position``, ``rotation`` (camera to world, OpenCV axes), ``fx``, ``fy``
             [pixels], ``width`` and ``height``.
-        index: Which of them, from 0.
+        index: Index of the camera, from 0.
         near: Near plane [scene units].
 
     Returns:
         The camera in float64; the principal point is the image's centre.
 
     Raises:
-        ValueError: If the file cannot be read, has no such camera, or the camera lacks a field.
+        ValueError: If the file cannot be read, has no such camera, or a field of the camera is missing.
     """
     entries = read_json(path, "camera file")
     if not isinstance(entries, list) or not 0 <= index < len(entries):

@@ -10,7 +10,7 @@ from gaussian_swaying.simulation.physgaussian.space import CENTER
 
 
 def camera_settings(take: Fields, cameras: str | None, notes: Notes) -> dict[str, Any]:
-    """``camera``: one of the model's, the moving one, or our own where the file of cameras is missing."""
+    """``camera``: a camera of the model, the moving camera, or our orbit camera if the file of cameras is missing."""
     viewpoint = list(take.vector("mpm_space_viewpoint_center", CENTER))
     up = list(take.vector("mpm_space_vertical_upward_axis", (0.0, 0.0, 1.0)))
     index = take.whole("default_camera_index", 0, least=-1)
@@ -24,7 +24,7 @@ def camera_settings(take: Fields, cameras: str | None, notes: Notes) -> dict[str
     if index >= 0 and cameras is None:
         notes.add(
             f"`default_camera_index` {index} is a camera of the 3DGS model, whose cameras.json was not given, so it is "
-            f"an orbit here; --camera {orbit} --camera.cameras PATH --camera.index {index} takes the model's."
+            f"an orbit here; --camera {orbit} --camera.cameras PATH --camera.index {index} uses the model's."
         )
         return part("OrbitCamera", width=960, height=540)
     if index >= 0:
@@ -32,7 +32,7 @@ def camera_settings(take: Fields, cameras: str | None, notes: Notes) -> dict[str
     wanted = [*start, *deltas] if moves else list(start)
     for name in wanted:
         if (start | deltas)[name] is None:
-            raise ValueError(f"The key `{name}` is missing, which `default_camera_index` -1 needs.")
+            raise ValueError(f"The key `{name}` is missing, but `default_camera_index` -1 needs it.")
         take.number(name)
     if cameras is None:
         notes.add(

@@ -1,6 +1,6 @@
 """PhysGaussian's JSON configurations as settings of this package, key by key.
 
-See ``docs/physgaussian.md`` for what each key becomes and what it means there and here.
+``docs/physgaussian.md`` lists what each key becomes, and what it means in PhysGaussian and here.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from gaussian_swaying.simulation.physgaussian.space import Normalisation, headin
 
 
 def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a PhysGaussian configuration; ValueError if it is missing or no JSON object."""
+    """Read a PhysGaussian configuration; ValueError if it is missing or not a JSON object."""
     config = read_json(path, "PhysGaussian configuration")
     if not isinstance(config, dict):
-        raise ValueError(f"The PhysGaussian configuration `{path}` is no JSON object: give one of its config/*.json.")
+        raise ValueError(f"The PhysGaussian configuration `{path}` is not a JSON object: use one of its config/*.json.")
     return config
 
 
@@ -38,19 +38,19 @@ def convert(
 ) -> tuple[dict[str, Any], list[str]]:
     """Settings of a simulation for a PhysGaussian configuration.
 
-    Numbers stay as they are in the file: boxes and planes in the normalised space (:class:`Normalisation`), which is
-    brought to the scene once its splat is known. Vectors turn with :func:`heading`.
+    Numbers stay as in the file: boxes and planes are in the normalised space (:class:`Normalisation`), which is mapped
+    to the scene once its splat is known. Vectors are rotated with :func:`heading`.
 
     Args:
         config: The JSON object.
         cameras: ``cameras.json`` of the 3DGS model, for ``default_camera_index`` and the lens.
-        sticky_planes: Make every plane stick, as PhysGaussian's code does whatever ``surface`` says.
+        sticky_planes: Make every plane sticky, as PhysGaussian's code does whatever ``surface`` says.
 
     Returns:
-        The settings, without a splat (``scene.ply`` is to be given), and sentences on what means something else here.
+        The settings, without a splat (``scene.ply`` must be set), and sentences about everything whose meaning differs.
 
     Raises:
-        ValueError: If a key is unknown, missing or out of range, or asks for what there is not; the message names it.
+        ValueError: If a key is unknown, missing, out of range or not supported; the message names it.
         TypeError: If a value has the wrong type.
     """
     take, notes = Fields(config, "PhysGaussian's configuration"), Notes()
@@ -64,8 +64,8 @@ def convert(
     substep, frame_dt = take.positive("substep_dt", 1e-4), take.positive("frame_dt", 1e-2)
     frames = take.whole("frame_num", 100)
     notes.add(
-        f"`substep_dt`: the substep is adaptive instead of {substep:g} s, which only enters damping and impulses; "
-        f"--solver.substep {substep:g} fixes it, and is refused where it is not surely stable."
+        f"`substep_dt`: the substep is adaptive instead of {substep:g} s, which is only used for damping and impulses; "
+        f"--solver.substep {substep:g} fixes it, and is refused unless it is stable."
     )
 
     scene: dict[str, Any] = {
@@ -109,7 +109,7 @@ def convert(
         "camera": camera,
     }
     notes.add(
-        "PhysGaussian has no wind: the coefficients of `aero` are zero; set `wind.flow` and C_D, C_F and C_L for some."
+        "PhysGaussian has no wind: the coefficients of `aero` are zero; for wind set `wind.flow` and C_D, C_F and C_L."
     )
     return settings, notes.sentences
 
@@ -119,8 +119,8 @@ def _gravity(take: Fields, turn: Tensor) -> list[float]:
     value = take.get("g", 9.8)
     if not isinstance(value, (list, tuple)):
         raise ValueError(
-            f"Expected `g` to be a list of 3 numbers, for example [0, 0, -9.8], but got {value!r}; PhysGaussian's own "
-            "default, a single number, stops it too."
+            f"Expected `g` to be a list of 3 numbers, for example [0, 0, -9.8], but got {value!r}; PhysGaussian's "
+            "default, a single number, does not work there either."
         )
     return tidy(turn @ torch.tensor(check_vector("g", value), dtype=torch.float64))
 
@@ -130,12 +130,12 @@ def _damping(take: Fields, substep: float, notes: Notes) -> float:
     rpic = take.number("rpic_damping", 0.0)
     if rpic != 0:
         notes.add(
-            f"`rpic_damping` {rpic:g} has no counterpart: the transfer is APIC; --solver.damping and "
-            "--solver.stiffness_damping take energy out."
+            f"`rpic_damping` {rpic:g} is not supported: the transfer is APIC; for damping use --solver.damping and "
+            "--solver.stiffness_damping."
         )
     if take.given("pic_damping"):
         take.number("pic_damping")
-        notes.add("`pic_damping` has no effect in PhysGaussian, nor here.")
+        notes.add("`pic_damping` has no effect in PhysGaussian or here.")
     factor = take.positive("grid_v_damping_scale", 1.1)
     return 0.0 if factor >= 1 else -math.log(factor) / substep
 

@@ -1,4 +1,4 @@
-"""Reading a PhysGaussian configuration key by key, and collecting notes on what means something else here."""
+"""Reading a PhysGaussian configuration key by key, and collecting notes on differences."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Notes:
 
 
 class Fields:
-    """The fields of a JSON object, each of which has to be asked for."""
+    """The fields of a JSON object; a field that is never read is an error."""
 
     def __init__(self, fields: Any, where: str) -> None:
         if not isinstance(fields, Mapping):
@@ -60,7 +60,7 @@ class Fields:
         value = self.number(name, *default)
         if value != int(value) or value < least:
             raise ValueError(
-                f"Expected `{name}` of {self._where} to be a whole number from {least}, but got {value:g}."
+                f"Expected `{name}` of {self._where} to be a whole number of at least {least}, but got {value:g}."
             )
         return int(value)
 
@@ -84,11 +84,11 @@ class Fields:
         return list(check_vector(name, value, len(value)))
 
     def vector(self, name: str, *default: Sequence[float], length: int = 3) -> tuple[float, ...]:
-        """So many finite numbers."""
+        """A list of ``length`` finite numbers."""
         return check_vector(name, self.get(name, *default), length)
 
     def finish(self) -> None:
-        """Raise ValueError, with a guess at what was meant, if a key was never asked for."""
+        """Raise ValueError, with a suggestion, if a key was never read."""
         for name in self._fields:
             if name not in self._asked:
                 close = difflib.get_close_matches(name, sorted(self._asked), 1)

@@ -7,19 +7,19 @@ from typing import Any
 from gaussian_swaying.simulation.physgaussian.fields import Fields, Notes
 
 _FILLING_NOTES = {
-    "density_threshold": "is counted otherwise here, so `scene.filling.threshold` keeps its default.",
+    "density_threshold": "has another definition here, so `scene.filling.threshold` keeps its default.",
     "search_threshold": "is not needed: cells are enclosed by the vote of 26 rays (`scene.filling.votes`).",
-    "search_exclude_direction": "has no counterpart: rays go to all sides, and are outvoted where a side is open.",
-    "ray_cast_direction": "has no counterpart: all rays count crossings, not one.",
-    "max_particles_num": "has no counterpart: the number of points follows from the volume.",
-    "boundary": "has no counterpart: all that is enclosed is filled; `scene.region` bounds it.",
-    "smooth": "has no counterpart: the density is blurred by half a cell.",
-    "visualize": "has no counterpart: filled points are never drawn.",
+    "search_exclude_direction": "is not supported: rays go in all directions, and an open side is outvoted.",
+    "ray_cast_direction": "is not supported: all rays count crossings, not one.",
+    "max_particles_num": "is not supported: the number of points follows from the volume.",
+    "boundary": "is not supported: everything enclosed is filled, within `scene.region`.",
+    "smooth": "is not supported: the density is blurred by half a cell.",
+    "visualize": "is not supported: filled points are never drawn.",
 }
 
 
 def filling_settings(fields: Any, n_grid: int, grid_lim: float, notes: Notes) -> dict[str, Any]:
-    """``scene.filling``: another method for the same purpose, on a grid of the same spacing."""
+    """``scene.filling``: another method for the same purpose, on a grid with the same spacing."""
     take = Fields(fields, "particle_filling")
     spacing = grid_lim / take.whole("n_grid", 4 * n_grid)
     wanted = take.whole("max_partciels_per_cell", 1)

@@ -61,7 +61,9 @@ def material_settings(take: Fields, notes: Notes) -> dict[str, Any]:
     if regions:
         material["regions"] = regions
     if kind == "sand":
-        notes.add("`material`: PhysGaussian gives sand the mean volume of all particles, here each cell has its own.")
+        notes.add(
+            "`material`: PhysGaussian uses the mean volume of all particles for sand; here each cell has its own."
+        )
     return material
 
 
@@ -69,8 +71,8 @@ def _law(kind: str, flow: Mapping[str, float], E: float, nu: float, notes: Notes
     """``material.law``; None for fixed corotated elasticity.
 
     PhysGaussian bounds ``|dev tau|`` by its yield stress, which grows by ``2 mu xi`` (with ``hardening`` = 1) and falls
-    by ``softening`` times the flow of the logarithmic strain. In the stress and strain of uniaxial tension that is a
-    yield stress ``sqrt(3/2)`` times as large, and 3/2 of the growth.
+    by ``softening`` times the plastic logarithmic strain. In terms of uniaxial tension the yield stress is
+    ``sqrt(3/2)`` times and the growth 3/2 times as large.
     """
     stress = flow["yield_stress"]
     growth = 2 * E / (2 * (1 + nu)) * flow["xi"] if flow["hardening"] == 1 else 0.0
@@ -80,28 +82,28 @@ def _law(kind: str, flow: Mapping[str, float], E: float, nu: float, notes: Notes
         return part("Sand", friction_angle=flow["friction_angle"])
     if kind == "foam":
         notes.add(
-            "`plastic_viscosity`: the overstress relaxes exactly here, and by one implicit step in PhysGaussian, whose "
-            "shear modulus grows with the stretch meanwhile."
+            "`plastic_viscosity`: the overstress relaxes exactly here, but by one implicit step in PhysGaussian, where "
+            "the shear modulus also grows with the stretch."
         )
         return part("Foam", yield_stress=stress, viscosity=flow["plastic_viscosity"])
     if kind == "snow":
-        notes.add("`material`: PhysGaussian computes no stress for snow; here it has that of Stomakhin et al. 2013.")
+        notes.add("`material`: PhysGaussian computes no stress for snow; here it is that of Stomakhin et al. 2013.")
         return part("Snow")
     if kind == "metal":
         if stress <= 0:
             raise ValueError(
                 f"Expected `yield_stress` of metal to be positive, but got {stress:g}: without it nothing keeps its "
-                "shape; give it, or use foam."
+                "shape; set it, or use foam."
             )
         if growth < 0:
             raise ValueError(f"Expected `xi` of metal not to be negative, but got {flow['xi']:g}: use plasticine.")
         return part("Metal", yield_stress=_YIELD * stress, hardening=1.5 * growth)
     if stress <= 0:
-        notes.add("`yield_stress`: plasticine without any never flows in PhysGaussian, so it is elastic here.")
+        notes.add("`yield_stress`: plasticine with zero never yields in PhysGaussian, so it is elastic here.")
         return None
     notes.add(
-        "`material`: plasticine has Hencky's stress here and the fixed corotated one in PhysGaussian, which takes all "
-        "stress from a particle whose yield stress reaches zero; here it keeps its pressure."
+        "`material`: plasticine has Hencky's stress here and the fixed corotated one in PhysGaussian. There a particle "
+        "loses all stress when its yield stress reaches zero; here it keeps its pressure."
     )
     growth -= flow["softening"]
     if growth > 0:
@@ -113,7 +115,7 @@ def _poisson_ratio(take: Fields, *default: float) -> float:
     nu = take.number("nu", *default)
     if not 0 <= nu < 0.5:
         raise ValueError(
-            f"Expected `nu` to lie from 0 to below 0.5, but got {nu}: at 0.5 the stress is infinite, use 0.49."
+            f"Expected `nu` to be from 0 to below 0.5, but got {nu}: at 0.5 the stress is infinite, use 0.49."
         )
     return nu
 

@@ -1,4 +1,4 @@
-"""Classes and regions as the dicts that stand for them in a configuration."""
+"""Classes and regions as dicts for a configuration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def box(low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
 
 
 def box_about(point: Sequence[float], size: Sequence[float]) -> dict[str, Any]:
-    """A box about a point, given half of its sides."""
+    """A box around a point, given half of its sides."""
     pairs = list(zip(point, size, strict=True))
     return box([p - s for p, s in pairs], [p + s for p, s in pairs])
 

@@ -1,6 +1,6 @@
-"""PhysGaussian's normalised space: the scene turned, and its simulated part scaled and centred at (1, 1, 1).
+"""PhysGaussian's normalised space: the scene is rotated, and its simulated part scaled and centred at (1, 1, 1).
 
-Boxes and planes of a PhysGaussian configuration are in it; :class:`Normalisation` brings them to scene units.
+Boxes and planes of a PhysGaussian configuration are in this space; :class:`Normalisation` converts them to scene units.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.simulation.scene import Material, Scene
 
 CENTER = (1.0, 1.0, 1.0)
-"""Where the simulated part is centred in the normalised space."""
+"""Centre of the simulated part in the normalised space."""
 
 
 def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
-    """Rotation by each angle about its axis, one after the other.
+    """Successive rotations by each angle about its axis.
 
     Args:
         degrees: Angles [degrees].
@@ -39,11 +39,11 @@ def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
         Scene axes to turned axes in float64, shape (3, 3).
 
     Raises:
-        ValueError: If there are not as many axes as angles, or an axis is none of 0, 1 and 2.
+        ValueError: If there are not as many axes as angles, or an axis is not 0, 1 or 2.
     """
     if len(degrees) != len(axes):
         raise ValueError(
-            f"Expected as many entries of `rotation_degree` as of `rotation_axis`, but got {len(degrees)} and "
+            f"Expected as many entries in `rotation_degree` as in `rotation_axis`, but got {len(degrees)} and "
             f"{len(axes)}."
         )
     total = torch.eye(3, dtype=torch.float64)
@@ -62,29 +62,29 @@ def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
 
 
 def tidy(vector: Tensor) -> list[float]:
-    """Numbers without the round-off of a rotation, and without -0."""
+    """Numbers without round-off from a rotation, and without -0."""
     return [round(v, 12) + 0.0 for v in vector.tolist()]
 
 
 def up_direction(rotation: Tensor) -> list[float]:
-    """``scene.up`` whose z-up frame has the z axis of the turned axes; scene axes to turned ones (3, 3)."""
+    """``scene.up`` so that the z-up frame has the z axis of the turned axes, from the rotation of the scene (3, 3)."""
     return tidy(rotation[2])
 
 
 def heading(rotation: Tensor) -> Tensor:
-    """Turned axes to the axes of the simulation, which may differ by a turn about z; shape (3, 3), float64."""
+    """Turned axes to the axes of the simulation, which differ by a rotation about z; shape (3, 3), float64."""
     return rotation_from_z(up_direction(rotation)).T @ rotation.T
 
 
 @dataclass
 class Normalisation:
-    """PhysGaussian's normalised space, in which boundaries and regions of the material are then given.
+    """PhysGaussian's normalised space. With it, boundaries and regions of the material are given in this space.
 
-    The scene is turned, and the simulated part scaled and centred at (1, 1, 1). A region of the scene itself is given
-    in turned axes, but in the scene's units. The unit of the normalised space is a metre.
+    The scene is rotated, and the simulated part scaled and centred at (1, 1, 1). The region of the scene is given in
+    turned axes, but in scene units. The unit of the normalised space is a metre.
 
     Args:
-        rotation_degree: Angles by which the scene is turned, one after the other [degrees].
+        rotation_degree: Angles of successive rotations of the scene [degrees].
         rotation_axis: Axis of each: 0, 1 or 2 for x, y or z.
         scale: Longest side of the simulated part along the turned axes [m].
     """
@@ -103,7 +103,7 @@ class Normalisation:
         return rotation_matrix(self.rotation_degree, self.rotation_axis)
 
     def fit(self, points: Tensor) -> SimFrame:
-        """From the normalised space to a scene.
+        """The map from the normalised space to a scene.
 
         Args:
             points: Points of the simulated part in scene units, shape (N, 3).
@@ -120,29 +120,29 @@ class Normalisation:
         low, high = turned.amin(0), turned.amax(0)
         extent = float((high - low).amax())
         if extent <= 0:
-            raise ValueError("The simulated part has no extent that `normalisation` could scale.")
+            raise ValueError("The simulated part has no extent for `normalisation` to scale.")
         scale = self.scale / extent
         origin = torch.tensor(CENTER, dtype=torch.float64) - scale * 0.5 * (low + high)
         return SimFrame(origin, rotation.T.contiguous(), 1 / scale)
 
     def place(self, scene: Scene, material: Material, solver: MPMSolver, camera: CameraPath | None = None) -> SimFrame:
-        """Bring regions, boundaries and camera to scene units, and give the scene its scale.
+        """Convert regions, boundaries and camera to scene units, and set the scale of the scene.
 
         Args:
             scene: Its region gets scene axes, and ``metres_per_unit`` is set; the splat is read.
             material: Its regions get scene units.
             solver: Its boundaries get scene units.
-            camera: A :class:`PhysGaussianCamera` gets scene units; any other is left alone.
+            camera: A :class:`PhysGaussianCamera` gets scene units; other cameras are not changed.
 
         Returns:
             The frame of :meth:`fit`.
 
         Raises:
-            ValueError: If the scene has a scale of its own, or nothing is simulated.
+            ValueError: If the scene already has a scale, or nothing is simulated.
         """
         if scene.longest_side is not None or scene.metres_per_unit is not None:
             raise ValueError(
-                "`normalisation` sets the scale of the scene: leave out `scene.longest_side` and "
+                "`normalisation` sets the scale of the scene: remove `scene.longest_side` and "
                 "`scene.metres_per_unit`, or `normalisation`."
             )
         turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)

@@ -8,7 +8,7 @@ from typing import Any
 
 
 def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str | None = None) -> str:
-    """Settings as a YAML file for ``--config``, with the notes as comments at its head.
+    """Settings as a YAML file for ``--config``, with the notes as comments at the top.
 
     Args:
         settings: From :func:`convert`.
@@ -29,7 +29,7 @@ def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str 
         for text in head
         for line in textwrap.wrap(text, initial_indent="# ", subsequent_indent="#   ", **width)  # type: ignore[arg-type]
     ]
-    plain = json.loads(json.dumps(settings))  # no part twice, which YAML would only refer to
+    plain = json.loads(json.dumps(settings))  # copies, since YAML would write repeated parts as references
     body = yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120)
     return "\n".join(lines) + "\n" + body
 

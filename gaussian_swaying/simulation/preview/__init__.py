@@ -1,1 +1,1 @@
-"""What a splat looks like to a run, and its first configuration."""
+"""Preview of a splat: its properties, a suggested first configuration, its cost and a picture."""

@@ -1,4 +1,4 @@
-"""What the preview finds, as plain numbers for preview.json."""
+"""The results of the preview as plain numbers, for preview.json."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def suggestion_dict(found: Suggestion) -> dict[str, Any]:
 
 
 def run_dict(simulation: Simulation) -> dict[str, Any]:
-    """What a run simulates, holds and blows at."""
+    """The simulated part, the pins and the wind of a run."""
     parts, scene = classify(simulation), simulation.scene
     return {
         "gaussians": len(scene.model.means),

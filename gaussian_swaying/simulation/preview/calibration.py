@@ -1,7 +1,7 @@
-"""Stiffness, thickness and wind with which a scene sways as far as wanted, found by short runs of the scene itself.
+"""Stiffness, thickness and wind that make a scene sway as far as wanted, found by short runs of the scene.
 
-A small deflection is proportional to wind² / (E thickness). So a run tells by what factor E thickness / wind² has to
-change, and the next run shows how well that went. Nothing here knows what the object is.
+A small deflection is proportional to wind² / (E thickness). So a run shows by what factor E thickness / wind² must
+change, and the next run checks the result. The method does not depend on what the object is.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from gaussian_swaying.simulation.preview.shape import quantile
 from gaussian_swaying.simulation.preview.suggest import Suggestion
 from gaussian_swaying.simulation.simulation import Simulation
 
-SWAY = 0.10  # largest displacement that is wanted, as a share of the longest side
-SOFTEST, STIFFEST = 3e4, 1e6  # Pa; ten times the stiffness takes three times the substeps
+SWAY = 0.10  # wanted largest displacement, as a share of the longest side
+SOFTEST, STIFFEST = 3e4, 1e6  # Pa; ten times the stiffness needs three times the substeps
 THINNEST, THICKEST = 0.003, 0.03  # of the longest side
-STRETCH = (0.75, 1.35)  # aimed at, so that a longer run stays within 0.7 and 1.4
+STRETCH = (0.75, 1.35)  # target range, so that a longer run stays between 0.7 and 1.4
 CLOSE = 1.2  # a share within this factor of the wanted one is good enough
 MOST_RUNS = 6
-SECONDS = 1.6  # of a run: the first peak of the sway, at 0.5 s, and the swing that follows it
-STOP = 4.0  # a run that moved this many times too far has told enough
-MOVED = 0.99  # quantile of the displacements that counts, so that a speck does not
-STRETCHED = 0.001  # share of the particles that may be stretched further, at either end
+SECONDS = 1.6  # length of a run: the first peak of the sway, at 0.5 s, and the swing after it
+STOP = 4.0  # a run is stopped when it has moved this many times too far
+MOVED = 0.99  # quantile of the displacements that is used, so that single specks do not count
+STRETCHED = 0.001  # share of the particles that may be stretched or compressed further
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Motion:
     """How far a scene moved in a run.
 
     Attributes:
-        share: Largest displacement (the quantile :data:`MOVED` of the particles) as a share of the longest side.
+        share: Largest displacement (the :data:`MOVED` quantile over the particles) as a share of the longest side.
         stretch_min: Smallest stretch of all but :data:`STRETCHED` of the particles.
         stretch_max: Largest stretch of all but :data:`STRETCHED` of the particles.
-        complete: False if the run was stopped because it moved much too far.
+        complete: False if the run was stopped because the scene moved much too far.
     """
 
     share: float
@@ -49,19 +49,19 @@ class Motion:
 
     @property
     def strain(self) -> float:
-        """Distance of the stretch from 1 as a share of what is allowed; above 1 it is too much."""
+        """Distance of the stretch from 1 as a share of the allowed distance; above 1 it is too large."""
         low, high = STRETCH
         return max((1 - self.stretch_min) / (1 - low), (self.stretch_max - 1) / (high - 1), 1e-6)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is calibrated.
+    """The values to calibrate.
 
     Attributes:
         E: Young's modulus [Pa].
         thickness: Thickness of the surface [m].
-        wind: Factor on the wind that was asked for, at most 1.
+        wind: Factor on the given wind, at most 1.
     """
 
     E: float
@@ -71,13 +71,13 @@ class Setting:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found.
+    """The result of the calibration.
 
     Attributes:
         setting: The values, to two digits.
         motion: How the scene moved with them.
-        runs: How many runs it took.
-        reason: In words.
+        runs: Number of runs.
+        reason: The reason, in words.
     """
 
     setting: Setting
@@ -87,7 +87,7 @@ class Calibration:
 
 
 def check_sway(sway: float) -> None:
-    """Raise ValueError unless a largest displacement, as a share of the longest side, is one that can be aimed at."""
+    """Raise ValueError unless a largest displacement, as a share of the longest side, is within range."""
     if not 0.01 <= sway <= 0.5:
         raise ValueError(f"Expected `--sway` to be a share of the longest side from 0.01 to 0.5, but got {sway:g}.")
 
@@ -95,19 +95,19 @@ def check_sway(sway: float) -> None:
 def calibrate(
     measure: Callable[[Setting], Motion], start: Setting, side: float, sway: float | None = SWAY
 ) -> Calibration:
-    """Find the setting with which a scene moves by ``sway`` and nothing is stretched too far.
+    """Find the setting for which a scene moves by ``sway`` and nothing is stretched too far.
 
-    E is changed first, then the thickness, which costs nothing, then the wind is weakened.
+    E is changed first, then the thickness, which costs no time, and finally the wind is reduced.
 
     Args:
-        measure: Runs the scene with a setting.
+        measure: Function that runs the scene with a setting.
         start: The first setting.
         side: Longest side of the object [m].
-        sway: Largest displacement wanted, as a share of the longest side. None for a sheet, which may go as far as the
-            wind takes it: E is raised until it is not stretched too far, and nothing else is changed.
+        sway: Wanted largest displacement, as a share of the longest side. None for a sheet, which may move as far as
+            the wind takes it: then E is raised until the sheet is not stretched too far, and nothing else changes.
 
     Returns:
-        The best setting of those that were run.
+        The best of the settings that were run.
 
     Raises:
         ValueError: If ``sway`` is out of range.
@@ -119,7 +119,10 @@ def calibrate(
     while True:
         motion = measure(setting)
         tried.append((setting, motion))
-        hold, good = 1.05 * motion.strain, motion.complete and motion.strain <= 1  # brings the stretch to its limit
+        hold, good = (
+            1.05 * motion.strain,
+            motion.complete and motion.strain <= 1,
+        )  # to the limit of the stretch
         if sway is not None:
             miss = motion.share / sway
             good = good and miss <= CLOSE and max(miss, hold) >= 1 / CLOSE
@@ -133,17 +136,17 @@ def calibrate(
 
 
 def adjusted(setting: Setting, hold: float, start: Setting, side: float, only_E: bool = False) -> Setting:
-    """A setting that holds ``hold`` times as much against the wind.
+    """A setting that is ``hold`` times as resistant to the wind.
 
     Args:
         setting: The last one.
         hold: Factor on E thickness / wind².
-        start: The first setting, whose thickness stays where E can do the work.
+        start: The first setting; its thickness is kept if changing E is enough.
         side: Longest side of the object [m].
-        only_E: Change E alone.
+        only_E: Change only E.
 
     Returns:
-        The new setting, its values within bounds and of two digits.
+        The new setting, with values within bounds and rounded to two digits.
     """
     hold = min(max(hold, 0.03), 30.0)
     if only_E:
@@ -156,18 +159,18 @@ def adjusted(setting: Setting, hold: float, start: Setting, side: float, only_E:
 
 
 def describe(setting: Setting, motion: Motion, sway: float | None) -> str:
-    """What a calibration came to, in words."""
+    """The result of a calibration, in words."""
     moved = f"{motion.share:.2g} of the longest side" if motion.complete else "much too far"
     words = [f"in {SECONDS:g} s of this wind 99 % of it moves by at most {moved}"]
     if setting.wind < 1:
-        words.append(f"the wind was weakened to {setting.wind:g} of what was asked for, as stiffer costs too much")
+        words.append(f"the wind was reduced to {setting.wind:g} of the given one, as a stiffer object costs too much")
     if motion.strain > 1:
         words.append(
             f"parts are stretched to between {motion.stretch_min:.2g} and {motion.stretch_max:.2g} of their length: "
-            "hold more of it, or give a smaller --sway or --wind"
+            "pin more of it, or set a smaller --sway or --wind"
         )
     elif sway is not None and motion.complete and motion.share < sway / CLOSE**2:
-        words.append("it hardly moves: more --wind moves it more" if motion.strain < 0.8 else "more would stretch it")
+        words.append("it hardly moves: raise --wind" if motion.strain < 0.8 else "more wind would stretch it")
     return "; ".join(words)
 
 
@@ -176,7 +179,7 @@ def _two_digits(value: float) -> float:
 
 
 def _response(tried: list[tuple[Setting, Motion]]) -> float:
-    """By which power the displacement falls as the hold grows: from the last two runs, 1 if there are none."""
+    """The exponent with which the displacement falls as the resistance grows, from the last two runs, else 1."""
     done = [(s.E * s.thickness / s.wind**2, m.share) for s, m in tried[-2:] if m.complete and m.share > 0]
     if len(done) < 2 or abs(math.log(done[1][0] / done[0][0])) < 0.1:
         return 1.0
@@ -185,7 +188,7 @@ def _response(tried: list[tuple[Setting, Motion]]) -> float:
 
 
 def _badness(motion: Motion, sway: float | None) -> float:
-    """Zero for a motion as wanted, more the further it is from that."""
+    """Zero for a motion as wanted, and larger the farther it is from that."""
     miss = 0.0 if sway is None else abs(math.log(max(motion.share, 1e-9) / sway))
     return miss + 3 * max(math.log(motion.strain), 0.0) + (0.0 if motion.complete else 100.0)
 
@@ -194,7 +197,7 @@ def _badness(motion: Motion, sway: float | None) -> float:
 
 
 def apply_setting(simulation: Simulation, setting: Setting, base: Setting) -> None:
-    """Give a run whose material and wind are those of ``base`` another setting, before it starts."""
+    """Change the setting of a run from ``base`` to another one, before it starts."""
     points, wind = simulation.scene.points, simulation.wind
     thicker = setting.thickness / base.thickness
     simulation.scene.points = replace(
@@ -203,7 +206,7 @@ def apply_setting(simulation: Simulation, setting: Setting, base: Setting) -> No
         volume=points.volume * thicker,
         youngs_modulus=points.youngs_modulus * (setting.E / base.E),
     )
-    assert isinstance(wind, WindField)  # that of the configuration that the preview writes
+    assert isinstance(wind, WindField)  # as in configurations written by the preview
     wind.flows = wind.flows * (setting.wind / base.wind)
 
 
@@ -215,17 +218,17 @@ def measure_motion(
     sway: float | None = None,
     seconds: float = SECONDS,
 ) -> Motion:
-    """Run a scene from rest, without pictures, with another setting than its own; the scene stays as it is.
+    """Run a scene from rest with another setting, without pictures; the scene itself does not change.
 
     Args:
-        simulation: The run, whose material and wind are those of ``base``.
+        simulation: The run, with material and wind of ``base``.
         setting: The setting to try.
         base: The setting of the simulation.
         sway: The run is stopped as soon as it moved :data:`STOP` times this share of the longest side; None for never.
-        seconds: How much time to simulate.
+        seconds: Time to simulate [s].
 
     Returns:
-        How far it moved; not complete if it was stopped or diverged.
+        The motion; not complete if the run was stopped or diverged.
     """
     scene, wind = simulation.scene, simulation.wind
     points, flows = scene.points, wind.flows
@@ -233,7 +236,7 @@ def measure_motion(
     side = scene.size * scene.frame.metres_per_unit
     limit = math.inf if sway is None else STOP * sway
     motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
-    torch.set_num_threads(1)  # a few hundred particles: more threads would only wait for each other
+    torch.set_num_threads(1)  # for a few hundred particles more threads would only wait for each other
     try:
         state = simulation.start()
         for _ in range(max(1, round(seconds / simulation.frame_dt))):
@@ -256,8 +259,12 @@ def measure_motion(
     return motion
 
 
+def _quantile(values: Tensor, share: float) -> float:
+    return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
+
+
 def calibrated_suggestion(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:
-    """The suggestion with the stiffness, thickness and wind that short runs of its draft ask for; the draft too."""
+    """The suggestion with stiffness, thickness and wind from short runs of its draft; the draft is changed too."""
     if found.pin is None or not any(found.flow):
         return found
     start, wanted = Setting(found.youngs_modulus, found.thickness), None if found.sheet else sway

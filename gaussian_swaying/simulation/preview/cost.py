@@ -1,4 +1,4 @@
-"""What a run will cost: its substeps, and their time on this machine from a few that are tried."""
+"""The cost of a run: its number of substeps, and their time on this machine, measured on a few."""
 
 from __future__ import annotations
 
@@ -19,24 +19,25 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a run, from its state at rest.
+    """Cost of a run, estimated from its state at rest.
 
-    A material that stiffens as it deforms, faster wind and a body that moves fast in ``updated`` take more substeps.
+    More substeps are needed if the material stiffens as it deforms, if the wind is faster, or if a body moves fast in
+    ``updated``.
 
     Attributes:
-        device: Where it was measured.
+        device: The device on which it was measured.
         particles: Material points.
         grid: Grid nodes along each axis.
         frames: Frames of the run.
         wave_speed: Fastest elastic wave [m/s].
         stable_substep: Longest stable substep [s].
-        substep: The one that the run takes at rest [s].
-        substeps: Substeps in a frame.
-        substep_seconds: Time that one of them takes [s].
-        simulation_seconds: Time that the frames take without their pictures [s].
-        picture_seconds: Time that the pictures of a frame take, one from each camera, with their files and their part
-            of the video [s]; None if there are none.
-        startup_seconds: Time to read the splat and prepare the scene [s]; 0 if it is not known.
+        substep: Substep of the run at rest [s].
+        substeps: Substeps per frame.
+        substep_seconds: Time for one substep [s].
+        simulation_seconds: Time for all frames without pictures [s].
+        picture_seconds: Time for the pictures of a frame, one from each camera, including files and video [s]; None
+            without pictures.
+        startup_seconds: Time to read the splat and prepare the scene [s]; 0 if unknown.
     """
 
     device: str
@@ -66,16 +67,17 @@ def estimate_cost(
 
     Args:
         simulation: The run.
-        frames: How many frames it is to have.
-        tries: Substeps to measure, after one that is not counted; on a GPU it is a frame.
+        frames: Number of frames of the run.
+        tries: Number of substeps to measure, after one that is not counted; on a GPU a frame is measured.
         picture: Whether the run draws pictures.
-        startup_seconds: How long it takes to prepare the run [s], if it is known.
+        startup_seconds: Time to prepare the run [s], if known.
 
     Returns:
         The estimate.
 
     Raises:
-        ValueError: If the run cannot start: a pin holds nothing, the grid is too large, a fixed substep is too long.
+        ValueError: If the run cannot start, because a pin holds nothing, the grid is too large or a fixed substep is
+            too long.
     """
     solver = simulation.solver
     state = simulation.start()
@@ -90,10 +92,10 @@ def estimate_cost(
         solver.rollout(state, dt, 1, forces)
         seconds = min(_seconds(simulation, lambda: solver.rollout(state, dt, 1, forces)) for _ in range(tries))
     drawn = None
-    if picture:  # the further cameras are taken to be as large as the first
-        simulation.painter.render(state, 0)
-        work = min(_seconds(simulation, lambda: _encode(simulation.painter.render(state, 0).color)) for _ in range(2))
-        drawn = work * (1 + len(simulation.painter.cameras))
+    if picture:  # assumes that all cameras have the size of the first
+        simulation.render(state, 0)
+        work = min(_seconds(simulation, lambda: _encode(simulation.render(state, 0).color)) for _ in range(2))
+        drawn = work * (1 + len(simulation.cameras))
     return Cost(
         device=describe_device(simulation.device),
         particles=solver.points.count,
@@ -111,7 +113,7 @@ def estimate_cost(
 
 
 def _drag_substeps(simulation: Simulation, state: MPMState, frames: int) -> int:
-    """Substeps of a frame that explicit drag asks for at rest, on average over the wind of the run."""
+    """Substeps per frame needed for explicit drag at rest, on average over the wind of the run."""
     if simulation.idle or simulation.aero.drag_step == "semi_implicit":
         return 1
     winds = simulation.wind_force.samples(state, simulation.frame_dt, frames)
@@ -124,7 +126,7 @@ def _drag_substeps(simulation: Simulation, state: MPMState, frames: int) -> int:
 
 
 def _encode(image: Tensor) -> None:
-    """What writing a picture and its part of the video takes, about: it is compressed twice."""
+    """Work similar to writing a picture and its part of the video: the picture is compressed twice."""
     import imageio.v3 as iio
 
     pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
@@ -133,7 +135,7 @@ def _encode(image: Tensor) -> None:
 
 
 def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
-    """Time that some work takes [s] on a machine that does nothing else, to its end on a GPU too."""
+    """Time for some work [s] on an otherwise idle machine; on a GPU until it is finished."""
     begin = Stopwatch()
     work()
     if simulation.device.type == "cuda":
@@ -143,17 +145,17 @@ def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
 
 
 class Stopwatch:
-    """Time since it was made [s]."""
+    """Time since it was created [s]."""
 
     def __init__(self) -> None:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
     @property
     def wall(self) -> float:
-        """By the clock on the wall."""
+        """Wall-clock time."""
         return time.perf_counter() - self._wall
 
     @property
     def quiet(self) -> float:
-        """By the clock on the wall, or that of the processor if it is less: other programs had the rest of it."""
+        """The smaller of wall-clock and processor time, to exclude the time used by other programs."""
         return min(self.wall, time.process_time() - self._cpu)

@@ -1,4 +1,4 @@
-"""What to check where a guess is weak, and the commands that settle it one way or the other."""
+"""Warnings about weak guesses, with the commands for the alternatives."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from gaussian_swaying.simulation.preview.suggest import Suggestion
 
 
 def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, **changes: str | list[str]) -> str:
-    """The command line of the preview that gives these options, and some in place of theirs.
+    """The command line of the preview with these options, some of them changed.
 
     Args:
-        options: What was given.
-        defaults: What is not written.
-        changes: Options to give instead, by their names in ``options``.
+        options: The given options.
+        defaults: Default values, which are left out.
+        changes: Options to change, by their names in ``options``.
     """
     words = [*program.words("preview"), str(options.scene)]
     for name, default in vars(defaults).items():
@@ -32,7 +32,7 @@ def preview_command(options: argparse.Namespace, defaults: argparse.Namespace, *
 
 
 def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Namespace) -> list[str]:
-    """Warnings about weak guesses, each with the command that takes the guess and the one that takes the next best.
+    """Warnings about weak guesses, each with the command for the guess and the one for the next best.
 
     Args:
         found: The guesses.
@@ -40,22 +40,22 @@ def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Na
         defaults: Their defaults.
 
     Returns:
-        Lines of text; none if there is nothing to doubt.
+        Lines of text; none if all guesses are good.
     """
     lines: list[str] = []
     if found.up.confidence == "low":
-        lines.append("warning: the up axis is a weak guess; look at the picture, and give it:")
+        lines.append("warning: the up axis is a weak guess; check the picture, and set it:")
         for name, words in zip(found.up.options, ("as guessed", "the next best"), strict=False):
             lines.append(f"  {preview_command(options, defaults, up=name.split())}   # {words}")
     if found.hold.confidence == "low":
         lines.append(
-            f"warning: that it is held at the {found.hold.end} is a weak guess; look at the picture, and give it:"
+            f"warning: that it is held at the {found.hold.end} is a weak guess; check the picture, and set it:"
         )
         for name, words in zip(found.hold.options, ("as guessed", "the next best"), strict=False):
             lines.append(f"  {preview_command(options, defaults, hold=name)}   # {words}")
     if found.region.loose:
         lines.append(
-            f"warning: {found.region.loose:,} specks inside the region hang on nothing and will fall; give a smaller "
+            f"warning: {found.region.loose:,} specks inside the region are loose and will fall; set a smaller "
             "--region, or raise scene.opacity_threshold"
         )
     return lines

@@ -1,4 +1,4 @@
-"""What a camera should show: the object with those of its parts that do not move."""
+"""What a camera should show: the whole object, including parts that do not move."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from torch import Tensor
 
 from gaussian_swaying.simulation.preview.shape import connected_parts, quantile
 
-RADIUS = 1.9  # distance of a camera in multiples of the longest side of what it shows
+RADIUS = 1.9  # distance of a camera in multiples of the longest side of the shown box
 SOLID = 0.1  # opacity
 
 
 def nearby(points: Tensor, simulated: Tensor) -> Tensor:
-    """Which points (N, 3) lie at most one longest side beyond the box of those that move, shape (N,)."""
+    """Which points (N, 3) are at most one longest side outside the box of those that move, shape (N,)."""
     low, high = points[simulated].amin(0), points[simulated].amax(0)
     side = (high - low).amax()
     return ((points >= low - side) & (points <= high + side)).all(-1)
@@ -23,14 +23,14 @@ def nearby(points: Tensor, simulated: Tensor) -> Tensor:
 def whole_box(
     points: Tensor, opacity: Tensor, simulated: Tensor, outside: Tensor, cell: float
 ) -> tuple[list[float], list[float]]:
-    """Box of what moves and of what is connected with it, at most one longest side beyond it on each side.
+    """Box of the moving part and everything connected with it, at most one longest side larger on each side.
 
     Args:
         points: Centres [scene units], shape (N, 3).
         opacity: Opacities, shape (N,).
-        simulated: What moves, shape (N,).
-        outside: What is no part of the object, such as a floor, shape (N,).
-        cell: What is in the same or in touching cells of this size is connected [scene units].
+        simulated: The moving part, shape (N,).
+        outside: Gaussians that are not part of the object, such as a floor, shape (N,).
+        cell: Points in the same or in touching cells of this size are connected [scene units].
 
     Returns:
         Lower and upper corner [scene units].
@@ -52,14 +52,14 @@ def whole_box(
 def orbit_frame(
     whole: tuple[Sequence[float], Sequence[float]], moving: tuple[Sequence[float], Sequence[float]]
 ) -> tuple[tuple[float, ...], float]:
-    """Where a camera that circles what moves has to look, and from how far, to show all of an object.
+    """Target and distance of an orbiting camera that shows all of an object.
 
     Args:
-        whole: Corners of the box of all of it [scene units].
-        moving: Corners of the box of what moves [scene units].
+        whole: Corners of the box of the whole object [scene units].
+        moving: Corners of the box of the moving part [scene units].
 
     Returns:
-        ``target_offset`` and ``radius`` of an orbiting camera, in multiples of the longest side of what moves.
+        ``target_offset`` and ``radius`` of an orbiting camera, in multiples of the longest side of the moving part.
     """
     size = max(b - a for a, b in zip(*moving, strict=True))
     share = max(b - a for a, b in zip(*whole, strict=True)) / size

@@ -22,7 +22,7 @@ from gaussian_swaying.simulation.preview.shape import (
     width,
 )
 
-PIN_DEPTH = 0.06  # depth of the pinned end, as a share of the object's length towards it
+PIN_DEPTH = 0.06  # depth of the pinned end, as a share of the object's length in that direction
 ENDS = {"bottom": "lower", "top": "upper"}
 
 
@@ -34,9 +34,9 @@ class HoldGuess:
         end: ``top``, ``bottom``, ``side`` or ``none``.
         direction: Unit vector in scene axes from the object to that end.
         confidence: ``high``, ``medium`` or ``low``, by the lead over the next end; ``given`` if the end was.
-        reason: In words.
+        reason: The reason, in words.
         scores: Points of each end; empty if it was given.
-        options: What ``--hold`` takes for this end and for the next best; empty if it was given.
+        options: The values of ``--hold`` for this end and the next best; empty if it was given.
     """
 
     end: str
@@ -56,27 +56,27 @@ def guess_hold(
     eyes: Tensor | None = None,
     wall: Sequence[float] | None = None,
 ) -> HoldGuess:
-    """The end at which the object is held, from what speaks for its bottom, its top or a side.
+    """The end at which the object is held, from points for its bottom, its top or a side.
 
-    Each end collects points, and the most win:
+    Each end gets points, and the highest sum wins:
 
-    - what was left out of the region touches the object there (2);
-    - the origin lies at that end (1), or at a side of an upright sheet, as a flag's at its pole (2);
+    - Gaussians outside the region touch the object there (2);
+    - the origin is at that end (1), or at a side of an upright sheet, as for a flag at its pole (2);
     - the object stands in balance on a wide base, or on a stalk (1);
     - it hangs in balance from something as thin as a cord (2.5);
     - photos were taken from below its lower end: it hangs (1); from above only: it stands (0.5);
     - most things stand (0.5), an upright sheet hangs (1), or flies from a pole somewhere else (0.5).
 
-    A lead of 2 is called high confidence, of 1 medium, less low.
+    A lead of 2 gives high confidence, a lead of 1 medium, and less low.
 
     Args:
         points: Centres of the simulated Gaussians [scene units], shape (N, 3).
         weight: Their visible area, shape (N,).
         up: Up direction, a unit vector.
-        cell: Grid spacing [scene units]: what is within two cells touches.
+        cell: Grid spacing [scene units]: parts within two cells touch.
         left_out: Centres of solid Gaussians that are not simulated [scene units], shape (M, 3).
-        eyes: Where photos were taken from [scene units], shape (C, 3).
-        wall: Unit vector from the object to a wall on which it hangs; then nothing else counts.
+        eyes: Positions of the photos' cameras [scene units], shape (C, 3).
+        wall: Unit vector from the object to a wall on which it hangs; it overrides everything else.
 
     Returns:
         The guess.
@@ -129,9 +129,9 @@ def guess_hold(
 
 
 def balanced_base(points: Tensor, weight: Tensor, up: Tensor) -> tuple[float, float] | None:
-    """Widths of the base on which an object would stand in balance, and of the object [scene units]; None without one.
+    """Widths of the base on which an object would balance, and of the object [scene units]; None without a base.
 
-    The base is what lies within 3 % of the length from the lower end. It has to be at least 0.4 times as wide as the
+    The base is the part within 3 % of the length from the lower end. It must be at least 0.4 times as wide as the
     object, with the centre of the visible area above it.
 
     Args:
@@ -187,7 +187,7 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
         return None
     which = ((high - height) / length * slices).long().clamp(max=slices - 1)
     parts = [points[which == k] for k in range(slices)]
-    across = plane_axes(up)  # of a plate one of the two widths is next to nothing
+    across = plane_axes(up)  # one of the two widths of a plate is nearly zero
     wide = [
         max(quantile(part @ a, 0.97) - quantile(part @ a, 0.03) for a in across) if len(part) else 0.0 for part in parts
     ]
@@ -201,7 +201,7 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
         return None
     first, last = (parts[k].mean(0) for k in (start, stop - 1))
     away = (first - last) - ((first - last) @ up) * up
-    if float(away.norm()) > 0.1 * (stop - start) / slices * length:  # what leans is no cord
+    if float(away.norm()) > 0.1 * (stop - start) / slices * length:  # a slanted part is not a cord
         return None
     if not _above(points, weight, parts[start], up, 0.05 * length):
         return None
@@ -209,7 +209,7 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
 
 
 def _above(points: Tensor, weight: Tensor, end: Tensor, up: Tensor, margin: float) -> bool:
-    """Whether the centre of the visible area lies on the same vertical as the hull of one end, within a margin."""
+    """Whether the centre of the visible area is above or below the hull of one end, within a margin."""
     centre = (points * weight[:, None]).sum(0) / weight.sum().clamp(min=1e-300)
     one, other = plane_axes(up)
     for k in range(8):
@@ -221,7 +221,7 @@ def _above(points: Tensor, weight: Tensor, end: Tensor, up: Tensor, margin: floa
 
 
 def _pole_side(points: Tensor, up: Tensor, normal: Sequence[float]) -> tuple[tuple[float, ...], bool]:
-    """Direction of the upright side of a sheet at which the origin lies; if at none, of one of them, and False."""
+    """Direction of the upright side of a sheet that contains the origin; if none does, one of the sides, and False."""
     across = torch.linalg.cross(up, torch.tensor(normal, dtype=torch.float64))
     across = torch.tensor(snapped(across), dtype=torch.float64)
     along = points @ across
@@ -233,16 +233,16 @@ def _pole_side(points: Tensor, up: Tensor, normal: Sequence[float]) -> tuple[tup
 
 
 def _option(end: str, sideways: Sequence[float]) -> str:
-    """What ``--hold`` takes for an end."""
+    """The value of ``--hold`` for an end."""
     if end != "side" or not sideways:
         return end
     return max(DIRECTIONS, key=lambda name: sum(a * b for a, b in zip(DIRECTIONS[name], sideways, strict=True)))
 
 
 def _touched(points: Tensor, left_out: Tensor | None, up: Tensor, cell: float) -> tuple[bool, bool]:
-    """Whether what was left out lies right below the lower end, and right above the upper one.
+    """Whether excluded Gaussians are right below the lower end, and right above the upper one.
 
-    At least 30 % of the columns of cells that the end fills have something in them, or beside them, within two cells.
+    That is so if at least 30 % of the columns of cells at that end have something in or beside them within two cells.
     """
     if left_out is None or len(left_out) == 0:
         return False, False
@@ -266,7 +266,7 @@ def _touched(points: Tensor, left_out: Tensor | None, up: Tensor, cell: float) -
 
 
 def given_hold(end: str, up: Sequence[float]) -> HoldGuess:
-    """An end that was given: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` that points to it."""
+    """A given end: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` that points to it."""
     check_choice("--hold", end, ("top", "bottom", "none", *DIRECTIONS))
     if end in DIRECTIONS:
         return HoldGuess("side", DIRECTIONS[end], "given", "given")
@@ -276,8 +276,8 @@ def given_hold(end: str, up: Sequence[float]) -> HoldGuess:
 def end_region(points: Tensor, direction: Sequence[float], cell: float) -> Region:
     """The end of an object as a region: a half-open box if the direction is an axis, else a cylinder.
 
-    Its depth is 6 % of the length towards it, at least one and a half cells, counted from where 0.5 %
-    of the points lie beyond.
+    Its depth is 6 % of the length in that direction, at least one and a half cells. It is measured from the place
+    beyond which there are 0.5 % of the points.
 
     Args:
         points: Centres of the simulated Gaussians [scene units], shape (N, 3).
@@ -290,7 +290,7 @@ def end_region(points: Tensor, direction: Sequence[float], cell: float) -> Regio
     axis = torch.tensor(direction, dtype=torch.float64)
     along = points.double() @ axis
     low, high = float(along.amin()), float(along.amax())
-    solid_end = quantile(along, 0.995)  # a few stragglers beyond do not move it
+    solid_end = quantile(along, 0.995)  # so that a few stragglers do not matter
     depth = max(PIN_DEPTH * (high - low), 1.5 * cell)
     start = max(solid_end - depth, low)
     main = int(axis.abs().argmax())

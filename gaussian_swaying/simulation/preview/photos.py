@@ -1,4 +1,4 @@
-"""What the cameras of a capture tell about its splat: which way is up, what the photos show, what lies behind it."""
+"""What the cameras of photos show about a splat: the up direction, the object, and its background."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ _MOST_PLANES = 3  # backdrops to look for
 
 @dataclass(frozen=True)
 class CapturedFrom:
-    """Where photos were taken from.
+    """The cameras of photos, and what follows from them.
 
     Attributes:
         path: The capture.
         cameras: Its cameras.
-        eyes: Where they stood [scene units], float64, shape (C, 3).
+        eyes: Their positions [scene units], float64, shape (C, 3).
         up: Unit vector that points up.
         confidence: ``high``, ``medium`` or ``low``.
-        reason: Why, in words.
-        focus: The point nearest to all optical axes [scene units], float64, shape (3,); None if they share none.
-        reach: How far to a side of it the median camera sees [scene units].
+        reason: The reason, in words.
+        focus: The point nearest to all optical axes [scene units], float64, shape (3,); None if there is no common
+            point.
+        reach: How far to the side of it the median camera sees [scene units].
     """
 
     path: str
@@ -48,18 +49,18 @@ class CapturedFrom:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """What ``--up`` takes for this direction and for the opposite one."""
+        """The values of ``--up`` for this direction and the opposite one."""
         return tuple(" ".join(f"{sign * c + 0.0:.4g}" for c in self.up) for sign in (1.0, -1.0))
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """A plane behind or below what the photos show: a wall, a floor, the top of a table.
+    """A plane behind or below the object in the photos: a wall, a floor or a table top.
 
     Attributes:
-        mask: Which points lie in it or behind it, shape (N,).
+        mask: Which points are in it or behind it, shape (N,).
         normal: Unit normal towards the cameras.
-        behind: Region of its front face and all behind it [scene units].
+        behind: Region of its front face and everything behind it [scene units].
     """
 
     mask: Tensor
@@ -69,13 +70,13 @@ class Backdrop:
 
 @dataclass(frozen=True)
 class ShownObject:
-    """What photos show.
+    """The object that photos show.
 
     Attributes:
-        mask: Gaussians that lie in at least 60 % of the photos, and in or behind no backdrop, shape (N,).
-        backdrops: Walls, floors and tables that were left out, their masks of all N.
+        mask: Gaussians visible in at least 60 % of the photos that are not in or behind a backdrop, shape (N,).
+        backdrops: Walls, floors and tables that were left out, with masks over all N Gaussians.
         focus: The point that the cameras look at [scene units], shape (3,).
-        reach: How far to a side of it they see [scene units].
+        reach: How far to the side of it they see [scene units].
     """
 
     mask: Tensor
@@ -84,16 +85,16 @@ class ShownObject:
     reach: float
 
     def nearness(self, points: Tensor) -> Tensor:
-        """How much each point (N, 3) counts by its distance from the focus: exp(-(2 d / reach)²), shape (N,)."""
+        """Weight of each point (N, 3) by its distance d from the focus: exp(-(2 d / reach)²), shape (N,)."""
         return (-((points.double() - self.focus).norm(dim=-1) / (0.5 * self.reach)).square()).exp()
 
     def floor(self, up: Sequence[float]) -> Tensor:
-        """Points of the backdrops within 25 degrees of level, shape (N,)."""
+        """Points of backdrops that are level within 25 degrees, shape (N,)."""
         level = [b.mask for b in self.backdrops if _dot(b.normal, up) > math.cos(math.radians(25))]
         return torch.stack([torch.zeros_like(self.mask), *level]).any(0)
 
     def wall(self, up: Sequence[float]) -> tuple[float, ...] | None:
-        """Direction to the largest wall, a backdrop within 25 degrees of upright; None if there is a floor or none."""
+        """Direction to the largest wall, a backdrop upright within 25 degrees; None without a wall or with a floor."""
         walls = [b for b in self.backdrops if abs(_dot(b.normal, up)) < math.sin(math.radians(25))]
         if not walls or bool(self.floor(up).any()):
             return None
@@ -105,13 +106,13 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 
 
 def captured_from(path: str | Path) -> CapturedFrom:
-    """Read the cameras of a capture; its photos need not be there.
+    """Read the cameras of a capture; its photos need not exist.
 
     Args:
-        path: A transforms.json, a COLMAP model, or a folder that holds one.
+        path: A transforms.json, a COLMAP model, or a folder that contains one.
 
     Returns:
-        Where they stood, and what follows from it.
+        The cameras, and what follows from them.
 
     Raises:
         ValueError: If there are no cameras, or a file is bad.
@@ -128,7 +129,7 @@ def photo_azimuth(view: CapturedFrom, center: Tensor, rotation: Tensor) -> float
     """Azimuth of the side from which photos were taken [degrees]; None if they were taken from all around.
 
     Args:
-        view: Where they were taken from.
+        view: The cameras of the photos.
         center: Centre of the object [scene units], shape (3,).
         rotation: Scene axes to axes with z up, float64, shape (3, 3).
     """
@@ -138,11 +139,11 @@ def photo_azimuth(view: CapturedFrom, center: Tensor, rotation: Tensor) -> float
 
 
 def cameras_up(cameras: Sequence[Camera]) -> tuple[tuple[float, ...], str, str]:
-    """Which way is up, from how photos are held: level, so that the rows of their pixels run horizontally.
+    """The up direction, assuming that photos are held level, so that their rows of pixels are horizontal.
 
-    It is the direction across the rows of all photos, on the side to which most photos have their upper edge. Where all
-    rows point the same way, or photos were not held level, the mean of their upward directions is taken. A direction
-    within 8 degrees of an axis is taken as the axis.
+    It is the direction perpendicular to the rows of all photos, on the side of the upper edge of most photos. If all
+    rows are parallel, or photos were not held level, it is the mean of their upward directions. A direction within 8
+    degrees of an axis is set to the axis.
 
     Args:
         cameras: At least one camera.
@@ -174,7 +175,7 @@ def cameras_up(cameras: Sequence[Camera]) -> tuple[tuple[float, ...], str, str]:
 
 
 def seen_share(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """Share of the pictures in which each point (N, 3) lies, were nothing before it; shape (N,)."""
+    """Share of the pictures that contain each point (N, 3), ignoring occlusion; shape (N,)."""
     count = torch.zeros(len(points))
     for camera in cameras:
         view, intrinsics = camera.world_to_camera.cpu().float(), camera.intrinsics.cpu().float()
@@ -187,22 +188,22 @@ def seen_share(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def looked_at(points: Tensor, view: CapturedFrom) -> Tensor:
-    """Points that lie in at least 60 % of the photos and within reach of the point that they look at, shape (N,).
+    """Points that are in at least 60 % of the photos and within reach of their common point, shape (N,).
 
     Raises:
-        ValueError: If the cameras look at no common point, or at hardly any Gaussian.
+        ValueError: If the cameras do not look at a common point, or at hardly any Gaussian.
     """
     if view.focus is None:
         raise ValueError(
-            f"The cameras of {view.path} look at no common point, so what they show is not known: give `--region`."
+            f"The cameras of {view.path} do not look at a common point, so the object is not known: set `--region`."
         )
     near = (points.double() - view.focus).norm(dim=-1) < 1.5 * view.reach
     mask = near & (seen_share(points, view.cameras) >= SEEN)
     if int(mask.sum()) < FEWEST:
         focus = [round(float(c), 3) for c in view.focus]
         raise ValueError(
-            f"The cameras of `--capture` look at {focus}, where the splat has {int(mask.sum())} Gaussians: give the "
-            "capture that it was trained from, or `--region`."
+            f"The cameras of `--capture` look at {focus}, where the splat has {int(mask.sum())} Gaussians: use the "
+            "capture that it was trained on, or set `--region`."
         )
     return mask
 
@@ -210,17 +211,17 @@ def looked_at(points: Tensor, view: CapturedFrom) -> Tensor:
 def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: float) -> list[Backdrop]:
     """Walls, floors and tables behind what photos show.
 
-    A backdrop is a plane, as thick as 6 % of the longest side, that holds at least 15 % of the visible area in front of
-    those found before, is at least 0.8 times as wide as photos reach to a side, and 25 degrees from the others. Nine of
-    ten cameras are in front of it, and there something at least 1.2 times narrower than the plane, both ways. What lies
-    as close before it as three such halves, and below nothing that stands out farther, belongs to it too: the roughness
-    of a wall.
+    A backdrop is a plane with a thickness of 6 % of the longest side. It contains at least 15 % of the visible area in
+    front of the backdrops found before, is at least 0.8 times as wide as photos reach to a side, and is at least 25
+    degrees from the others. Nine of ten cameras are in front of it, and so is something that is at least 1.2 times
+    narrower than the plane in both directions. Points up to three half thicknesses in front of it also belong to it,
+    unless something stands out farther there: this is the roughness of a wall.
 
     Args:
-        points: Centres of what photos show [scene units], shape (N, 3).
+        points: Centres of the Gaussians in the photos [scene units], shape (N, 3).
         weight: Their visible area, shape (N,).
-        eyes: Where the cameras stood [scene units], shape (C, 3).
-        reach: How far to a side photos reach [scene units].
+        eyes: Positions of the cameras [scene units], shape (C, 3).
+        reach: How far photos reach to the side [scene units].
         cell: Coordinates of the regions are rounded to a hundredth of it [scene units].
 
     Returns:
@@ -244,7 +245,7 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
         layer, behind, front = left & (height.abs() <= half), height < -half, left & (height > half)
         tried |= layer
         if any(float(torch.tensor(other.normal) @ normal.float()) > math.cos(math.radians(25)) for other in found):
-            continue  # what is fixed to a wall is not one more wall
+            continue  # something fixed to a wall is not another wall
         ahead = float((eyes @ normal - offset > half).double().mean())
         if ahead < 0.9 or float(weight[layer].sum()) < 0.15 * float(weight[left].sum()) or int(front.sum()) < FEWEST:
             continue
@@ -271,7 +272,7 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
 
 
 def _below(columns: Tensor, high: Tensor) -> Tensor:
-    """Which points lie in or beside a column that holds at least 3 of the high ones; columns (N, 2), shape (N,)."""
+    """Which points are in or beside a column with at least 3 of the high ones; columns (N, 2), shape (N,)."""
     index = columns.floor().long()
     key = index[:, 0] * 2**31 + index[:, 1]
     full, count = key[high].unique(return_counts=True)
@@ -281,16 +282,16 @@ def _below(columns: Tensor, high: Tensor) -> Tensor:
 
 
 def shown_object(points: Tensor, opacity: Tensor, weight: Tensor, view: CapturedFrom) -> ShownObject:
-    """What the photos of a capture show, without what lies behind it.
+    """The object that the photos of a capture show, without its background.
 
     Args:
         points: Centres [scene units], shape (N, 3).
         opacity: Opacities, shape (N,).
         weight: Visible area, shape (N,).
-        view: Where the photos were taken from.
+        view: The cameras of the photos.
 
     Raises:
-        ValueError: If the cameras look at no common point, or at hardly any Gaussian.
+        ValueError: If the cameras do not look at a common point, or at hardly any Gaussian.
     """
     mask = looked_at(points, view)
     assert view.focus is not None
@@ -309,7 +310,7 @@ def _wide(values: Tensor) -> float:
 
 
 def _largest_plane(points: Tensor, weight: Tensor, mask: Tensor, half: float) -> tuple[Tensor, float] | None:
-    """Normal and offset of the plane within ``half`` of which the most weight lies; None for too few points."""
+    """Normal and offset of the plane with the most weight within ``half`` of it; None for too few points."""
     index = mask.nonzero()[:, 0]
     if len(index) < FEWEST:
         return None

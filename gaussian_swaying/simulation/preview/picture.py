@@ -1,4 +1,4 @@
-"""A picture of what a configuration does to a splat: simulated part, pins, wind and normals drawn over it."""
+"""A picture of a splat with the effect of a configuration: simulated part, pins, wind and normals."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ UP = (40, 40, 40)
 
 @dataclass(frozen=True)
 class Parts:
-    """Which Gaussians are what, shape (N,) each.
+    """The roles of Gaussians, masks of shape (N,).
 
     Attributes:
-        simulated: Those that the region and the opacity choose.
+        simulated: Those selected by region and opacity.
         carried: Faint ones that follow them.
         pinned: Simulated ones that a condition holds.
         pushed: Simulated ones that an impulse pushes.
-        names: What each condition is and how many it holds, in words.
+        names: The kind of each condition and the number of its particles, in words.
     """
 
     simulated: Tensor
@@ -91,7 +91,7 @@ def box_edges(low: Iterable[float], high: Iterable[float]) -> Tensor:
 
 
 def region_box(region: Region, low: Tensor, high: Tensor) -> tuple[list[float], list[float]] | None:
-    """Corners of a box region with its open sides closed at those of the scene; None if it is no box."""
+    """Corners of a box region with its open sides closed at those of the scene; None if it is not a box."""
     if not isinstance(region, Box):
         return None
     first = [max(a, float(b)) for a, b in zip(region.min, low, strict=True)]
@@ -109,10 +109,10 @@ def preview_picture(
     """The scene at rest from the side of its camera and from 90 degrees to the left, with a legend.
 
     Args:
-        simulation: A run that need not have started.
+        simulation: A run, which need not have started.
         height: Height of each view [pixels].
         normals: About how many normals to draw in each view.
-        whole: Corners of the box to show [scene units]; that of the object with what does not move of it if None.
+        whole: Corners of the box to show [scene units]; that of the whole object if None.
 
     Returns:
         8-bit RGB, shape (H, W, 3).
@@ -146,7 +146,7 @@ def preview_picture(
 
 
 def _whole(simulation: Simulation, parts: Parts) -> tuple[list[float], list[float]]:
-    """Corners of the box of the object with what does not move of it [scene units]."""
+    """Corners of the box of the whole object, including parts that do not move [scene units]."""
     scene = simulation.scene
     means, opacity = scene.model.means.detach().cpu(), scene.model.opacity().detach().cpu()
     solid = nearby(means, parts.simulated) & (opacity >= SOLID)
@@ -159,7 +159,7 @@ def _whole(simulation: Simulation, parts: Parts) -> tuple[list[float], list[floa
 
 
 def _view(simulation: Simulation, parts: Parts, camera: Camera, normals: int, title: str) -> Any:
-    """One view with what is drawn over it, as a PIL image."""
+    """One view with annotations, as a PIL image."""
     from PIL import Image, ImageDraw, ImageFont
 
     scene = simulation.scene
@@ -220,7 +220,7 @@ def _draw_arrow(
     draw.line([tuple(a.tolist()), tuple(b.tolist())], fill=colour, width=width)
     way = b - a
     length = float(way.norm())
-    if length < 2:  # towards the eye or away from it
+    if length < 2:  # towards or away from the eye
         x, y = b.tolist()
         draw.ellipse([x - 3, y - 3, x + 3, y + 3], outline=colour, width=2)
         return
@@ -232,7 +232,7 @@ def _draw_arrow(
 
 
 def _draw_normals(draw: ImageDraw, scene: Any, parts: Parts, camera: Camera, count: int) -> None:
-    """Normals of an even sample of simulated patches, turned to the eye."""
+    """Normals of an even sample of simulated patches, flipped to the eye."""
     index = parts.simulated.nonzero()[:, 0]
     # the largest visible patch of each cell of a coarse lattice over the picture, so that they are spread
     means = scene.model.means.detach().cpu()[index].double()
@@ -290,7 +290,7 @@ def _draw_wind(draw: ImageDraw, simulation: Simulation, camera: Camera) -> None:
 
 
 def mean_flow(simulation: Simulation) -> Tensor:
-    """Flow without its modulations [m/s], z up, shape (3,), float64; the strongest entry of a schedule."""
+    """Flow without modulations [m/s], z up, shape (3,), float64; for a schedule its strongest entry."""
     flows = simulation.flows().detach().cpu().double().reshape(-1, 3)
     return flows[int(flows.norm(dim=-1).argmax())]
 
@@ -315,13 +315,13 @@ def _draw_up(draw: ImageDraw, font: Any, base: Tensor, up: Tensor, camera: Camer
 def _legend(
     draw: ImageDraw, font: FreeTypeFont | ImageFont, parts: Parts, simulation: Simulation, top: int, width: int
 ) -> None:
-    """What the colours mean, below the views."""
+    """The meaning of the colours, below the views."""
     flow = mean_flow(simulation).tolist()
     entries = [
         (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
         (PINNED, f"held: {int(parts.pinned.sum()):,} Gaussians"),
         (WIND, f"wind {[round(v, 2) for v in flow]} m/s (z up), before gusts"),
-        (NORMAL, "normals, turned to the eye"),
+        (NORMAL, "normals, flipped to the eye"),
         ((190, 190, 190), f"not simulated: {int((~(parts.simulated | parts.carried)).sum()):,} Gaussians, greyed"),
         ((120, 120, 120), f"faint, follow their neighbours: {int(parts.carried.sum()):,} Gaussians"),
     ]

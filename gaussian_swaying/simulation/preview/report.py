@@ -1,4 +1,4 @@
-"""What the preview finds, as text for people."""
+"""The results of the preview as text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
     """Bounds, opacities and shapes of the Gaussians."""
     corner, own = data["bounds"], data["gaussians"]
     below = ", ".join(f"{share:.0%} below {t}" for t, share in own["opacity_below"].items())
-    normals = "with normals" if own["normals"] else "without normals (the smallest axes are taken)"
+    normals = "with normals" if own["normals"] else "without normals (the smallest axes are used)"
     return [
         f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
         f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
@@ -48,7 +48,7 @@ def suggestion_lines(found: Suggestion) -> list[str]:
         lines.append(f"  pin           {_short(region_dict(found.pin))}")
     lines += [
         f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
-        f"{found.metres_per_unit:.4g} m, as the longest side is taken as {found.longest_side:g} m",
+        f"{found.metres_per_unit:.4g} m, assuming a longest side of {found.longest_side:g} m",
         f"grid            dx = {found.dx:g} m: {found.longest_side / found.dx:.0f} cells along the longest side, "
         f"{found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of {found.spacing:.3g} m",
         "further points  "
@@ -56,7 +56,7 @@ def suggestion_lines(found: Suggestion) -> list[str]:
         f"material        {_material(found)}",
         f"wind            {_numbers(found.flow)} m/s, z up",
     ]
-    return ["", "guesses (each can be given instead, see --help)", *(f"  {line}" for line in lines)]
+    return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
 
 
 def run_lines(run: dict[str, Any]) -> list[str]:
@@ -85,17 +85,17 @@ def cost_lines(cost: Cost) -> list[str]:
     return [
         "",
         f"cost on this machine ({cost.device})",
-        f"  substep         {cost.substep:.3g} s, {cost.substeps} a frame (stable up to {cost.stable_substep:.3g} s; "
+        f"  substep         {cost.substep:.3g} s, {cost.substeps} per frame (stable up to {cost.stable_substep:.3g} s; "
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} a substep at rest",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep at rest",
         f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
 
 
 def video_length(text: str) -> str:
-    """Length and picture of the video of a configuration, in words."""
+    """Length and picture size of a configuration's video, in words."""
     import yaml
 
     given = yaml.safe_load(text)

@@ -12,10 +12,10 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Preview:
-    """Everything that is found before anything is written.
+    """All results, before anything is written.
 
     Attributes:
-        report: Text for people.
+        report: Text for the user.
         data: The same as plain numbers, for preview.json.
         picture: 8-bit RGB, shape (H, W, 3).
         configurations: Their names and YAML, ``draft`` and ``starter``; none with ``--config``.
@@ -28,9 +28,9 @@ class Preview:
 
 
 def splat_name(path: str | Path) -> str:
-    """What a splat is called: its file, or the folder of a ``point_cloud.ply``, as trainings write it.
+    """The name of a splat: that of its file, or of the folder of a ``point_cloud.ply``, as written by training.
 
-    A folder ``iteration_30000`` and one called ``point_cloud``, as 3DGS makes them, are passed over.
+    Folders ``iteration_30000`` and ``point_cloud``, as 3DGS makes them, are skipped.
     """
     file = Path(path)
     if file.stem != "point_cloud":
@@ -41,10 +41,10 @@ def splat_name(path: str | Path) -> str:
 
 
 def write(found: Preview, folder: Path) -> list[Path]:
-    """Write preview.json, preview.png and, if they were guessed, draft.yaml and starter.yaml.
+    """Write preview.json, preview.png and, if there are suggestions, draft.yaml and starter.yaml.
 
-    A configuration that is there and differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ...: someone may
-    have edited it.
+    An existing configuration that differs is kept as ``starter.1.yaml``, ``starter.2.yaml``, ..., since it may have
+    been edited.
 
     Returns:
         The files.

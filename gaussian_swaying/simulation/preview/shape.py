@@ -10,7 +10,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive, check_shape
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
-FEWEST = 16  # Gaussians that make an object
+FEWEST = 16  # smallest number of Gaussians in an object
 DIRECTIONS = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
@@ -42,7 +42,7 @@ def bounds(points: Tensor, share: float = 0.005) -> dict[str, list[float]]:
 
 
 def sheet_normal(points: Tensor) -> tuple[float, ...] | None:
-    """Unit normal of points that lie close to a plane (see ``SHEET``), snapped to an axis within 10 degrees."""
+    """Unit normal of points that are close to a plane (see ``SHEET``), set to an axis within 10 degrees."""
     where = points.double()
     values, axes = torch.linalg.eigh(torch.cov((where - where.mean(0)).T))
     spread = values.clamp(min=0).sqrt()
@@ -52,12 +52,12 @@ def sheet_normal(points: Tensor) -> tuple[float, ...] | None:
 
 
 def quantile(values: Tensor, share: float) -> float:
-    """Quantile without the limit of 2^24 values that torch.quantile has."""
+    """Quantile without torch.quantile's limit of 2^24 values."""
     return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
 
 
 def plane_axes(axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors across another."""
+    """Two unit vectors perpendicular to another."""
     helper = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
     first = torch.linalg.cross(axis, helper)
     first = first / first.norm()
@@ -65,13 +65,13 @@ def plane_axes(axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def width(points: Tensor, axis: Tensor) -> float:
-    """Geometric mean of the widths of points across an axis, robust."""
+    """Geometric mean of the widths of points perpendicular to an axis, robust."""
     sides = [points.double() @ across for across in plane_axes(axis)]
     return math.sqrt(math.prod(max(quantile(s, 0.97) - quantile(s, 0.03), 1e-9) for s in sides))
 
 
 def snapped(direction: Tensor) -> tuple[float, ...]:
-    """A unit vector, made the axis that it is within 10 degrees of; its largest component positive."""
+    """A unit vector, set to an axis within 10 degrees; its largest component is positive."""
     unit = direction.double() / direction.double().norm()
     main = int(unit.abs().argmax())
     if float(unit[main]) < 0:
@@ -82,19 +82,19 @@ def snapped(direction: Tensor) -> tuple[float, ...]:
 
 
 def rounded(value: float, cell: float) -> float:
-    """A coordinate with no more digits than matter: a hundredth of a cell."""
+    """A coordinate rounded to about a hundredth of a cell."""
     return round(value, max(0, 2 - math.floor(math.log10(cell))))
 
 
 def connected_parts(points: Tensor, cell: float) -> Tensor:
-    """Number of the connected part that each point is in; points in the same or in touching cells are connected.
+    """The number of each point's connected part; points in the same or in touching cells are connected.
 
     Args:
         points: Shape (N, 3).
         cell: Size of a cell.
 
     Returns:
-        Numbers from 0 on, shape (N,).
+        Numbers from 0, shape (N,).
 
     Raises:
         ValueError: If ``cell`` is not positive.
@@ -107,7 +107,7 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
     pairs = []
     for x, y, z in torch.cartesian_prod(*(torch.arange(-1, 2),) * 3).tolist():
         wanted = key + (x << 42) + (y << 21) + z
-        if (x, y, z) > (0, 0, 0):  # the other half of the neighbours finds the same pairs
+        if (x, y, z) > (0, 0, 0):  # the other half of the neighbours gives the same pairs
             at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
             found = (key[at] == wanted).nonzero()[:, 0]
             pairs.append(torch.stack([found, at[found]]))

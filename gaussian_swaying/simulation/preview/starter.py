@@ -1,4 +1,4 @@
-"""A first configuration as a YAML file with comments, from what the preview found."""
+"""A first configuration as a YAML file with comments, from the results of the preview."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ aero:
   C_F: 0.4
   C_L: 0.01
   air_density: 1.225            # kg/m^3
-  law: projected                # a captured shell shows patches to the wind at every angle
+  law: projected                # patches of a captured shell face the wind at every angle
 """
 
 
 def _material(s: Suggestion) -> str:
-    density, why = (400.0, "lighter things follow the gusts faster")
+    density, why = (400.0, "lighter objects follow the gusts faster")
     if s.sheet:
         density, why = (30.0, "the paper's flags, whose E is 3e3 to 6e3")
     return f"""\
 material:
   # {s.stiffness_reason}
-  E: {s.youngs_modulus:<27.1e}# Pa; more of it bends less and takes more substeps
+  E: {s.youngs_modulus:<27.1e}# Pa; a larger E bends less and needs more substeps
   nu: 0.3
   density: {density:<21}# kg/m^3; {why}
   thickness: {s.thickness:<19.4g}# m; a shell; the mass of a patch is density x thickness x area
@@ -61,7 +61,7 @@ def region_dict(region: Region) -> dict[str, Any]:
     """A region as ``class_path`` and ``init_args``, open sides as None.
 
     Raises:
-        TypeError: If it is none of Box, Cylinder, Not and Union.
+        TypeError: If it is not a Box, Cylinder, Not or Union.
     """
     arguments: dict[str, Any]
     if isinstance(region, Box):
@@ -80,7 +80,7 @@ def region_dict(region: Region) -> dict[str, Any]:
 
 
 def draft_yaml(suggestion: Suggestion, ply: str | Path) -> str:
-    """A configuration for a first look, as :func:`starter_yaml`: a coarser grid, 2 s, a small picture."""
+    """A configuration for a first look, like :func:`starter_yaml`, with a coarser grid, 2 s and a small picture."""
     dx = max(suggest_spacing(suggestion.longest_side, suggestion.spacing, DRAFT_CELLS), suggestion.dx)
     fill = None if suggestion.fill_spacing is None else float(f"{0.45 * dx:.2g}")
     coarse = replace(suggestion, dx=dx, fill_spacing=fill)
@@ -115,11 +115,11 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
         region: {json.dumps(region_dict(s.pin))}"""
     falls = s.sheet or s.pin is None
     gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "
-    why = "cloth and what nothing holds" if falls else "it was captured in balance with its weight"
+    why = "for cloth and objects without pins" if falls else "it was captured in balance with its weight"
     return f"""\
 {title}
-# Guessed from the splat; every number may be changed. A splat does not tell what it is made of: E and thickness are
-# such that it sways visibly in this wind.
+# Guessed from the splat; every number may be changed. A splat does not show its material: E and thickness are chosen
+# so that it sways visibly in this wind.
 #   {shlex.join(program.words("sim"))} --config THIS_FILE
 frames: {frames:<24}# {frames * 0.04:.3g} s at 25 frames a second
 frame_dt: 0.04                  # s
@@ -135,11 +135,11 @@ scene:
   faint: carry
   area: coverage
   particle_spacing: {_fill(s)}
-  sampling: grid                # as many points as the grid can use, which all Gaussians follow; gaussian: one for each
+  sampling: grid                # as many points as the grid needs; all Gaussians follow them; gaussian: one for each
 
 {_material(s)}
 solver:
-  formulation: total            # keeps its neighbours: cannot tear
+  formulation: total            # particles keep their neighbours: cannot tear
   dx: {s.dx:<26.6g}# m; {s.longest_side / s.dx:.0f} cells along the longest side
   cfl: 0.4
   gravity: {gravity}     # m/s^2, z up; {why}
@@ -160,9 +160,9 @@ shader:
   class_path: DiffuseShader
   init_args:
     light: [0.3, -0.6, 1.0]     # direction to the light, z up
-    two_sided: true             # the sign of a captured normal means nothing
+    two_sided: true             # the sign of a captured normal has no meaning
     ambient: 0.6
-    relative: true              # the light of the photos is in the colours already
+    relative: true              # the colours already contain the light of the photos
 
 camera:
   class_path: OrbitCamera
@@ -170,10 +170,10 @@ camera:
     width: {size[0]}
     height: {size[1]}
     fov_y: 40.0                 # degrees
-    azimuth: {s.azimuth:<19.6g}# degrees about up; onto the broad side
+    azimuth: {s.azimuth:<19.6g}# degrees about up; shows the broad side
     elevation: 8.0
-    radius: {s.camera_radius:<20.6g}# times the longest side of what moves; shows all of the object
-    target_offset: {json.dumps(list(s.camera_offset))}  # scene axes, likewise; from the centre of what moves
+    radius: {s.camera_radius:<20.6g}# times the longest side of the moving part; shows all of the object
+    target_offset: {json.dumps(list(s.camera_offset))}  # scene axes, same unit; from the centre of the moving part
 
 recorder:
   trajectory: false             # positions of all particles in each frame
@@ -181,7 +181,7 @@ recorder:
 
 
 def _padded(text: str, width: int) -> str:
-    """Text with blanks up to a width, at least one."""
+    """Text padded with blanks to a width, with at least one blank."""
     return f"{text:<{width - 1}} "
 
 

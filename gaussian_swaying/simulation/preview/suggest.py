@@ -1,7 +1,7 @@
-"""What a splat looks like to the simulation: bounds, up axis, sizes, and a guess at each number that a run needs.
+"""A suggestion for the first configuration of a splat: bounds, up axis, sizes, and every number that a run needs.
 
-Everything here is a guess of a first configuration, made from rules that are stated with the result. None of them knows
-what the object is.
+Everything here is a guess, made with rules that are stated with the result. The rules do not depend on what the object
+is.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from gaussian_swaying.simulation.preview.shape import (
 )
 from gaussian_swaying.simulation.preview.up import UpGuess, given_up, guess_up
 
-CELLS = 24  # along the longest side: enough to bend, few enough for a laptop
+CELLS = 24  # along the longest side: enough for bending, and few enough for a laptop
 DRAFT_CELLS = 16  # the same for a first look
 CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
-SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; anything else: a shell of rubber
+SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; everything else: a shell of rubber
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
-KEPT_AREA = 0.95  # share of the visible area that the threshold has to leave
-MAX_BOXES = 8  # boxes that cut specks out of the region
+KEPT_AREA = 0.95  # share of the visible area that the threshold must keep
+MAX_BOXES = 8  # largest number of boxes that cut specks out of the region
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class RegionGuess:
     """Which Gaussians to simulate.
 
     Attributes:
-        simulated: Those that would be, shape (N,).
+        simulated: The simulated ones, shape (N,).
         box: Lower and upper corner [scene units] of the region, or None for all of space.
-        holes: Boxes within it that are left out, as corners.
-        opacity_threshold: Smallest opacity that is simulated.
-        specks: Gaussians above the threshold that are not part of the object, floor and surroundings apart.
-        loose: Those of them that the region does not leave out.
+        holes: Boxes inside it that are left out, as corners.
+        opacity_threshold: Smallest simulated opacity.
+        specks: Number of Gaussians above the threshold that are not part of the object, floor or surroundings.
+        loose: Number of these inside the region.
         reason: In words.
-        cuts: Further regions within it that are left out: what lies in and behind a wall.
+        cuts: Further regions inside it that are left out: walls and everything behind them.
     """
 
     simulated: Tensor
@@ -68,7 +68,7 @@ class RegionGuess:
     cuts: tuple[Region, ...] = ()
 
     def region(self) -> Region | None:
-        """The region as a run takes it; None for all of space."""
+        """The region for a run; None for all of space."""
         if self.box is None:
             return None
         inside: Region = Box(*self.box)
@@ -77,7 +77,7 @@ class RegionGuess:
 
 
 def visible_weight(cloud: GaussianCloud) -> Tensor:
-    """Opacity times area pi s1 s2 of each Gaussian [scene units²], shape (N,), the largest 1 % cut to the next."""
+    """Opacity times area pi s1 s2 of each Gaussian [scene units²], shape (N,), with the largest 1 % clamped."""
     weight = (cloud.opacities.sigmoid() * patch_area(cloud.scales)).double()
     return weight.clamp(max=quantile(weight, 0.99))
 
@@ -113,26 +113,27 @@ class Suggestion:
     """Everything that a first configuration needs.
 
     Attributes:
-        up: Which way is up.
-        region: What is simulated.
-        hold: At which end it is held.
+        up: The up direction.
+        region: The simulated part.
+        hold: The end at which it is held.
         pin: That end as a region, None if it is not held.
-        longest_side: Length given to the longest side of the object [m].
-        metres_per_unit: Length of a scene unit that follows [m].
+        longest_side: Assumed length of the longest side of the object [m].
+        metres_per_unit: Resulting length of a scene unit [m].
         size: Sides of the object along the z-up axes [m].
         spacing: Particle spacing [m], see :func:`particle_spacing`.
         dx: Grid spacing [m].
-        fill_spacing: Spacing of further points on large Gaussians [m], see :func:`suggest_fill`; None if not needed.
+        fill_spacing: Spacing of extra points on large Gaussians [m], see :func:`suggest_fill`; None if not needed.
         sheet: Whether the object is a thin sheet.
-        azimuth: Azimuth of a camera that sees the broad side, or what photos show [degrees].
-        flow: Wind across the picture, or along a sheet from where it is held [m/s], z up.
+        azimuth: Azimuth of a camera that sees the broad side, or the side seen in photos [degrees].
+        flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
         youngs_modulus: Young's modulus [Pa], a first guess;
             :mod:`~gaussian_swaying.simulation.preview.calibration` finds a better one.
-        thickness: Thickness of the surface [m], likewise.
-        stiffness_reason: Why, in words.
-        whole: Corners of the box of the object with what does not move of it [scene units].
-        camera_offset: From the centre of what moves to that of the whole, in multiples of its longest side.
-        camera_radius: Distance of a camera that shows the whole, likewise.
+        thickness: Thickness of the surface [m], also a first guess.
+        stiffness_reason: The reason for both, in words.
+        whole: Corners of the box of the whole object, including parts that do not move [scene units].
+        camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
+            of the moving part.
+        camera_radius: Distance of a camera that shows the whole, in the same unit.
     """
 
     up: UpGuess
@@ -174,20 +175,18 @@ def suggest(
         region: Corners of the box to simulate [scene units]; guessed if None.
         longest_side: Length of the longest side of the object [m].
         speed: Speed of the wind [m/s].
-        capture: Where the photos of the splat were taken from, which tells up and object.
+        capture: The cameras of the splat's photos, which define the up direction and the object.
 
     Returns:
         The suggestion.
 
     Raises:
-        ValueError: If the splat has too few Gaussians, or what was given does not fit it.
+        ValueError: If the splat has too few Gaussians, or an argument does not fit the splat.
     """
     check_positive("--longest-side", longest_side)
     check_positive("--wind", speed, allow_zero=True)
     if len(cloud) < FEWEST:
-        raise ValueError(
-            f"The splat holds {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed."
-        )
+        raise ValueError(f"The splat has {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed.")
     means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
     normals = smallest_axis_normal(cloud.quats, cloud.scales)
     shown = None if capture is None or region is not None else shown_object(means, opacity, weight, capture)
@@ -203,10 +202,10 @@ def suggest(
     corner = bounds(means if shown is None else means[shown.mask])
     side = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
     if side <= 0:
-        raise ValueError("All Gaussians of the splat lie at one point: there is no object to simulate.")
+        raise ValueError("All Gaussians of the splat are at one point: there is no object to simulate.")
     if region is None:
         cell = max(side / CELLS, 2 * particle_spacing(means if shown is None else means[shown.mask]))
-        if shown is not None:  # what is left of a backdrop must not be taken for a part of the object
+        if shown is not None:  # the rest of a backdrop must not count as a part of the object
             cell = 0.5 * cell
         chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown)
     else:
@@ -224,17 +223,17 @@ def suggest(
     else:
         held = given_hold(hold, upward.direction)
     pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
-    azimuth, turn = broad_side(metres), 20.0  # the broad side, a little from the side
+    azimuth, turn = broad_side(metres), 20.0  # the broad side, seen slightly from the side
     front = None if capture is None else photo_azimuth(capture, points.double().mean(0), frame.rotation)
     if front is not None:
         azimuth, turn = front, 0.0
     flow = _across_picture(azimuth, speed)
     flat = sheet_normal(points)
-    if held.end == "side" and flat is not None:  # from the pole on, and a little onto the sheet
+    if held.end == "side" and flat is not None:  # along the sheet from the pole, and slightly onto it
         away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
         onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
         flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
-    elif flat is not None:  # a curtain is moved by wind onto it
+    elif flat is not None:  # a curtain is moved by wind that hits its face
         flow = _across_picture(azimuth - 90, speed)
     outside = upward.ground if shown is None else upward.ground | ~shown.mask
     whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
@@ -272,7 +271,7 @@ def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
 
 
 def suggest_threshold(opacity: Tensor, weight: Tensor) -> float:
-    """The highest of ``THRESHOLDS`` above which at least ``KEPT_AREA`` of the visible area lies."""
+    """The highest of ``THRESHOLDS`` that keeps at least ``KEPT_AREA`` of the visible area."""
     total = float(weight.sum())
     for threshold in THRESHOLDS:
         if float(weight[opacity >= threshold].sum()) >= KEPT_AREA * total:
@@ -285,16 +284,16 @@ def suggest_region(
 ) -> RegionGuess:
     """The main object without floor, surroundings and specks.
 
-    The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks within its box are
-    cut out by boxes of their own, the largest first.
+    The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks inside its box are
+    cut out by smaller boxes, the largest first.
 
     Args:
         points: Centres [scene units], shape (N, 3).
         opacity: Opacities, shape (N,).
         weight: Visible area, shape (N,).
         ground: The floor, shape (N,).
-        cell: What is farther apart than two such cells is not connected [scene units].
-        shown: What photos show, to which the object is confined; the part nearest to their common point counts most.
+        cell: Points farther apart than two such cells are not connected [scene units].
+        shown: The object in photos, to which the result is limited; the part nearest to their common point counts most.
 
     Returns:
         The guess.
@@ -309,7 +308,7 @@ def suggest_region(
     if len(index) < FEWEST:
         raise ValueError(
             f"Only {len(index)} Gaussians are left above the floor and an opacity of {threshold:g}, too few for an "
-            "object: give another `--up`."
+            "object: set another `--up`."
         )
     part = connected_parts(points[index], cell)
     counted = weight[index].double() if shown is None else weight[index].double() * shown.nearness(points[index])
@@ -331,14 +330,14 @@ def suggest_region(
         members = index[stray & (part == number)]
         hole = _padded(points[members], 0.05 * cell)
         caught = Box(*hole).contains(points) & chosen
-        if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # worth what it costs the object
+        if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # removes more specks than parts of the object
             holes.append(hole)
     guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), 0, "", cuts)
     region = guess.region()
     assert region is not None
     simulated = region.contains(points) & (opacity >= threshold)
     loose = int((simulated & ~chosen).sum())
-    if shown is not None and loose:  # the grid is coarser than what tells the object from its surroundings
+    if shown is not None and loose:  # the grid is coarser than the gap between the object and its surroundings
         joined = connected_parts(points[simulated], 2 * cell)
         loose = int((joined != joined.mode().values).sum())
     everything = bool(region.contains(points).all())
@@ -348,7 +347,7 @@ def suggest_region(
     if shown is not None:
         words.append("the cameras look at it")
         if shown.backdrops:
-            words.append("what lies in or behind a wall or floor is left out")
+            words.append("everything in or behind a wall or floor is left out")
     if guess.specks:
         words.append(f"{guess.specks:,} float apart from it")
     words.append("the region is all of space" if everything else "the region is the box around it")
@@ -362,17 +361,17 @@ def suggest_region(
 def given_region(
     points: Tensor, opacity: Tensor, weight: Tensor, low: Sequence[float], high: Sequence[float]
 ) -> RegionGuess:
-    """A region that was given as the corners of a box, with a suggested threshold.
+    """A region given by the corners of a box, with a suggested threshold.
 
     Raises:
-        ValueError: If it holds hardly any Gaussian.
+        ValueError: If it contains hardly any Gaussian.
     """
     box = Box(low, high)
     inside = box.contains(points)
     if int(inside.sum()) < FEWEST:
         span = [[round(float(v), 4) for v in corner] for corner in (points.amin(0), points.amax(0))]
         raise ValueError(
-            f"The box of `--region` holds {int(inside.sum())} Gaussians, too few for an object: the splat reaches from "
+            f"The box of `--region` contains {int(inside.sum())} Gaussians, too few for an object: the splat spans "
             f"{span[0]} to {span[1]}."
         )
     threshold = suggest_threshold(opacity[inside], weight[inside])
@@ -393,7 +392,7 @@ def particle_spacing(points: Tensor) -> float:
 
 
 def suggest_spacing(longest_side: float, spacing: float, cells: int = CELLS) -> float:
-    """Grid spacing: the longest side over ``cells``, no finer than twice the particle spacing, to 2 digits.
+    """Grid spacing: the longest side over ``cells``, at least twice the particle spacing, rounded to 2 digits.
 
     Args:
         longest_side: Longest side of the object [m].
@@ -411,18 +410,18 @@ def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> flo
     """``scene.particle_spacing``, if the splat has holes for the grid: points more than 0.6 cells from any centre.
 
     Args:
-        cloud: What is simulated.
+        cloud: The simulated Gaussians.
         metres_per_unit: Length of a scene unit [m].
         dx: Grid spacing [m].
 
     Returns:
-        0.45 ``dx`` to 2 digits [m], or None if such points are fewer than two in a hundred, or far too many.
+        0.45 ``dx`` rounded to 2 digits [m], or None if such points are fewer than 2 %, or far too many.
     """
     spacing = float(f"{0.45 * dx:.2g}")
     opacity = cloud.opacities.sigmoid()
     try:
         further = subdivide(cloud.means, cloud.quats, cloud.scales, opacity, spacing / metres_per_unit).means
-    except ValueError:  # haze, on which nothing is to be put
+    except ValueError:  # haze, which gets no extra points
         return None
     distance, _ = nearest_neighbours(cloud.means, 1, further)
     holes = int((distance * metres_per_unit > 0.6 * dx).sum())
@@ -430,7 +429,7 @@ def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> flo
 
 
 def broad_side(points: Tensor) -> float:
-    """Azimuth [degrees], from -90 to 90, of the horizontal direction in which points (N, 3), z up, reach least far."""
+    """Azimuth [degrees], from -90 to 90, of the horizontal direction of smallest extent of points (N, 3), z up."""
     flat = points.double()[:, :2]
     _, axes = torch.linalg.eigh(torch.cov((flat - flat.mean(0)).T))
     x, y = axes[:, 0].tolist()
@@ -448,7 +447,7 @@ def _padded(points: Tensor, margin: float) -> tuple[list[float], list[float]]:
 
 
 def _without(low: list[float], high: list[float], points: Tensor, ground: Tensor) -> tuple[list[float], list[float]]:
-    """The box with the face that looks at the floor moved back onto the object, if it reaches into the floor."""
+    """The box, with the face at the floor moved back to the object if the box extends into the floor."""
     for axis in range(3):
         first, last = float(points[:, axis].amin()), float(points[:, axis].amax())
         floor_low, floor_high = float(ground[:, axis].amin()), float(ground[:, axis].amax())

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
 COLOUR = (20, 60, 130)
-SHORTEST = 0.06  # an edge seen shorter than this has no ticks, of the picture's height
-FORESHORTENED = 0.5  # nor has one of which less than this is seen: another view has them
+SHORTEST = 0.06  # an edge that looks shorter than this share of the picture's height has no ticks
+FORESHORTENED = 0.5  # nor does an edge foreshortened below this share; another view shows them
 
 
 def nice_ticks(low: float, high: float, most: int = 5) -> tuple[list[float], int]:
@@ -26,7 +26,7 @@ def nice_ticks(low: float, high: float, most: int = 5) -> tuple[list[float], int
     Args:
         low: Lower bound.
         high: Upper bound.
-        most: How many of them there may be, at least 1.
+        most: Largest number of them, at least 1.
 
     Returns:
         The numbers, and how many decimals they need.
@@ -62,7 +62,7 @@ def draw_ticks(
 ) -> None:
     """Ticks with coordinates and the axis' name along one edge of a box for each axis.
 
-    The edge is the rightmost of those that stand upright in the picture, and the lowest of the others.
+    The edge is the rightmost of edges that are upright in the picture, and the lowest of others.
 
     Args:
         draw: Where to draw.
@@ -91,7 +91,7 @@ def draw_ticks(
         upright = bool(way[1].abs() > 2 * way[0].abs())
         ends, end, depth_of = max(edges, key=lambda edge: float(edge[0][:, 0 if upright else 1].mean()))
         length = float((ends[1] - ends[0]).norm())
-        facing = focal * (high[axis] - low[axis]) / depth_of  # its length, were it across the line of sight
+        facing = focal * (high[axis] - low[axis]) / depth_of  # its length if it were perpendicular to the line of sight
         if length < max(SHORTEST * size[1], FORESHORTENED * facing):
             continue
         along = (ends[1] - ends[0]) / length
@@ -115,7 +115,7 @@ def draw_ticks(
 def _label(
     draw: ImageDraw, font: Any, at: Tensor, text: str, anchor: str, size: tuple[int, int], weight: int = 0
 ) -> None:
-    """Text with a pale rim, if it lies within the picture."""
+    """Text with a pale rim, if it fits into the picture."""
     x, y = at.tolist()
     box = draw.textbbox((x, y), text, font=font, anchor=anchor)
     if box[0] < 0 or box[1] < 0 or box[2] > size[0] or box[3] > size[1]:

@@ -1,4 +1,4 @@
-"""Which way is up in a splat, from its shape and from what capturing and modelling programs agree on."""
+"""The up direction of a splat, from its shape and from conventions of capturing and modelling programs."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from gaussian_swaying.simulation.preview.shape import (
     sheet_normal,
 )
 
-# what captures and modelling programs agree on: z up (Blender), y down (COLMAP), y up (glTF)
+# conventions of capturing and modelling programs: z up (Blender), y down (COLMAP), y up (glTF)
 CONVENTION = {"+z": 0.75, "-y": 0.75, "+y": 0.5, "-z": -1.0, "+x": -1.0, "-x": -1.0}
 
 
 @dataclass(frozen=True)
 class UpGuess:
-    """Which way is up, and why.
+    """The up direction, and the reasons.
 
     Attributes:
         direction: Unit vector in scene axes.
         confidence: ``high``, ``medium`` or ``low``, by the lead over the next best direction; ``given`` if it was.
         scores: Points of each direction.
-        reasons: What spoke for the winner, in words.
+        reasons: The reasons for the winner, in words.
         ground: Which Gaussians form the floor below, shape (N,).
-        options: What ``--up`` takes for this direction and for the next best; empty if it was given.
+        options: The values of ``--up`` for this direction and the next best; empty if it was given.
     """
 
     direction: tuple[float, ...]
@@ -48,8 +48,8 @@ class UpGuess:
 def floor_mask(points: Tensor, normals: Tensor, weight: Tensor, up: Sequence[float]) -> Tensor:
     """Gaussians that form a level floor at the lower end of a scene.
 
-    A floor is a layer, 4 % of the longest side thick, that holds at least 15 % of the visible area, most of it level,
-    with next to nothing below, something above, and wider than that.
+    A floor is a layer with a thickness of 4 % of the longest side. It contains at least 15 % of the visible area, most
+    of it level. There is almost nothing below it and something above it that is narrower.
 
     Args:
         points: Centres [scene units], shape (N, 3).
@@ -90,7 +90,7 @@ def floor_mask(points: Tensor, normals: Tensor, weight: Tensor, up: Sequence[flo
 
 
 def _floor_score(points: Tensor, floor: Tensor, up: Sequence[float]) -> float:
-    """3 for a floor from which something rises by 0.3 of its width or more, less for what is flat, as on a wall."""
+    """3 for a floor with something at least 0.3 times as tall as the floor is wide; less for flat things."""
     axis = torch.tensor(up, dtype=torch.float64)
     rest = points[~floor].double() @ axis
     width = min(quantile(c, 0.98) - quantile(c, 0.02) for c in (points[floor].double() @ a for a in plane_axes(axis)))
@@ -100,10 +100,10 @@ def _floor_score(points: Tensor, floor: Tensor, up: Sequence[float]) -> float:
 def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
     """The scene axis that most likely points up.
 
-    Each of the six directions along an axis collects points: for convention (z up and y down 0.75, y up 0.5, others
-    -1), for a floor below (3, less if what is on it is flat), for the origin at the lower end (1), for a wide base in
-    balance (0.5, no sheet), and for the axis being the longest (log2 of its ratio to the next, up to 1.5); a thin sheet
-    hangs, so its normal loses 1. A lead of 2 over the next is called high confidence, of 1 medium.
+    Each of the six directions along an axis gets points: for convention (z up and y down 0.75, y up 0.5, others -1),
+    for a floor below (3, less if things on it are flat), for the origin at the lower end (1), for a wide base in
+    balance (0.5, not for sheets), and if the axis is the longest (log2 of its ratio to the next, up to 1.5). A thin
+    sheet hangs, so its normal loses 1. A lead of 2 over the next gives high confidence, a lead of 1 medium.
 
     Args:
         points: Centres [scene units], shape (N, 3).
@@ -131,11 +131,11 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
         if bool(floors[name].any()):
             gain = _floor_score(points, floors[name], direction)
             points_for += gain
-            reasons.append(f"a level floor lies at the lower end (+{gain:.2g})")
+            reasons.append(f"there is a level floor at the lower end (+{gain:.2g})")
         near, far = (low[axis], high[axis]) if name[0] == "+" else (high[axis], low[axis])
         if side[axis] > 0 and abs(near) < 0.05 * side[axis] < abs(far):
             points_for += 1
-            reasons.append("the origin lies at the lower end (+1)")
+            reasons.append("the origin is at the lower end (+1)")
         if side[axis] == longest[1] and longest[1] > 1.3 * longest[0]:
             gain = min(math.log2(longest[1] / max(longest[0], 1e-30)), 1.5)
             points_for += gain
@@ -155,10 +155,10 @@ def guess_up(points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
 
 
 def given_up(up: Sequence[float] | str, points: Tensor, normals: Tensor, weight: Tensor) -> UpGuess:
-    """An up direction that was given, as 3 numbers or as ``+x`` to ``-z``, with the floor below.
+    """A given up direction, as 3 numbers or as ``+x`` to ``-z``, with the floor below.
 
     Raises:
-        ValueError: If it is no direction.
+        ValueError: If it is not a direction.
     """
     if isinstance(up, str):
         if up not in DIRECTIONS:

@@ -1,1 +1,1 @@
-"""What a run writes and reads again: frames, splats, trajectory, checkpoint."""
+"""Writing and reading the files of a run: frames, splats, trajectory, checkpoint."""

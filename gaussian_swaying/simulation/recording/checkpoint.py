@@ -1,7 +1,7 @@
-"""``checkpoint.pt``: what a resumed run starts from, and what is refused before it does.
+"""``checkpoint.pt``, from which a run is resumed, and the checks before that.
 
-A sealed file (:mod:`.seal`), so a changed bit is found. What is in it is checked all the same, field by field, against
-the state that the scene starts from.
+The file has a checksum (:mod:`gaussian_swaying.runs.seal`), so changed bits are found. Its content is also checked,
+field by field, against the initial state of the scene.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
 
     Args:
         path: ``checkpoint.pt`` of a run.
-        config: The configuration that it must have been written with; "" for any.
+        config: The configuration with which it must have been written; "" for any.
 
     Returns:
-        Its fields, of the right types; :func:`check_state` looks into them.
+        Its fields, with the right types; :func:`check_state` checks their content.
 
     Raises:
-        ValueError: If there is none, or it is damaged, or the configuration differs.
+        ValueError: If it does not exist or is damaged, or the configuration differs.
     """
     if not path.exists():
-        raise ValueError(f"There is nothing to resume in {path.parent}: it holds no {path.name}; leave out --resume.")
+        raise ValueError(f"There is nothing to resume in {path.parent}: it has no {path.name}; leave out --resume.")
     try:
         check_seal(path)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         if not isinstance(checkpoint, dict):
-            raise ValueError("it holds no fields")
+            raise ValueError("it has no fields")
         for name, kind in _FIELDS.items():
             if name not in checkpoint:
-                raise ValueError(f"it lacks `{name}`")
+                raise ValueError(f"it has no `{name}`")
             if type(checkpoint[name]) is not kind:
-                raise ValueError(f"its `{name}` is no {kind.__name__}")
+                raise ValueError(f"its `{name}` is not of type {kind.__name__}")
     except Exception as error:
         raise unreadable(path, error) from error
     if config and checkpoint["config"] != config:
         try:
             change = first_change(checkpoint["config"], config)
-        except Exception as error:  # its text is no configuration
+        except Exception as error:  # the text is not a configuration
             raise unreadable(path, ValueError("its `config` is not valid YAML")) from error
         raise ValueError(
             f"The configuration differs from that of the run in {path.parent} ({change}): resume with the same one, or "
@@ -65,7 +65,7 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
 
 
 def unreadable(path: Path, error: Exception) -> ValueError:
-    """The one sentence for a checkpoint that is no good."""
+    """The error for a checkpoint that cannot be used."""
     why = (str(error).splitlines() or ["empty"])[0].rstrip(".")
     return ValueError(f"{path} cannot be read as a checkpoint ({why}): start again without --resume.")
 
@@ -73,25 +73,25 @@ def unreadable(path: Path, error: Exception) -> ValueError:
 def check_state(
     checkpoint: dict[str, Any], start: MPMState, frame_dt: float, max_nodes: int, edited: bool = False
 ) -> None:
-    """Raise ValueError, saying what is wrong, unless a run can go on from a checkpoint.
+    """Raise ValueError with the reason unless a run can continue from a checkpoint.
 
     Args:
         checkpoint: From :func:`read_checkpoint`.
-        start: The state from which the scene begins.
+        start: The initial state of the scene.
         frame_dt: Time between frames [s].
-        max_nodes: Number of nodes of the largest grid.
-        edited: Whether edits may have changed the material meanwhile, and with it which internal variables there are.
+        max_nodes: Largest number of nodes of a grid.
+        edited: Whether edits may have changed the material, and so its internal variables.
     """
     frame, state, log, wall = (checkpoint[name] for name in ("frame", "state", "log", "wall_s"))
     _require(frame >= 0, "its `frame` is negative")
     wanted = start.state_dict()
-    _require(set(state) == set(wanted), f"its state has not the fields {', '.join(wanted)}")
+    _require(set(state) == set(wanted), f"the fields of its state are not {', '.join(wanted)}")
     nodes = _check_grid(state["grid"], start, max_nodes)
     for name, like in wanted.items():
         if name in ("grid", "substep"):
             continue
         value = state[name]
-        if name == "F_total":  # None where it is F_elastic
+        if name == "F_total":  # None if it equals F_elastic
             like = start.F_elastic
         if value is None and (name == "F_total" or like is None or (edited and name == "internal")):
             continue
@@ -102,36 +102,40 @@ def check_state(
         found = (tuple(value.shape), value.dtype)
         _require(found == (shape, like.dtype), f"its `{name}` is {_kind(*found)} and not {_kind(shape, like.dtype)}")
         _require(bool(torch.isfinite(value).all()), f"its `{name}` is NaN or infinite")
-    _require(_is_number(state["substep"]) and state["substep"] >= 0, "its `substep` is no length of time")
+    _require(_is_number(state["substep"]) and state["substep"] >= 0, "its `substep` is not a duration")
     _require(
         abs(float(state["time"]) - frame * frame_dt) <= 0.01 * frame_dt, f"its `time` is not that of frame {frame}"
     )
     names = set(FrameDiagnostics.__dataclass_fields__)
-    _require(len(log) == frame + 1, f"its `log` is not of {frame + 1} frames")
+    _require(len(log) == frame + 1, f"its `log` does not have {frame + 1} frames")
     for entry in log:
-        _require(isinstance(entry, dict) and set(entry) == names, "its `log` has not the diagnostics of each frame")
-        _require(all(type(value) in (int, float) for value in entry.values()), "its `log` holds something but numbers")
+        _require(isinstance(entry, dict) and set(entry) == names, "its `log` lacks diagnostics of a frame")
+        _require(
+            all(type(value) in (int, float) for value in entry.values()), "its `log` has entries that are not numbers"
+        )
     known = all(isinstance(name, str) and _is_number(value) and value >= 0 for name, value in wall.items())
-    _require(known, "its `wall_s` holds something but seconds")
+    _require(known, "its `wall_s` has values that are not seconds")
 
 
 def _check_grid(grid: Any, start: MPMState, max_nodes: int) -> int:
-    """Number of nodes of a stored grid, which must be one."""
+    """Number of nodes of a stored grid; ValueError if it is not a valid grid."""
     fields = {"dx", "offset", "resolution"}
     _require(
-        isinstance(grid, dict) and set(grid) == fields, f"its `grid` has not the fields {', '.join(sorted(fields))}"
+        isinstance(grid, dict) and set(grid) == fields,
+        f"the fields of its `grid` are not {', '.join(sorted(fields))}",
     )
     _require(
-        type(grid["dx"]) is float and grid["dx"] == start.grid.dx, f"its `grid` has not a dx of {start.grid.dx:g} m"
+        type(grid["dx"]) is float and grid["dx"] == start.grid.dx,
+        f"the dx of its `grid` is not {start.grid.dx:g} m",
     )
     for name in ("offset", "resolution"):
         three = isinstance(grid[name], (tuple, list)) and len(grid[name]) == 3
         _require(
-            three and all(type(value) is int for value in grid[name]), f"its `grid.{name}` is not of three numbers"
+            three and all(type(value) is int for value in grid[name]), f"its `grid.{name}` is not three whole numbers"
         )
     nodes = math.prod(grid["resolution"])
-    _require(min(grid["resolution"]) > 0 and nodes <= max_nodes, "its `grid.resolution` is that of no grid")
-    _require(max(abs(value) for value in grid["offset"]) < 2**31, "its `grid.offset` is that of no grid")
+    _require(min(grid["resolution"]) > 0 and nodes <= max_nodes, "its `grid.resolution` is out of range")
+    _require(max(abs(value) for value in grid["offset"]) < 2**31, "its `grid.offset` is out of range")
     fixed = start.node_displacement is not None
     same = (tuple(grid["offset"]), tuple(grid["resolution"])) == (start.grid.offset, start.grid.resolution)
     _require(not fixed or same, "its `grid` is not that of the scene")

@@ -16,24 +16,24 @@ FILES = [
     "diagnostics.csv",
     "animation.usdc",
 ]
-# what a run writes, and so must not find in a folder that no run made
+# names that a run writes; a folder that was not made by a run must not contain them
 OURS = [*FILES, "frames", "ply", "trajectory", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
 OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
 
 
 def frame_folder(render: str = "color", camera: str = "") -> str:
-    """Folder of a render's frames within that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
+    """Folder of a render's frames inside that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
 
     Args:
         render: One of ``color``, ``depth``, ``normal`` and ``force``.
-        camera: Name of a further camera; empty for the one of the run.
+        camera: Name of a further camera; empty for the main camera.
     """
     own = "frames" if render == "color" else render
     return f"cameras/{camera}/{own}" if camera else own
 
 
 def raw_folder(place: str) -> str:
-    """Folder of the numbers whose colours are in the folder ``place``."""
+    """Folder of the numbers that are shown as colours in the folder ``place``."""
     return f"{place}_raw"
 
 
@@ -44,6 +44,6 @@ def video_file(place: str) -> str:
 
 
 def check_camera_name(name: str) -> None:
-    """Raise ValueError unless a camera's name can be that of a folder on every system."""
+    """Raise ValueError unless a camera's name is valid as a folder name on every system."""
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name):
-        raise ValueError(f"Expected a name of `cameras` to have letters, digits, - and _ only, but got {name!r}.")
+        raise ValueError(f"Expected the names of `cameras` to have only letters, digits, - and _, but got {name!r}.")

@@ -1,7 +1,7 @@
-"""What a run leaves on disk. Every file is written under a temporary name and then renamed, see :mod:`.files`.
+"""The output files of a run. Every file is written under a temporary name and then renamed.
 
-Frames are written in the background (:mod:`.writer`), the video is encoded meanwhile (:mod:`.video`), and positions and
-deformation gradients end up in one file (:mod:`.trajectory`).
+Frames are written in the background (:mod:`.writer`), while the video is encoded (:mod:`.video`). Positions and
+deformation gradients are packed into one file (:mod:`.trajectory`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NORMAL_AXES = ("camera", "world")
 
 
 class _Film:
-    """The video of one folder of frames, and the frames that its encoder was given."""
+    """The video of one folder of frames, and the frames encoded so far."""
 
     def __init__(self) -> None:
         self.encoder: VideoEncoder | None = None
@@ -63,32 +63,32 @@ class Recorder:
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
     ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
-    Further renders have folders of their own, ``depth``, ``normal`` and ``force``, and videos of these names; further
-    cameras have the same once more in ``cameras/<name>``. All but the colour is black where no Gaussian is.
+    Other renders have separate folders, ``depth``, ``normal`` and ``force``, and videos with these names. Further
+    cameras have the same layout in ``cameras/<name>``. Except for colour, pixels without Gaussians are black.
 
-    - ``depth``: along the optical axis, yellow to violet from one longest side of the object before its centre at rest
-      to one behind it; the numbers are in ``depth_raw`` as PNG of 16 bits: 0 where nothing is, else steps of
+    - ``depth``: along the optical axis, from yellow, one longest side of the object in front of its centre at rest, to
+      violet, as far behind it. The numbers are in ``depth_raw`` as 16-bit PNG: 0 for empty pixels, else steps of
       ``depth_step``.
-    - ``normal``: turned towards the camera, (n + 1) / 2 in red, green and blue, in ``normal_axes``.
-    - ``force``: of the wind per area [Pa], violet at 0 to yellow at ``force_scale``.
+    - ``normal``: flipped towards the camera, (n + 1) / 2 in red, green and blue, in ``normal_axes``.
+    - ``force``: wind force per area [Pa], violet at 0 to yellow at ``force_scale``.
 
-    Images, trajectory, .ply and checkpoint are written in the background: the methods take a copy and return. They
-    wait only if the disk or ffmpeg is so far behind that the queue is full. What cannot be written is raised by the
-    next of them, by :meth:`wait` or by :meth:`close`.
+    Images, trajectory, .ply and checkpoint are written in the background: the methods make a copy and return. They wait
+    only if the disk or ffmpeg is so slow that the queue is full. If something cannot be written, the next method call,
+    :meth:`wait` or :meth:`close` raises the error.
 
     Args:
         images: Write a PNG per frame.
         video: Encode the frames; needs ``images``.
-        ply_every: Write the deformed Gaussians in ``export_format`` every so many frames; 0 for never.
-        trajectory: Keep position (float32, metres, z up) and F (float16) of the simulated particles per frame.
-        checkpoint_every: Keep the state for ``--resume`` every so many frames; 0 for never.
+        ply_every: Write the deformed Gaussians in ``export_format`` every ``ply_every`` frames; 0 for never.
+        trajectory: Write position (float32, metres, z up) and F (float16) of the simulated particles for each frame.
+        checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
-        renders: What is drawn of each frame: ``color``, ``depth``, ``normal``, ``force``.
+        renders: What to draw for each frame: ``color``, ``depth``, ``normal``, ``force``.
         depth_step: Depth of one step of the PNG in ``depth_raw`` [m].
-        normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (metres' axes, z up).
-        force_scale: End of the colour scale of ``force`` [Pa]; null for the force per area that the wind's flow,
-            without gusts, can exert on a patch at rest; it is in summary.json.
-        export_format: How the Gaussians are written: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
+        normal_axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (simulation axes, z up).
+        force_scale: End of the colour scale of ``force`` [Pa]; null for the largest force per area of the wind, without
+            gusts, on a patch at rest; the value is in summary.json.
+        export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
             ``splat``, or ``usd`` (all frames in one animation.usdc, in metres; needs usd-core). See
             ``gaussian_swaying.gaussians.export``.
     """
@@ -158,25 +158,25 @@ class Recorder:
     ) -> dict[str, Any] | None:
         """Prepare the output folder.
 
-        An earlier run found there is moved aside, never overwritten. Any other files in the folder are left alone; if
-        one of them bears a name of the layout, the folder is refused.
+        An earlier run in it is moved aside, never overwritten. Other files in the folder are not touched; if one of
+        them has a name from the layout, the folder is refused.
 
         Args:
-            folder: Where to write.
-            config: The whole configuration as YAML, kept beside the results and compared when resuming.
+            folder: The output folder.
+            config: The whole configuration as YAML, stored with the results and compared when resuming.
             resume: Continue the run in the folder.
             real_time_fps: Frames per second at which the video shows the simulated time.
             cameras: Names of the further cameras.
-            check: Called with the checkpoint before anything in the folder is changed; raises what is wrong with it.
+            check: Called with the checkpoint before anything in the folder is changed; raises an error if it is bad.
 
         Returns:
-            The checkpoint to continue from, or None. The folder is held until :meth:`close` or :meth:`release`.
+            The checkpoint to continue from, or None. The folder is locked until :meth:`close` or :meth:`release`.
 
         Raises:
             FolderLocked: If another run writes to the folder.
-            ValueError: If the folder cannot be written, or there is nothing to resume or something else, or what was
-                recorded so far is damaged.
-            OSError: If something of an earlier folder, that was not closed, could not be written.
+            ValueError: If the folder cannot be written, there is nothing to resume, the run is a different one, or its
+                files are damaged.
+            OSError: If files of an earlier folder that was not closed could not be written.
         """
         self.wait()
         self._give_up_video()
@@ -204,22 +204,22 @@ class Recorder:
         except BaseException:
             self.release()
             raise
-        if self.video and not resume:  # that of a resumed run is made of its PNGs
+        if self.video and not resume:  # a resumed run makes its video from the PNGs
             for place, film in self._films.items():
                 film.encoder = VideoEncoder(path / video_file(place), self.fps or real_time_fps)
         return checkpoint
 
     def _continue(self, path: Path, config: str, check: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
-        """Hold the folder and look through all that the rest of the run builds on, before anything is changed."""
+        """Lock the folder and check everything that the rest of the run needs, before anything is changed."""
         if not path.is_dir():
-            raise ValueError(f"There is nothing to resume in {path}: it holds no checkpoint.pt; leave out --resume.")
-        self._lock = hold_folder(path, "see to its permissions")
+            raise ValueError(f"There is nothing to resume in {path}: it has no checkpoint.pt; leave out --resume.")
+        self._lock = hold_folder(path, "check its permissions")
         checkpoint = read_checkpoint(path / "checkpoint.pt", config)
         if check is not None:
             check(checkpoint)
         told = self._check_kept(path, checkpoint)
         for folder in (path, *(path / name for name in self._folders())):
-            remove_temporaries(folder)  # of a run that was killed while it wrote
+            remove_temporaries(folder)  # of a run that was killed while writing
         if not (path / MARKER).exists():
             mark(path)
         for sentence in told:
@@ -228,7 +228,7 @@ class Recorder:
         return checkpoint
 
     def _check_kept(self, path: Path, checkpoint: dict[str, Any]) -> list[str]:
-        """Sentences about what is missing of the frames so far; ValueError if something is damaged."""
+        """Sentences about missing files of the frames so far; ValueError if something is damaged."""
         frames = checkpoint["frame"] + 1
         videos = [video_file(place) for place in self._films] if self.video else []
         check_names(path, [*FILES, *videos], self._folders())
@@ -247,7 +247,7 @@ class Recorder:
         return told
 
     def release(self) -> None:
-        """Let other runs write to the folder."""
+        """Unlock the folder for other runs."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
@@ -265,7 +265,7 @@ class Recorder:
         return [*self._films, *raw]
 
     def write_image(self, index: int, image: Tensor, place: str = "frames") -> None:
-        """Write one frame as PNG from colours in [0, 1], shape (H, W, 3), rounded to 8 bits; and add it to the video.
+        """Write one frame as 8-bit PNG from colours in [0, 1], shape (H, W, 3), and add it to the video.
 
         Args:
             index: Frame number.
@@ -273,7 +273,7 @@ class Recorder:
             place: Folder of the frames, see :func:`frame_folder`.
 
         Raises:
-            OSError: If something could not be written before, here as in the other methods that write.
+            OSError: If an earlier file could not be written. The other methods that write raise it too.
         """
         path = self.folder / place / f"{index:05d}.png"
         copy = HostCopy((image.detach().clamp(0, 1) * 255 + 0.5).to(torch.uint8))
@@ -287,12 +287,12 @@ class Recorder:
                     encoder.write(copy.get().numpy())
                     encoded.append(index)
                 except Exception:
-                    encoder.abort()  # `close` misses the frame, encodes the PNGs and tells what fails then
+                    encoder.abort()  # `close` notices the missing frame, encodes the PNGs and reports errors
 
             self._submit(encoder.path, encode)
 
     def write_depth(self, index: int, steps: Tensor, place: str = "depth") -> None:
-        """Write one frame's depth as PNG of 16 bits, beside the frames of ``place``.
+        """Write one frame's depth as 16-bit PNG, beside the frames of ``place``.
 
         Args:
             index: Frame number.
@@ -303,7 +303,7 @@ class Recorder:
         self._submit(path, lambda: _write_png(path, copy.get().numpy().astype(np.uint16)))
 
     def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
-        """Keep position [m] (P, 3) and F (P, 3, 3) of one frame; packed into one file by :meth:`close`."""
+        """Write position [m] (P, 3) and F (P, 3, 3) of one frame; :meth:`close` packs all into one file."""
         path = self.folder / "trajectory" / f"{index:05d}.npz"
         copy = HostCopy({f"position_{index:05d}": position.float(), f"F_{index:05d}": F.half()})
 
@@ -319,8 +319,8 @@ class Recorder:
 
         Args:
             index: Frame number.
-            write: Called with the path in another thread, later, so what it holds on to must not change. On a GPU it
-                sees what was asked of the current stream before. Must itself write the file whole or not at all.
+            write: Called later with the path, in another thread, so its data must not change. On a GPU, earlier work of
+                the current stream is finished by then. It must write the file completely or not at all.
         """
         suffix = ".npz" if self.export_format == "usd" else SUFFIXES[self.export_format]
         path = self.folder / self.export_format / f"{index:05d}{suffix}"
@@ -336,7 +336,7 @@ class Recorder:
         self._submit(path, work)
 
     def write_splat(self, index: int, cloud: GaussianCloud, frame: SimFrame) -> None:
-        """Write one frame's Gaussians in the format of the recorder; those of USD are joined by :meth:`close`.
+        """Write one frame's Gaussians in the recorder's format; for USD :meth:`close` joins the frames.
 
         Args:
             index: Frame number.
@@ -349,10 +349,9 @@ class Recorder:
             self.write_ply(index, lambda path: export_cloud(path, cloud, self.export_format))
 
     def write_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep what a resumed run needs.
+        """Write the checkpoint for a resumed run.
 
-        Written only once all that was handed over before is on disk, so that it never names a frame that is not
-        complete.
+        It is written only after everything submitted before is on disk, so that it never refers to an incomplete frame.
         """
         path, copy = self.folder / "checkpoint.pt", HostCopy(checkpoint)
 
@@ -366,15 +365,15 @@ class Recorder:
         self._writer.submit(path.relative_to(self.folder).as_posix(), write, after_all)
 
     def wait(self) -> None:
-        """Return once everything handed over is on disk, but for the end of the video.
+        """Return when everything submitted is on disk, except for the end of the video.
 
         Raises:
-            OSError: If something could not be written, unless another method has raised it before.
+            OSError: If something could not be written and no other method has raised it yet.
         """
         self._writer.wait()
 
     def frame_files(self, count: int, place: str = "frames") -> list[Path]:
-        """The PNGs of the first ``count`` frames that exist, of the folder ``place``."""
+        """The existing PNGs of the first ``count`` frames in the folder ``place``."""
         files = [self.folder / place / f"{index:05d}.png" for index in range(count)]
         return [file for file in files if file.exists()]
 
@@ -385,16 +384,16 @@ class Recorder:
 
         Args:
             frames: Number of frames recorded.
-            summary: What goes to ``summary.json``.
+            summary: Content of ``summary.json``.
             real_time_fps: Frames per second at which the video shows the simulated time, if not as in :meth:`open`.
-            release: Let other runs write to the folder then.
+            release: Unlock the folder at the end.
 
         Returns:
-            The files and folders of the run, for telling the user.
+            The files and folders of the run, to show to the user.
 
         Raises:
-            OSError: If something could not be written, unless another method has raised it before. What does not
-                depend on it is kept all the same.
+            OSError: If something could not be written and no other method has raised it yet. Everything that does not
+                depend on it is still written.
         """
         failure = None
         try:
@@ -417,7 +416,7 @@ class Recorder:
                 made += [self.folder / place for place in self._picture_folders()]
                 for place in self._films:
                     files = self.frame_files(frames, place)
-                    if self.video and files:  # last: it needs another program
+                    if self.video and files:  # last, as it needs another program
                         self._finish_video(place, files, self.fps or real_time_fps or self._real_time_fps)
                         made.append(self.folder / video_file(place))
         finally:
@@ -429,13 +428,13 @@ class Recorder:
         return made
 
     def _finish_video(self, place: str, files: list[Path], fps: float) -> None:
-        """End the video if it shows these frames at this rate, or else make one of the files."""
+        """Finish the video if it has these frames at this rate, or else encode the files."""
         film = self._films[place]
         encoder = film.encoder
         if encoder is not None and encoder.fps == fps and film.encoded == [int(file.stem) for file in files]:
             with suppress(OSError):
                 return encoder.finish()
-        film.give_up()  # before another is made under the same name
+        film.give_up()  # before a new one with the same name is made
         encode_video(files, self.folder / video_file(place), fps)
 
     def _give_up_video(self) -> None:
@@ -443,7 +442,7 @@ class Recorder:
             film.give_up()
 
     def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write ``summary.json``, and its entry ``per_frame`` as ``diagnostics.csv`` too."""
+        """Write ``summary.json``, and its entry ``per_frame`` also as ``diagnostics.csv``."""
         write_json(self.folder / "summary.json", summary)
         if summary.get("per_frame"):
             write_table(self.folder / "diagnostics.csv", summary["per_frame"])

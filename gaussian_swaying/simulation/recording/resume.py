@@ -1,4 +1,4 @@
-"""What an earlier part of a run has left, looked at before the run goes on: nothing is found out at its end."""
+"""Checks of the files of an earlier part of a run, before the run continues, so that nothing fails at its end."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from gaussian_swaying.simulation.recording.trajectory import check_trajectory
 
 
 def check_pictures(folder: Path, place: str, frames: int, video: str | None = None) -> list[str]:
-    """Look at the PNGs of the frames so far.
+    """Check the PNGs of the frames so far.
 
     Args:
         folder: The folder of the run.
-        place: Name of the folder of PNGs in it.
-        frames: Number of frames that there must be.
-        video: Name of the video that is made of them, if any.
+        place: Name of its folder of PNGs.
+        frames: Number of frames that must exist.
+        video: Name of the video made from them, if any.
 
     Returns:
         A sentence if some are missing.
@@ -39,7 +39,7 @@ def check_pictures(folder: Path, place: str, frames: int, video: str | None = No
         try:
             with Image.open(path, formats=["PNG"]) as image:
                 look = (image.size, image.mode)
-                image.verify()  # the checksums of its chunks; nothing is unpacked
+                image.verify()  # the checksums of its chunks, without decoding
         except Exception as error:
             raise damaged(path, str(error) or type(error).__name__) from error
         first = first or look
@@ -50,20 +50,20 @@ def check_pictures(folder: Path, place: str, frames: int, video: str | None = No
 
 
 def check_frames(folder: Path, place: str, suffix: str, wanted: Iterable[int]) -> list[str]:
-    """Tell which files of the frames so far are missing."""
+    """A sentence if files of the frames so far are missing."""
     files = [folder / place / f"{index:05d}{suffix}" for index in wanted]
     return tell_missing([file for file in files if kind_of(file) is None])
 
 
 def check_positions(folder: Path, frames: int, particles: int | None) -> list[str]:
-    """Look at the trajectory of the frames so far; ValueError if a file of it is damaged."""
+    """Check the trajectory of the frames so far; ValueError if a file is damaged."""
     held = check_trajectory(folder / "trajectory", folder / "trajectory.npz", frames, particles)
     lost = sorted(set(range(frames)) - held)
     return tell_missing([folder / "trajectory" / f"{index:05d}.npz" for index in lost], "trajectory.npz")
 
 
 def check_shards(folder: Path, wanted: Iterable[int]) -> list[str]:
-    """Look at the frames of a film in USD: single ones that are not joined yet, and those joined before."""
+    """Check the frames of a USD film: single ones that are not joined yet, and those already joined."""
     missing, film = [], folder / "animation.usdc"
     for index in wanted:
         path = folder / "usd" / f"{index:05d}.npz"
@@ -87,13 +87,13 @@ def check_shards(folder: Path, wanted: Iterable[int]) -> list[str]:
 
 
 def damaged(path: Path, why: str) -> ValueError:
-    """The one sentence for a file that a run has left and that is no good."""
+    """The error for a damaged file of a run."""
     why = re.sub(r"\s+", " ", why).rstrip(".")
     return ValueError(f"{path} is damaged ({why}): remove it to go on without it, or start again without --resume.")
 
 
 def tell_missing(files: Sequence[Path], film: str | None = None) -> list[str]:
-    """A sentence that names the first of some missing files, if there are any, and the film that is made of them."""
+    """A sentence with the first of some missing files, if there are any, and the film made from them."""
     if not files:
         return []
     what, many = ("it", f"{files[0]} is") if len(files) == 1 else ("them", f"{files[0]} and {len(files) - 1} more are")

@@ -21,11 +21,11 @@ _MEMBER = re.compile(r"(position|F)_(\d{5})\.npy")
 
 
 def pack_trajectory(shards: Path, target: Path, frames: int) -> None:
-    """Join the frames into one .npz, copying their arrays without unpacking all of them at once.
+    """Join the frames into one .npz, copying their arrays one by one.
 
     Args:
         shards: Folder with an .npz per frame, ``00000.npz`` ...; removed at the end.
-        target: The file; frames that only an earlier one of this name holds are kept.
+        target: The file; frames that are only in an existing file with this name are kept.
         frames: Number of frames to keep.
     """
     wanted = {f"{index:05d}" for index in range(frames)}
@@ -42,26 +42,26 @@ def pack_trajectory(shards: Path, target: Path, frames: int) -> None:
 
 
 def _sources(shards: Path, target: Path) -> Iterator[Path]:
-    """The files that hold frames; those of a resumed run replace those of the run before it."""
+    """The files with frames; frames of a resumed run replace those of the earlier run."""
     yield from sorted(shards.glob("[0-9]*.npz"), reverse=True)
     if target.exists():
         yield target
 
 
 def check_trajectory(shards: Path, target: Path, frames: int, particles: int | None = None) -> set[int]:
-    """Look through what :func:`pack_trajectory` would join, with the checksum of every array.
+    """Check the files that :func:`pack_trajectory` would join, with the checksum of every array.
 
     Args:
         shards: Folder with an .npz per frame.
-        target: The file that was joined before, if any.
+        target: The joined file of an earlier part, if any.
         frames: Number of frames that were recorded.
         particles: Number of particles that each must have; None for any.
 
     Returns:
-        The frames of which position and F are there.
+        The frames that have both position and F.
 
     Raises:
-        ValueError: If a file is damaged, or is no regular one.
+        ValueError: If a file is damaged or not a regular file.
     """
     found: dict[str, set[int]] = {"position": set(), "F": set()}
     for source in _sources(shards, target):
@@ -71,10 +71,10 @@ def check_trajectory(shards: Path, target: Path, frames: int, particles: int | N
                 for member in archive.infolist():
                     name = _MEMBER.fullmatch(member.filename)
                     if name is None:
-                        raise ValueError(f"it holds {member.filename}, which no run writes")
+                        raise ValueError(f"it contains {member.filename}, which no run writes")
                     with archive.open(member) as stream:
                         _check_array(stream, name[1], particles)
-                        while stream.read(1 << 20):  # to the end, where its checksum is compared
+                        while stream.read(1 << 20):  # up to the end, where its checksum is compared
                             pass
                     if int(name[2]) < frames:
                         found[name[1]].add(int(name[2]))
@@ -87,13 +87,13 @@ def check_trajectory(shards: Path, target: Path, frames: int, particles: int | N
 
 
 def _check_array(stream: IO[bytes], name: str, particles: int | None) -> None:
-    """Read the header of an array, which must be of the kind that a run writes."""
+    """Read the header of an array and check its shape and type."""
     if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError("an array is of another format")
+        raise ValueError("an array has another format")
     shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
     sizes, kind = ((3,), np.float32) if name == "position" else ((3, 3), np.float16)
     if shape[1:] != sizes or dtype != kind or (particles is not None and shape[0] != particles):
-        raise ValueError(f"an array of {dtype} {shape} is none of this run")
+        raise ValueError(f"an array of {dtype} {shape} is not from this run")
 
 
 def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, Tensor]:
@@ -104,10 +104,10 @@ def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, T
         frame: Frame number from 0.
 
     Raises:
-        ValueError: If the file does not hold the frame.
+        ValueError: If the frame is not in the file.
     """
     with np.load(check_archive(path, "the run")) as arrays:
         name = f"{frame:05d}"
         if f"position_{name}" not in arrays:
-            raise ValueError(f"{path} holds no frame {frame}: it has {len(arrays.files) // 2} frames.")
+            raise ValueError(f"{path} has no frame {frame}: it has {len(arrays.files) // 2} frames.")
         return torch.from_numpy(arrays[f"position_{name}"]), torch.from_numpy(arrays[f"F_{name}"]).float()

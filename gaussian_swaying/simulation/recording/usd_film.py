@@ -17,7 +17,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 
 
 def write_usd_frame(path: Path, cloud: GaussianCloud, frame: SimFrame) -> None:
-    """Write one frame as .npz, whole or not at all.
+    """Write one frame as .npz, completely or not at all.
 
     Args:
         path: The .npz file.
@@ -33,7 +33,7 @@ def write_usd_frame(path: Path, cloud: GaussianCloud, frame: SimFrame) -> None:
 def pack_usd(shards: Path, target: Path, wanted: Iterable[int], fps: float) -> None:
     """Join the frames into one film. Frames of an earlier part of a resumed run come from the film of that part.
 
-    Without new frames the film stays as it is.
+    Without new frames the film does not change.
 
     Args:
         shards: Folder with an .npz for each frame, ``00000.npz`` ...; removed at the end.

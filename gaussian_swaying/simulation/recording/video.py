@@ -18,10 +18,10 @@ from gaussian_swaying._files import temporary_name
 
 
 class VideoEncoder:
-    """ffmpeg in a process of its own, given one frame after the other.
+    """Encodes frames one by one with ffmpeg in a separate process.
 
-    H.264 in yuv420p; odd sizes are padded by a row or column, as the format needs even ones. The file appears under its
-    name in :meth:`finish`. An encoder that is given up before leaves neither a process nor a file behind.
+    The format is H.264 in yuv420p; odd sizes are padded by a row or column, as it needs even ones. The file gets its
+    name in :meth:`finish`. An encoder that is aborted earlier leaves no process and no file behind.
 
     Args:
         path: The .mp4 file.
@@ -38,10 +38,10 @@ class VideoEncoder:
         self._end: Callable[[], Any] = lambda: None
 
     def write(self, image: np.ndarray) -> None:
-        """Add a frame, uint8 (H, W, 3). One thread at a time.
+        """Add a frame, uint8 (H, W, 3). Only one thread may call this at a time.
 
         Raises:
-            OSError: If ffmpeg fails, with its last message, or the frame has another size than the first.
+            OSError: If ffmpeg fails, with its last message, or the size of the frame differs from the first.
         """
         with self._lock:
             if self._closed:
@@ -62,7 +62,7 @@ class VideoEncoder:
             raise self._failure() from None
 
     def finish(self) -> None:
-        """Wait for ffmpeg and give the file its name; without frames there is none.
+        """Wait for ffmpeg and rename the file; without frames there is no file.
 
         Raises:
             OSError: If ffmpeg fails, with its last message.
@@ -70,7 +70,7 @@ class VideoEncoder:
         if self._process is None:
             return
         assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # the exit status tells
+        with suppress(BrokenPipeError):  # the exit status shows the error
             self._process.stdin.close()
         if self._process.wait() != 0:
             raise self._failure()
@@ -78,7 +78,7 @@ class VideoEncoder:
         self.abort()
 
     def abort(self) -> None:
-        """Give up what is not finished; no more frames are taken."""
+        """Stop, and remove an unfinished file; no more frames are accepted."""
         with self._lock:
             self._closed = True
         self._end()
@@ -92,7 +92,7 @@ class VideoEncoder:
         command += ["-movflags", "+faststart", str(self._temporary.resolve())]
         self._size = (height, width)
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - unlike a pipe, never full
-        # in a session of its own, so that Ctrl-C does not end it before its last frame
+        # in a separate session, so that Ctrl-C does not end it before its last frame
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=self._messages, start_new_session=True)
         self._end = weakref.finalize(self, _end_process, self._process, self._messages, self._temporary)
 

@@ -1,4 +1,4 @@
-"""Writing beside the run: copies on the host that nobody waits for, and threads that put them on disk."""
+"""Writing in the background: asynchronous copies to the host, and threads that write them to disk."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# compression gives up Python's lock, so the threads work side by side; half of the cores are left to the simulation
+# compression releases Python's lock, so the threads run in parallel; half of the cores are left for the simulation
 WORKERS = max(2, min(8, (os.cpu_count() or 1) // 2))
-QUEUE_LIMIT = 4 * WORKERS  # jobs waiting or in work; a frame has up to five, so memory holds about one frame a thread
-_POLL = 0.2  # s; no wait is longer, so that Ctrl-C is heard on every platform
+QUEUE_LIMIT = 4 * WORKERS  # jobs waiting or running; a frame has up to five, so memory holds about one frame per thread
+_POLL = 0.2  # s; no wait is longer, so that Ctrl-C works on every platform
 
 
 @cache
@@ -24,13 +24,13 @@ def _copy_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 class HostCopy:
-    """The tensors of a nested value as they are now, on the host.
+    """A copy of the tensors of a nested value on the host.
 
-    Changing the value afterwards changes nothing in the copy. Tensors on a GPU are cloned there and go to pinned memory
-    in a stream of their own: neither the host nor the other streams wait.
+    Later changes of the value do not affect the copy. Tensors on a GPU are cloned there and copied to pinned memory in
+    a separate stream, so neither the host nor the other streams wait.
 
     Args:
-        value: A tensor, or dicts, lists and tuples of tensors and of what cannot be changed.
+        value: A tensor, or dicts, lists and tuples of tensors and immutable values.
     """
 
     def __init__(self, value: Any) -> None:
@@ -43,7 +43,7 @@ class HostCopy:
             self._copied.append(event)
 
     def get(self) -> Any:
-        """The value with its tensors on the host, of the same shapes and types; waits until they are there."""
+        """Wait for the copy and return the value with its tensors on the host, with the same shapes and types."""
         for event in self._copied:
             event.synchronize()
         self._clones.clear()
@@ -51,7 +51,7 @@ class HostCopy:
 
     def _copy(self, value: Any) -> Any:
         if isinstance(value, Tensor):
-            clone = value.detach().clone()  # with its strides, on which the last bits of a product depend
+            clone = value.detach().clone()  # with its strides, as the last bits of a product depend on them
             return self._to_host(clone) if clone.is_cuda else clone
         if isinstance(value, dict):
             return {key: self._copy(item) for key, item in value.items()}
@@ -78,21 +78,20 @@ class _Job:
 
 
 class FrameWriter:
-    """Does jobs in background threads, in any order but for the promises of :meth:`submit`.
+    """Runs jobs in background threads. The only order is that promised by :meth:`submit`.
 
-    At most ``limit`` jobs wait or are in work at a time; whoever submits one more waits. Once a job fails, what was
-    submitted before it is still done, what was submitted after it and has not begun is not, and nothing more is taken.
-    Threads end when there is nothing left to do, so a writer that is given up keeps nothing alive; one whose jobs are
-    not done keeps the process until they are.
+    At most ``limit`` jobs wait or run at a time; submitting one more waits. If a job fails, earlier jobs still run,
+    later jobs that have not started do not, and no more jobs are accepted. Threads end when there is nothing left to
+    do, so an unused writer keeps nothing alive. With unfinished jobs the process stays alive until they are done.
 
     Args:
-        limit: Largest number of jobs that wait or are in work.
+        limit: Largest number of jobs that wait or run.
         workers: Largest number of threads.
     """
 
     def __init__(self, limit: int = QUEUE_LIMIT, workers: int = WORKERS) -> None:
         self.limit, self.workers = limit, workers
-        self._jobs: list[_Job] = []  # waiting and in work, in the order of submission
+        self._jobs: list[_Job] = []  # waiting and running, in the order of submission
         self._threads: set[threading.Thread] = set()
         self._changed = threading.Condition(threading.Lock())
         self._error: BaseException | None = None
@@ -100,20 +99,20 @@ class FrameWriter:
 
     @property
     def pending(self) -> int:
-        """Number of jobs that wait or are in work."""
+        """Number of jobs that wait or run."""
         return len(self._jobs)
 
     def submit(self, name: str, run: Callable[[], None], after_all: bool = False) -> None:
-        """Have ``run()`` called in a thread; waits while ``limit`` jobs are pending.
+        """Call ``run()`` in a thread; waits while ``limit`` jobs are pending.
 
         Args:
-            name: What it writes. Jobs of the same name are done one after the other, as they were submitted.
-            run: The job. It gets no arguments; what it holds on to must not change.
-            after_all: Begin only once everything submitted before it is done.
+            name: Name of its file. Jobs with the same name run one after the other, in the order of submission.
+            run: The job. It gets no arguments; its data must not change.
+            after_all: Start only when everything submitted before is done.
 
         Raises:
-            OSError: If an earlier job could not write, with its name; then and from then on this one is not taken.
-            BaseException: If an earlier job failed in another way: what it raised.
+            OSError: If an earlier job could not write, with its name; this job and later ones are not accepted.
+            BaseException: The error of an earlier job that failed in another way.
         """
         with self._changed:
             while len(self._jobs) >= self.limit and self._error is None:
@@ -126,11 +125,11 @@ class FrameWriter:
             self._hire()
 
     def wait(self) -> None:
-        """Return once no job is pending.
+        """Wait until no job is pending.
 
         Raises:
-            OSError: If a job could not write, unless a call has raised it before.
-            BaseException: If a job failed in another way, likewise.
+            OSError: If a job could not write and no call has raised it yet.
+            BaseException: The error of a job that failed in another way, if no call has raised it yet.
         """
         with self._changed:
             while self._jobs:
@@ -141,7 +140,7 @@ class FrameWriter:
                 raise self._error
 
     def _hire(self) -> None:
-        """Start a thread if there is work for it. Called with the lock held."""
+        """Start a thread if there is work for it. Call it with the lock held."""
         if len(self._threads) >= self.workers or self._next() is None:
             return
         thread = threading.Thread(target=self._work, name="frame-writer")
@@ -153,7 +152,7 @@ class FrameWriter:
             raise
 
     def _next(self) -> _Job | None:
-        """The first job that may begin. Called with the lock held."""
+        """The first job that may start. Call it with the lock held."""
         earlier: set[str] = set()
         for job in self._jobs:
             if not job.running and job.name not in earlier and not (job.after_all and earlier):
@@ -171,7 +170,7 @@ class FrameWriter:
                 job.running = True
             error: BaseException | None = None
             try:
-                with torch.inference_mode():  # of which each thread has its own
+                with torch.inference_mode():  # inference mode is set per thread
                     job.run()
             except OSError as failure:
                 error = OSError(f"{job.name} could not be written: {failure.strerror or failure}")
@@ -185,7 +184,7 @@ class FrameWriter:
                     self._error = self._error or error
                 self._jobs.remove(job)
                 self._changed.notify_all()
-            del job  # and with it the frame that it holds
+            del job  # frees the frame that it refers to
 
 
 __all__ = ["QUEUE_LIMIT", "WORKERS", "FrameWriter", "HostCopy"]

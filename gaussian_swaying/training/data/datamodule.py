@@ -112,10 +112,10 @@ class CaptureDataset(Dataset[TrainingImage]):
 class CaptureDataModule(LightningDataModule):
     """Training, validation and test images of a capture.
 
-    A batch is one :class:`TrainingImage`. There is no end of training images: they come in rounds whose order depends
-    only on ``seed``. A run resumed from a checkpoint continues with the next image; one image is one step of the
-    trainer. Validation and test images are sorted by name. Validation uses the split ``val`` of the capture, or
-    ``test`` if there is none. Alpha is passed on, as the trainer chooses the background.
+    A batch is one :class:`TrainingImage`. Training images are endless: they come in rounds whose order depends only on
+    ``seed``. A run resumed from a checkpoint continues with the next image; one image is one step of the trainer.
+    Validation and test images are sorted by name. Validation uses the split ``val`` of the capture, or ``test`` if
+    there is none. Alpha is passed on, as the trainer chooses the background.
 
     Args:
         path: Folder or transforms.json, see :func:`~gaussian_swaying.captures.capture.read_capture`.

@@ -1,8 +1,8 @@
 r"""Friction angles that the Drucker-Prager law mobilises in three tests of one element.
 
-Which angle stands for "30 degrees" depends on the test. The cone meets the Mohr-Coulomb pyramid in triaxial compression
-only: there the law mobilises 30.0 degrees, in steady simple shear 34.6 and in plane strain 43.9. So a layer on an
-incline stands up to 34.6 degrees, and a planar column is stronger than real sand of 30 degrees.
+The angle for a friction angle of 30 degrees depends on the test. The cone touches the Mohr-Coulomb pyramid only in
+triaxial compression. There the law mobilises 30.0 degrees, in steady simple shear 34.6 and in plane strain 43.9. So a
+layer on an incline is stable up to 34.6 degrees, and a planar column is stronger than real sand of 30 degrees.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def shear_angle(law: ConstitutiveLaw, steps: int = 100, increment: float = 1e-3,
     Args:
         law: The law under test.
         steps: Number of increments.
-        increment: Shear of each.
+        increment: Shear of each increment.
         pressure: Confining pressure over Young's modulus.
 
     Returns:

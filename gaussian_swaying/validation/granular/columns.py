@@ -1,4 +1,4 @@
-"""A column of sand in a box, and one that is let go."""
+"""A column of sand in a box, and one that collapses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from gaussian_swaying.validation.settings import Axial, Result, Settings, follow
 def column_at_rest(
     settings: Settings | None = None, cells: int = 4, friction_angle: float = 30.0, seconds: float = 0.2, **more: Any
 ) -> Result:
-    """A square of sand between smooth walls, as deep as wide, under the stress that its weight gives it.
+    """A square of sand between smooth walls, as deep as wide, with the stress due to its weight.
 
     Args:
         settings: The numerics under test.
@@ -75,15 +75,15 @@ def column_collapse(
     compression: float = 1e-2,
     duration: float = 5.0,
 ) -> Result:
-    r"""Let go a column of sand and watch it spread over a rough floor.
+    r"""Release a column of sand and let it spread over a rough floor.
 
     Planar: half of a column, or one beside a smooth wall, in plane strain (one layer of particles, which does not move
-    along y). Otherwise a quarter of a round column. It starts with the stress under its weight; the half width or
+    along y). Otherwise a quarter of a round column. It starts with the stress due to its weight; the half width or
     radius :math:`L_0` is 0.1 m.
 
-    The bulk is where the mass, spread with the B-spline of a cell and mirrored in floor and symmetry planes, comes to
-    more than half of the density at rest: gaps inside do not count, nor does spray. The surface is the thickness of the
-    bulk over each point of the floor.
+    The bulk is where the mass, spread with the B-spline of a cell and mirrored in floor and symmetry planes, is more
+    than half of the density at rest: gaps inside and spray do not matter. The surface is the thickness of the bulk over
+    each point of the floor.
 
     Coarse grids stop the sand too early: the transfers smooth the flow within a cell in every substep, so the run-out
     grows with the cells and falls with the substeps. At a = 1, planar: 0.57, 0.68, 0.77, 0.88 and 0.95 with 4, 8, 16,
@@ -97,7 +97,7 @@ def column_collapse(
         planar: Plane strain, or else a round column.
         friction_angle: Friction angle of the law [degrees].
         volume_correction: See :class:`~gaussian_swaying.mpm.laws.sand.Sand`.
-        floor_friction: Coulomb coefficient of the floor, or None for a floor that holds what touches it.
+        floor_friction: Coulomb coefficient of the floor, or None for a sticky floor.
         compression: Weight of the column over Young's modulus, about the compression at its foot.
         duration: Time over :math:`\sqrt{H_0 / g}`; in experiments a column rests after about 3.
 

@@ -1,4 +1,4 @@
-"""What a column of sand leaves on the floor: bulk, height and slope, and run-outs in experiments."""
+"""The deposit of a column of sand: bulk, height and slope; and run-outs in experiments."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 def bulk(position: Tensor, volume: Tensor, dx: float, planar: bool) -> tuple[float, Tensor, Tensor]:
     """Volume of the bulk [m³], and its thickness [m] over points of the floor at given distances [m], both (N,).
 
-    Sampled at the centres of squares or cubes of a quarter or half a cell, which floor and symmetry planes bound.
+    Sampled at the centres of squares or cubes of a quarter or half a cell, bounded by floor and symmetry planes.
     """
     fine = 4 if planar else 2
     axes = (0, 2) if planar else (0, 1, 2)

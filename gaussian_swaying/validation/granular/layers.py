@@ -1,4 +1,4 @@
-"""A layer of sand without end: on inclines, and thrown up."""
+"""An infinite layer of sand: on inclines, and thrown up."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gaussian_swaying.validation.settings import Result, Settings, follow, latti
 
 
 class _Invariant(Boundary):
-    """Gives all nodes of one height the velocity of the one at x = y = 0: a layer without end.
+    """Gives all nodes at one height the velocity of the node at x = y = 0, as in an infinite layer.
 
     With the particles at x = y = 0 the stress along the layer does not act on that node, and its shear stress and mass
     are those of the layer.
@@ -58,10 +58,11 @@ def inclined_layer(
     seconds: float = 0.3,
     compression: float = 1e-2,
 ) -> tuple[list[float], list[float], Result]:
-    """Lay sand on rough inclines without end and find how fast it moves off.
+    """Put sand on infinite rough inclines and measure how fast it accelerates.
 
-    Nothing varies along the slope, so one column of particles is enough; each is put back to x = 0 after each substep.
-    The layer starts with the stress under its weight on a level floor; gravity tilts over the first third of the time.
+    Nothing varies along the slope, so one column of particles is enough; each particle is moved back to x = 0 after
+    each substep. The layer starts with the stress due to its weight on a level floor; gravity is tilted during the
+    first third of the time.
 
     Args:
         angles: Inclinations [degrees].
@@ -110,11 +111,10 @@ def angle_of_repose(
     angles: Sequence[float] = tuple(range(30, 41)),
     **more: Any,
 ) -> Result:
-    r"""The steepest incline on which a layer stands.
+    r"""The steepest incline on which a layer stays at rest.
 
-    A layer flows if it gathers speed by more than 0.2 % of g. In theory it does so by
-    :math:`g (\sin\theta - \mu \cos\theta)`; the dissipation of the grid takes some of it away, the more the coarser the
-    grid.
+    A layer flows if it accelerates by more than 0.2 % of g. In theory the acceleration is
+    :math:`g (\sin\theta - \mu \cos\theta)`. The dissipation of the grid reduces it, and more so on coarser grids.
 
     Args:
         settings: The numerics under test.
@@ -124,10 +124,10 @@ def angle_of_repose(
         more: ``volume_correction``, ``seconds`` and ``compression``, see :func:`inclined_layer`.
 
     Returns:
-        ``stands`` and ``flows``: the steepest inclination that stands, and the gentlest that flows [degrees];
-        ``friction_deg``: where the acceleration vanishes, extrapolated from the two gentlest that flow [degrees];
-        ``exact``: :func:`shear_angle`; ``error`` of ``friction_deg`` relative to it; ``acceleration_error`` on the
-        steepest incline, relative to theory; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
+        ``stands`` and ``flows``: the steepest angle at rest, and the gentlest that flows [degrees]; ``friction_deg``:
+        where the acceleration vanishes, extrapolated from the two gentlest that flow [degrees]; ``exact``:
+        :func:`shear_angle`; ``error`` of ``friction_deg`` relative to it; ``acceleration_error`` on the steepest
+        incline, relative to theory; ``simulated_s``, ``substeps``, ``wall_s`` and ``particles``.
     """
     found, _, numbers = inclined_layer(angles, settings, cells, friction_angle, **more)
     flows = [k for k, gain in enumerate(found) if gain > 2e-3]
@@ -157,10 +157,10 @@ def tossed_layer(
     seconds: float = 0.6,
     compression: float = 1e-2,
 ) -> Result:
-    """Throw up a layer without end so that it is pulled apart, and let it fall back.
+    """Throw an infinite layer up so that it is pulled apart, and let it fall back.
 
-    Its velocity grows from zero at the floor to that which takes the surface up by ``rise``. Where sand is pulled apart
-    the return map forgets the gap, and without correction the sand that falls back stands the taller for it.
+    Its velocity grows from zero at the floor to the value that lifts the surface by ``rise``. Where sand is pulled
+    apart, the return map forgets the gap. Without correction the layer is therefore taller after it falls back.
 
     Args:
         settings: The numerics under test.

@@ -1,4 +1,4 @@
-"""What layers and columns of sand share: numbers, the state at the start, and the formulation.
+"""Shared by layers and columns of sand: constants, the initial state, and the formulation.
 
 The runs are in metres, seconds and kilograms, and in the ``updated`` formulation whatever the settings say.
 """
@@ -20,7 +20,7 @@ FRAMES = 50
 
 
 def updated(settings: Settings | None) -> Settings:
-    """The settings, or those by default, with the ``updated`` formulation."""
+    """The given or default settings with the ``updated`` formulation."""
     return dataclasses.replace(Settings() if settings is None else settings, formulation="updated")
 
 

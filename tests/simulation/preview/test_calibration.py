@@ -57,7 +57,7 @@ def test_stiffness_goes_first_then_thickness_then_wind():
     blown = calibrate(beam(1e5), START, 1.0)
     assert (blown.setting.E, blown.setting.thickness) == (STIFFEST, THICKEST)
     assert 0.1 < blown.setting.wind < 0.3
-    assert "wind was weakened to" in blown.reason
+    assert "wind was reduced to" in blown.reason
 
 
 def test_what_can_hardly_move_says_so():

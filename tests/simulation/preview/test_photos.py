@@ -205,7 +205,11 @@ def test_cameras_that_look_elsewhere_are_refused(tmp_path, capsys):
     write_ply(splat, cloud_of(everything))
     away = write_capture(tmp_path / "away", cameras(ring(9, 2.0), (0.0, 0.0, 900.0)))
     side = write_capture(tmp_path / "side", cameras([(float(k), 0.0, 0.0) for k in range(3)], (1e7, 0.0, 0.0)))
-    for folder, words in ((away, "splat has 0 Gaussians"), (side, "look at no common point"), (tmp_path / "no", "no")):
+    for folder, words in (
+        (away, "splat has 0 Gaussians"),
+        (side, "do not look at a common point"),
+        (tmp_path / "no", "no"),
+    ):
         assert main([str(splat), "--capture", str(folder), "--output", str(tmp_path / "out"), "--device", "cpu"]) == 2
         error = capsys.readouterr().err
         assert words in error
@@ -213,7 +217,7 @@ def test_cameras_that_look_elsewhere_are_refused(tmp_path, capsys):
         assert not (tmp_path / "out").exists()
     view = captured_from(side)
     assert view.focus is None
-    with pytest.raises(ValueError, match="give `--region`"):
+    with pytest.raises(ValueError, match="set `--region`"):
         looked_at(everything, view)
 
 

@@ -238,9 +238,9 @@ def test_too_little_above_the_floor_is_refused():
     cloud = tree().select(torch.arange(0, 1700))
     with pytest.raises(ValueError, match="too few for an object"):
         suggest(cloud.select(torch.arange(10)))
-    with pytest.raises(ValueError, match=r"box of `--region` holds 0 Gaussians.*splat reaches from"):
+    with pytest.raises(ValueError, match=r"box of `--region` contains 0 Gaussians.*splat spans"):
         given_region(cloud.means, torch.ones(1700), torch.ones(1700), [90, 90, 90], [91, 91, 91])
-    with pytest.raises(ValueError, match="lie at one point"):
+    with pytest.raises(ValueError, match="are at one point"):
         suggest(splat(torch.ones(50, 3), torch.zeros(50, 3)))
 
 

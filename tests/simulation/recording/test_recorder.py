@@ -159,7 +159,7 @@ def test_the_trajectory_holds_every_frame(make_simulation, tmp_path):
         position, F = load_trajectory(tmp_path / "run" / "trajectory.npz", frame)
         assert torch.equal(position, state.position)
         torch.testing.assert_close(F, state.F_total, rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="holds no frame 3: it has 3 frames"):
+    with pytest.raises(ValueError, match="has no frame 3: it has 3 frames"):
         load_trajectory(tmp_path / "run" / "trajectory.npz", 3)
 
 
@@ -683,7 +683,7 @@ def test_foreign_files_are_not_overwritten(name, make_simulation, tmp_path):
     file = tmp_path / "mine" / name
     file.parent.mkdir(parents=True)
     file.write_text("precious")
-    with pytest.raises(ValueError, match=r"mine holds \w+.* choose another with --output"):
+    with pytest.raises(ValueError, match=r"mine contains \w+.* choose another with --output"):
         _run(make_simulation(), tmp_path / "mine", 1)
     assert file.read_text() == "precious"
     assert len([path for path in (tmp_path / "mine").rglob("*") if path.is_file()]) == 1
