@@ -671,6 +671,7 @@ class SimulationPipeline(nn.Module):
             "particles": self.solver.points.count,
             "gaussians": len(self.scene.model.means),
             "simulated_gaussians": len(self.scene.chosen),
+            "loose_gaussians": self.scene.loose,
             "surface_particles": self.scene.on_surface,
             "filled_particles": self.scene.filled,
             "mass_kg": float(self.solver.points.mass.sum()),

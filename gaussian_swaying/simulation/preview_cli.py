@@ -141,6 +141,9 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "draft_cost": _cost_dict(costs["draft"]),
     }
     report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found)]
+    if pipeline.scene.loose:
+        words = f"{pipeline.scene.loose:,} specks hang on nothing; they follow their nearest neighbours"
+        report.append(f"  note: {words} (scene.loose: carry)")
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
     report += _cost_lines(costs["starter"])
     output, stem = Path("outputs"), splat_name(options.scene)
@@ -282,7 +285,6 @@ def suggestion_dict(found: Suggestion) -> dict[str, Any]:
             "simulated": int(found.region.simulated.sum()),
             "opacity_threshold": found.region.opacity_threshold,
             "specks": found.region.specks,
-            "loose": found.region.loose,
             "reason": found.region.reason,
         },
         "hold": asdict(found.hold) | {"region": None if found.pin is None else region_dict(found.pin)},
@@ -307,6 +309,7 @@ def run_dict(pipeline: SimulationPipeline) -> dict[str, Any]:
         "gaussians": len(scene.model.means),
         "simulated": int(parts.simulated.sum()),
         "carried": int(parts.carried.sum()),
+        "loose": scene.loose,
         "held": int(parts.pinned.sum()),
         "conditions": parts.names,
         "regions": [repr(b.region) for b in conditions(pipeline) if hasattr(b, "region")],
@@ -377,7 +380,7 @@ def _run_lines(run: dict[str, Any]) -> list[str]:
         "this configuration",
         f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
         f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
-        f"  follow them     {run['carried']:,} faint ones",
+        f"  follow them     {run['carried']:,} faint or loose ones",
         f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
         f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
         *(f"                  {region}" for region in run["regions"]),

@@ -38,7 +38,7 @@ class Parts:
 
     Attributes:
         simulated: Those that the region and the opacity choose.
-        carried: Faint ones that follow them.
+        carried: Faint and loose ones that follow them.
         pinned: Simulated ones that a condition holds.
         pushed: Simulated ones that an impulse pushes.
         names: What each condition is and how many it holds, in words.
@@ -323,7 +323,7 @@ def _legend(
         (WIND, f"wind {[round(v, 2) for v in flow]} m/s (z up), before gusts"),
         (NORMAL, "normals, turned to the eye"),
         ((190, 190, 190), f"not simulated: {int((~(parts.simulated | parts.carried)).sum()):,} Gaussians, greyed"),
-        ((120, 120, 120), f"faint, follow their neighbours: {int(parts.carried.sum()):,} Gaussians"),
+        ((120, 120, 120), f"faint or loose, follow their neighbours: {int(parts.carried.sum()):,} Gaussians"),
     ]
     if bool(parts.pushed.any()):
         entries.append((PUSHED, f"pushed: {int(parts.pushed.sum()):,} Gaussians"))

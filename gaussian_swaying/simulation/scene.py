@@ -27,6 +27,7 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
+from gaussian_swaying.simulation.shape import connected_parts
 
 
 @dataclass
@@ -97,6 +98,8 @@ class Scene:
         region: Part that is simulated, in scene units; the rest stays as it is and is rendered with it.
         opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
         faint: What those do: ``carry`` (follow their nearest simulated neighbour), ``static`` or ``drop``.
+        loose: What specks do that hang on nothing (see :func:`loose_points`): ``simulate``, as all others, so they fly
+            off in the wind; or ``carry`` (carry no mass, feel no wind, follow their nearest simulated neighbour).
         up: Direction in the scene that points up, for example [0, -1, 0].
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
@@ -138,9 +141,11 @@ class Scene:
         layers: int = 1,
         particle_spacing: float | None = None,
         sampling: str = "gaussian",
+        loose: str = "simulate",
     ) -> None:
         check_choice("scene.sampling", sampling, ("gaussian", "grid"))
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
+        check_choice("scene.loose", loose, ("simulate", "carry"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
         check_choice("scene.area", area, ("coverage", "paper", "equal"))
         if not any(check_vector("scene.up", up)):
@@ -168,7 +173,7 @@ class Scene:
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
         self.max_stretch = None if max_stretch is None else float(max_stretch)
-        self.layers, self.particle_spacing, self.sampling = layers, particle_spacing, sampling
+        self.layers, self.particle_spacing, self.sampling, self.loose = layers, particle_spacing, sampling, loose
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -179,6 +184,7 @@ class Scene:
 
 
 POINTS_PER_CELL = 2.2  # and direction, of ``sampling: grid``; more is finer than the grid can show
+LOOSE = 0.01  # share of the largest connected part below which a part is loose
 FOLLOWED = 6  # points that a Gaussian without one of its own follows
 _SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 
@@ -195,12 +201,14 @@ class SimulatedScene(nn.Module):
     Args:
         scene: Where the Gaussians come from.
         material: What they are made of.
-        dx: Grid spacing [m], for ``material.volume = "cell"`` and as twice the spacing of ``scene.filling``.
+        dx: Grid spacing [m], for ``material.volume = "cell"``, as twice the spacing of ``scene.filling``, and for
+            ``scene.sampling`` and ``scene.loose``.
         dtype: Precision of the simulation.
 
     Attributes:
         chosen: Indices of the Gaussians that the region and the opacity choose; with ``sampling: gaussian`` these are
-            the simulated ones, with ``grid`` the others of them are carried.
+            the simulated ones, with ``grid`` the others of them are carried. Without those that are loose.
+        loose: Number of Gaussians that the region and the opacity choose but that are loose, and carried.
         points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
         filled: Number of points within a solid.
         on_surface: Number of points on the surface, which are the first: the simulated Gaussians, then the further
@@ -233,6 +241,19 @@ class SimulatedScene(nn.Module):
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
+        further = None if scene.particle_spacing is None else scene.particle_spacing / self.frame.metres_per_unit
+        pieces = _pieces(cloud, simulated, further)
+        carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
+        self.loose = 0
+        if scene.loose == "carry":
+            where = means if pieces is None else torch.cat([means, pieces.means.to(means)])
+            cube = dx / POINTS_PER_CELL / self.frame.metres_per_unit
+            specks = simulated[loose_points(where, cube)[: len(means)]]
+            self.loose = len(specks)
+            if self.loose:
+                chosen[specks], carried[specks] = False, True
+                simulated = chosen.nonzero()[:, 0]
+                pieces = _pieces(cloud, simulated, further)
         normals = self.model.normals()
         position = self.frame.point_to_sim(cloud.means[simulated].double())
         filling = None
@@ -241,11 +262,7 @@ class SimulatedScene(nn.Module):
             visible = self.model.opacity()[simulated]
             filling = within_region(scene.filling.fill(position, shape, visible, 0.5 * dx), scene.region, self.frame)
         self.filled = 0 if filling is None else len(filling.position)
-        pieces = None
-        if scene.particle_spacing is not None:
-            spacing = scene.particle_spacing / self.frame.metres_per_unit
-            part = cloud.select(simulated)
-            pieces = subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
+        if pieces is not None:
             position = torch.cat([position, self.frame.point_to_sim(pieces.means.double())])
         source = torch.arange(len(simulated))  # the simulated Gaussian of each point on the surface
         source = source if pieces is None else torch.cat([source, pieces.parent])
@@ -255,7 +272,6 @@ class SimulatedScene(nn.Module):
         for group in (outer, ~outer):  # what lies within takes no area from the surface
             areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
         self.max_stretch = scene.max_stretch
-        carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
         followed = 1
         if scene.sampling == "grid":
             kept, group = group_points(position, areas, dx / POINTS_PER_CELL, preferred=len(simulated))
@@ -445,6 +461,35 @@ class SimulatedScene(nn.Module):
         own = values[: len(self.simulated)].to(self.model.means.dtype)
         found = own.new_zeros(len(self.model.means))
         return found.index_copy(0, self.moving, torch.cat([own, self._blend(own[self.anchor])]))
+
+
+def loose_points(points: Tensor, side: float) -> Tensor:
+    """Which points hang on nothing: those in a small part that is not connected to the rest.
+
+    Points in the same or in touching cubes are connected. A part is loose if it has fewer than one in a hundred of the
+    points of the largest part. As a surface it is then less than a tenth as long as the largest, 2.4 of 24 cells: too
+    short for the grid to bend.
+
+    Args:
+        points: Points, shape (N, 3).
+        side: Side of the cubes, in the unit of the points: the grid spacing over :data:`POINTS_PER_CELL`, so that
+            neighbours are less than a grid cell apart along each axis. Farther ones share only the rim of their
+            kernels, and the grid lets them move apart without any strain.
+
+    Returns:
+        Booleans, shape (N,).
+    """
+    part = connected_parts(points, side)
+    size = part.bincount()
+    return size[part] < LOOSE * size.max()
+
+
+def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None) -> Subdivision | None:
+    """Further points on the large ones of the simulated Gaussians, no farther apart than a spacing [scene units]."""
+    if spacing is None:
+        return None
+    part = cloud.select(simulated)
+    return subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
 
 
 def _areas(
