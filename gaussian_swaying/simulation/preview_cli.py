@@ -142,7 +142,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     }
     report = [*_splat_lines(options.scene, cloud, data), *_suggestion_lines(found)]
     if pipeline.scene.loose:
-        words = f"{pipeline.scene.loose:,} specks hang on nothing; they follow their nearest neighbours"
+        words = f"{pipeline.scene.loose:,} specks hang on nothing or by a thread; they follow their nearest neighbours"
         report.append(f"  note: {words} (scene.loose: carry)")
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
     report += _cost_lines(costs["starter"])

@@ -27,7 +27,7 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
-from gaussian_swaying.simulation.shape import connected_parts
+from gaussian_swaying.simulation.shape import loose_points
 
 
 @dataclass
@@ -98,8 +98,9 @@ class Scene:
         region: Part that is simulated, in scene units; the rest stays as it is and is rendered with it.
         opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
         faint: What those do: ``carry`` (follow their nearest simulated neighbour), ``static`` or ``drop``.
-        loose: What specks do that hang on nothing (see :func:`loose_points`): ``simulate``, as all others, so they fly
-            off in the wind; or ``carry`` (carry no mass, feel no wind, follow their nearest simulated neighbour).
+        loose: What specks do that hang on nothing, or by a thread (see
+            :func:`~gaussian_swaying.simulation.shape.loose_points`): ``simulate``, as all others, so that the wind
+            blows them away; or ``carry`` (no mass, no wind; they follow their nearest simulated neighbour).
         up: Direction in the scene that points up, for example [0, -1, 0].
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
@@ -184,7 +185,6 @@ class Scene:
 
 
 POINTS_PER_CELL = 2.2  # and direction, of ``sampling: grid``; more is finer than the grid can show
-LOOSE = 0.01  # share of the largest connected part below which a part is loose
 FOLLOWED = 6  # points that a Gaussian without one of its own follows
 _SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 
@@ -247,8 +247,8 @@ class SimulatedScene(nn.Module):
         self.loose = 0
         if scene.loose == "carry":
             where = means if pieces is None else torch.cat([means, pieces.means.to(means)])
-            cube = dx / POINTS_PER_CELL / self.frame.metres_per_unit
-            specks = simulated[loose_points(where, cube)[: len(means)]]
+            side = dx / POINTS_PER_CELL / self.frame.metres_per_unit
+            specks = simulated[loose_points(where, side)[: len(means)]]
             self.loose = len(specks)
             if self.loose:
                 chosen[specks], carried[specks] = False, True
@@ -461,27 +461,6 @@ class SimulatedScene(nn.Module):
         own = values[: len(self.simulated)].to(self.model.means.dtype)
         found = own.new_zeros(len(self.model.means))
         return found.index_copy(0, self.moving, torch.cat([own, self._blend(own[self.anchor])]))
-
-
-def loose_points(points: Tensor, side: float) -> Tensor:
-    """Which points hang on nothing: those in a small part that is not connected to the rest.
-
-    Points in the same or in touching cubes are connected. A part is loose if it has fewer than one in a hundred of the
-    points of the largest part. As a surface it is then less than a tenth as long as the largest, 2.4 of 24 cells: too
-    short for the grid to bend.
-
-    Args:
-        points: Points, shape (N, 3).
-        side: Side of the cubes, in the unit of the points: the grid spacing over :data:`POINTS_PER_CELL`, so that
-            neighbours are less than a grid cell apart along each axis. Farther ones share only the rim of their
-            kernels, and the grid lets them move apart without any strain.
-
-    Returns:
-        Booleans, shape (N,).
-    """
-    part = connected_parts(points, side)
-    size = part.bincount()
-    return size[part] < LOOSE * size.max()
 
 
 def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None) -> Subdivision | None:
