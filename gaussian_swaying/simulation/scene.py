@@ -13,7 +13,7 @@ from gaussian_swaying.data.procedural import ProceduralScene
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
-from gaussian_swaying.gaussians.grouping import blend_weights, group_points
+from gaussian_swaying.gaussians.grouping import blend_weights, group_points, loose_points
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Everything, Region, select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
@@ -27,7 +27,6 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.frame import SimFrame
-from gaussian_swaying.simulation.shape import loose_points
 
 
 @dataclass
@@ -99,7 +98,7 @@ class Scene:
         opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
         faint: What those do: ``carry`` (follow their nearest simulated neighbour), ``static`` or ``drop``.
         loose: What specks do that hang on nothing, or by a thread (see
-            :func:`~gaussian_swaying.simulation.shape.loose_points`): ``simulate``, as all others, so that the wind
+            :func:`~gaussian_swaying.gaussians.grouping.loose_points`): ``simulate``, as all others, so that the wind
             blows them away; or ``carry`` (no mass, no wind; they follow their nearest simulated neighbour).
         up: Direction in the scene that points up, for example [0, -1, 0].
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.gaussians.grouping import joined
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
 FEWEST = 16  # Gaussians that make an object
-LOOSE = 0.01  # share of the largest part; what is smaller and touches nothing is loose
 DIRECTIONS = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
@@ -100,54 +100,6 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
     Raises:
         ValueError: If ``cell`` is not positive.
     """
-    of_point, pairs = touching_cells(points, cell)
-    return _joined(int(of_point.max()) + 1, pairs)[of_point]
-
-
-def loose_points(points: Tensor, side: float) -> Tensor:
-    """Which points hang on nothing, or by a thread, so that a grid does not hold them.
-
-    Points in the same or in touching cubes are connected. Loose are
-
-    - the parts with fewer than one in a hundred of the cubes of the largest part: as surfaces they are less than a
-      tenth as long as it, too short for a usual grid to bend;
-    - the points of a cube that touches at most one other, once: to leave them out parts nothing, and a thread loses
-      its loose end only.
-
-    Args:
-        points: Points, shape (N, 3).
-        side: Side of the cubes, in the unit of the points. It has to be half the grid spacing or less: neighbours are
-            then at most one spacing apart along each axis. What is farther apart shares only the rims of its kernels,
-            and can move away without any strain that the points would see.
-
-    Returns:
-        Booleans, shape (N,); none if otherwise all would be loose.
-
-    Raises:
-        ValueError: If ``side`` is not positive.
-    """
-    of_point, pairs = touching_cells(points, side)
-    count = int(of_point.max()) + 1
-    part = _joined(count, pairs)
-    size = part.bincount()
-    loose = (size[part] < LOOSE * size.max()) | (pairs.flatten().bincount(minlength=count) < 2)
-    return (loose & ~loose.all())[of_point]
-
-
-def touching_cells(points: Tensor, cell: float) -> tuple[Tensor, Tensor]:
-    """Cells that hold points, and which of them share a face, an edge or a corner.
-
-    Args:
-        points: Shape (N, 3).
-        cell: Size of a cell.
-
-    Returns:
-        The number of the cell of each point, from 0 on, shape (N,), and each pair of cells that touch once, shape
-        (2, K).
-
-    Raises:
-        ValueError: If ``cell`` is not positive.
-    """
     check_shape("points", points, None, 3)
     check_positive("cell", cell)
     low = points.amin(0).double()
@@ -160,20 +112,4 @@ def touching_cells(points: Tensor, cell: float) -> tuple[Tensor, Tensor]:
             at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
             found = (key[at] == wanted).nonzero()[:, 0]
             pairs.append(torch.stack([found, at[found]]))
-    return of_point, torch.cat(pairs, 1)
-
-
-def _joined(count: int, pairs: Tensor) -> Tensor:
-    """Number of the connected part of each of ``count`` cells, from 0 on, by pairs that touch, shape (2, K)."""
-    one, other = pairs
-    label = torch.arange(count)
-    while True:  # the smaller number spreads, by halving of paths
-        smaller = torch.minimum(label[one], label[other])
-        new = label.clone()
-        for end in (one, other, label[one], label[other]):
-            new.scatter_reduce_(0, end, smaller, "amin")
-        new = new[new]
-        if new.equal(label):
-            break
-        label = new
-    return label.unique(return_inverse=True)[1]
+    return joined(len(key), torch.cat(pairs, 1))[of_point]
