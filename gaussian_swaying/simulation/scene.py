@@ -240,8 +240,8 @@ class SimulatedScene(nn.Module):
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
-        further = None if scene.particle_spacing is None else scene.particle_spacing / self.frame.metres_per_unit
-        pieces = _pieces(cloud, simulated, further)
+        piece_spacing = None if scene.particle_spacing is None else scene.particle_spacing / self.frame.metres_per_unit
+        pieces = _pieces(cloud, simulated, piece_spacing)
         carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
         self.loose = 0
         if scene.loose == "carry":
@@ -252,7 +252,7 @@ class SimulatedScene(nn.Module):
             if self.loose:
                 chosen[specks], carried[specks] = False, True
                 simulated = chosen.nonzero()[:, 0]
-                pieces = _pieces(cloud, simulated, further)
+                pieces = _pieces(cloud, simulated, piece_spacing)
         normals = self.model.normals()
         position = self.frame.point_to_sim(cloud.means[simulated].double())
         filling = None

@@ -218,7 +218,6 @@ def test_region_leaves_out_floor_and_specks():
     assert found.hold.end == "bottom"
     assert found.region.specks == 12
     assert len(found.region.holes) == 2
-    assert found.region.loose == 0
     simulated = found.region.simulated
     assert bool(simulated[CROWN].all())
     assert not bool(simulated[FLOOR].any())
@@ -339,7 +338,7 @@ def test_sheet_and_broad_side():
     assert broad_side(plate @ turn.T) == pytest.approx(-60, abs=2)
 
 
-def test_specks_beyond_the_boxes_are_counted_as_loose():
+def test_specks_beyond_the_boxes_follow_their_neighbours(make_scene):
     draw = torch.Generator().manual_seed(1)
     angle = torch.arange(10.0) * 0.6
     centre = torch.stack([0.3 * angle.cos(), 0.3 * angle.sin(), 0.2 + 0.045 * torch.arange(10.0)], -1) + 5.0
@@ -351,7 +350,9 @@ def test_specks_beyond_the_boxes_are_counted_as_loose():
     ground = floor_mask(points, smallest_axis_normal(both.quats, both.scales), weight, (0, 0, 1))
     found = suggest_region(points, both.opacities.sigmoid(), weight, ground, 0.05)
     assert len(found.holes) == MAX_BOXES
-    assert found.loose == 3 * (10 - MAX_BOXES)
+    scene = make_scene(both, dx=0.12, region=found.region(), loose="carry")
+    assert scene.loose == 3 * (10 - MAX_BOXES)
+    assert bool((scene.carried >= len(base)).all())
     assert found.specks == 30
 
 
