@@ -78,7 +78,9 @@ def test_what_further_points_join_is_not_loose(make_scene):
     assert filled.loose == 0
     assert filled.on_surface > len(filled.simulated)
     names = ("means", "quats", "scales", "opacities", "sh")
-    speck = dataclasses.replace(few.select(torch.tensor([30])), means=torch.tensor([[0.6, -0.7, 0.4]]))
+    alone = few.select(torch.tensor([30]))
+    speck = dataclasses.replace(alone, means=torch.tensor([[0.6, -0.7, 0.4]]), scales=alone.scales - 1.1)
+    assert make_scene(speck, dx=0.06, particle_spacing=0.025).on_surface > 1
     both = GaussianCloud(*(torch.cat([getattr(few, n), getattr(speck, n)]) for n in names))
     scene = make_scene(both, dx=0.06, particle_spacing=0.025, loose="carry")
     assert scene.loose == 1
