@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from gaussian_swaying.data.procedural import FlagScene
+from gaussian_swaying.gaussians.grouping import LOOSE
 from gaussian_swaying.gaussians.ply import GaussianCloud
 from gaussian_swaying.gaussians.selection import Box, Cylinder
 from gaussian_swaying.gaussians.surface import quat_to_rotation, smallest_axis_normal
@@ -34,6 +35,7 @@ from gaussian_swaying.simulation.preview import (
     suggest_threshold,
     visible_weight,
 )
+from gaussian_swaying.simulation.scene import POINTS_PER_CELL
 from gaussian_swaying.simulation.shape import SHEET, bounds, sheet_normal
 from gaussian_swaying.simulation.starter import DRAFT_FRAMES, draft_yaml, starter_yaml
 from gaussian_swaying.simulation.up import CONVENTION, floor_mask, guess_up
@@ -369,6 +371,8 @@ def test_page_states_the_numbers_of_the_rules():
         f"{100 * calibration.THINNEST:g} to {100 * calibration.THICKEST:g} % of the longest side",
         f"first {calibration.SECONDS:g} s",
         f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
+        f"less than {LOOSE:.0%}".replace("%", " % of what the largest part has"),
+        f"side `dx` / {POINTS_PER_CELL}",
         f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
         f"below {SHEET:g} of the next",
     ):
