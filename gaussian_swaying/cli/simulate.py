@@ -61,6 +61,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     scene = simulation.scene
     by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
     print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {simulation.device}")
+    if scene.loose:
+        print(f"{scene.loose:,} loose ones follow their neighbours")
     if scene.filled:
         print(f"{scene.filled:,} points fill the inside")
     print(scene.frame.describe())

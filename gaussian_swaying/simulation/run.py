@@ -255,6 +255,7 @@ class Run:
             "particles": solver.points.count,
             "gaussians": len(scene.model.means),
             "simulated_gaussians": len(scene.chosen),
+            "loose_gaussians": scene.loose,
             "surface_particles": scene.on_surface,
             "filled_particles": scene.filled,
             "mass_kg": float(solver.points.mass.sum()),

@@ -13,7 +13,7 @@ from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
-from gaussian_swaying.gaussians.grouping import blend_weights, group_points
+from gaussian_swaying.gaussians.grouping import blend_weights, group_points, loose_points
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
@@ -92,6 +92,9 @@ class Scene:
         region: Part that is simulated, in scene units; the rest stays as it is and is rendered with it.
         opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
         faint: What those do: ``carry`` (follow their nearest simulated neighbour), ``static`` or ``drop``.
+        loose: What specks do that hang on nothing, or by a thread (see
+            :func:`~gaussian_swaying.gaussians.grouping.loose_points`): ``simulate``, as all others, so that the wind
+            blows them away; or ``carry`` (no mass, no wind; they follow their nearest simulated neighbour).
         up: Direction in the scene that points up, for example [0, -1, 0].
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
@@ -133,9 +136,11 @@ class Scene:
         layers: int = 1,
         particle_spacing: float | None = None,
         sampling: str = "gaussian",
+        loose: str = "simulate",
     ) -> None:
         check_choice("scene.sampling", sampling, ("gaussian", "grid"))
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
+        check_choice("scene.loose", loose, ("simulate", "carry"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
         check_choice("scene.area", area, ("coverage", "paper", "equal"))
         if not any(check_vector("scene.up", up)):
@@ -163,7 +168,7 @@ class Scene:
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
         self.max_stretch = None if max_stretch is None else float(max_stretch)
-        self.layers, self.particle_spacing, self.sampling = layers, particle_spacing, sampling
+        self.layers, self.particle_spacing, self.sampling, self.loose = layers, particle_spacing, sampling, loose
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -190,12 +195,14 @@ class SimulatedScene(nn.Module):
     Args:
         scene: Where the Gaussians come from.
         material: What they are made of.
-        dx: Grid spacing [m], for ``material.volume = "cell"`` and as twice the spacing of ``scene.filling``.
+        dx: Grid spacing [m], for ``material.volume = "cell"``, as twice the spacing of ``scene.filling``, and for
+            ``scene.sampling`` and ``scene.loose``.
         dtype: Precision of the simulation.
 
     Attributes:
         chosen: Indices of the Gaussians that the region and the opacity choose; with ``sampling: gaussian`` these are
-            the simulated ones, with ``grid`` the others of them are carried.
+            the simulated ones, with ``grid`` the others of them are carried. Without those that are loose.
+        loose: Number of Gaussians that the region and the opacity choose but that are loose, and carried.
         points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
         filled: Number of points within a solid.
         on_surface: Number of points on the surface, which are the first: the simulated Gaussians, then the further
@@ -228,6 +235,19 @@ class SimulatedScene(nn.Module):
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
+        piece_spacing = None if scene.particle_spacing is None else scene.particle_spacing / self.frame.metres_per_unit
+        pieces = _pieces(cloud, simulated, piece_spacing)
+        carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
+        self.loose = 0
+        if scene.loose == "carry":
+            where = means if pieces is None else torch.cat([means, pieces.means.to(means)])
+            side = dx / POINTS_PER_CELL / self.frame.metres_per_unit
+            specks = simulated[loose_points(where, side)[: len(means)]]
+            self.loose = len(specks)
+            if self.loose:
+                chosen[specks], carried[specks] = False, True
+                simulated = chosen.nonzero()[:, 0]
+                pieces = _pieces(cloud, simulated, piece_spacing)
         normals = self.model.normals()
         position = self.frame.point_to_sim(cloud.means[simulated].double())
         filling = None
@@ -236,11 +256,7 @@ class SimulatedScene(nn.Module):
             visible = self.model.opacity()[simulated]
             filling = within_region(scene.filling.fill(position, shape, visible, 0.5 * dx), scene.region, self.frame)
         self.filled = 0 if filling is None else len(filling.position)
-        pieces = None
-        if scene.particle_spacing is not None:
-            spacing = scene.particle_spacing / self.frame.metres_per_unit
-            part = cloud.select(simulated)
-            pieces = subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
+        if pieces is not None:
             position = torch.cat([position, self.frame.point_to_sim(pieces.means.double())])
         source = torch.arange(len(simulated))  # the simulated Gaussian of each point on the surface
         source = source if pieces is None else torch.cat([source, pieces.parent])
@@ -250,7 +266,6 @@ class SimulatedScene(nn.Module):
         for group in (outer, ~outer):  # what lies within takes no area from the surface
             areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
         self.max_stretch = scene.max_stretch
-        carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
         followed = 1
         if scene.sampling == "grid":
             kept, group = group_points(position, areas, dx / POINTS_PER_CELL, preferred=len(simulated))
@@ -440,6 +455,14 @@ class SimulatedScene(nn.Module):
         own = values[: len(self.simulated)].to(self.model.means.dtype)
         found = own.new_zeros(len(self.model.means))
         return found.index_copy(0, self.moving, torch.cat([own, self._blend(own[self.anchor])]))
+
+
+def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None) -> Subdivision | None:
+    """Further points on the large ones of the simulated Gaussians, no farther apart than a spacing [scene units]."""
+    if spacing is None:
+        return None
+    part = cloud.select(simulated)
+    return subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
 
 
 def _areas(

@@ -1,5 +1,6 @@
 """tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -73,6 +74,32 @@ def test_starter_runs_unchanged(splat, tmp_path, capsys):
     assert summary["displacement_mean_max_m"] > 1e-4
     short = [*small, "--frames", "2"]
     assert simulate(["--config", str(out / "draft.yaml"), "--output", str(tmp_path / "draft"), *short]) == 0
+
+
+def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
+    assert preview(splat, tmp_path / "plain") == 0
+    assert "hang on nothing" not in capsys.readouterr().out
+    cloud = FlagScene(spacing=0.08).generate()
+    means, pairs = cloud.means.clone(), torch.tensor([0, 0, 1, 1])
+    specks = dataclasses.replace(
+        cloud.select(pairs), means=means[75] + 0.3 * torch.tensor([[0.0, 1, 0], [0, -1, 0]])[pairs]
+    )
+    names = ("means", "quats", "scales", "opacities", "sh")
+    write_ply(splat, GaussianCloud(*(torch.cat([getattr(c, n) for c in (cloud, specks)]) for n in names)))
+    out = tmp_path / "out"
+    region = ["--region", "-1", "-1", "-1", "2", "1", "2"]
+    assert preview(splat, out, "--up", "+z", "--hold", "-x", "--frames", "2", *region) == 0
+    report = capsys.readouterr().out
+    assert "note: 4 specks hang on nothing or by a thread; they follow their nearest neighbours" in report
+    assert "warning" not in report
+    assert json.loads((out / "preview.json").read_text())["run"]["loose"] == 4
+    small = ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--recorder.video", "false"]
+    for name in ("draft", "starter"):
+        assert yaml.safe_load((out / f"{name}.yaml").read_text())["scene"]["loose"] == "carry"
+        run = tmp_path / name
+        assert simulate(["--config", str(out / f"{name}.yaml"), "--output", str(run), "--frames", "2", *small]) == 0
+        assert "4 loose ones follow their neighbours" in capsys.readouterr().out
+        assert json.loads((run / "summary.json").read_text())["loose_gaussians"] == 4
 
 
 def test_more_sway_is_softer(tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.grouping import blend_weights, group_points
+from gaussian_swaying.gaussians.grouping import blend_weights, group_points, joined, loose_points
 
 
 def test_each_cube_keeps_the_point_nearest_to_its_weighted_centre():
@@ -57,3 +57,54 @@ def test_few_points_are_followed_as_they_are():
     index, weight = blend_weights(torch.rand(9, 3), torch.rand(3, 3), 1)
     assert index.shape == (3, 1)
     assert weight.tolist() == [[1.0]] * 3
+
+
+def sheet(count=20):
+    """A square lattice of points, one apart."""
+    side = torch.arange(float(count))
+    return torch.cartesian_prod(side, side, torch.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("extra", "loose"),
+    [
+        ([[30, 0, 0], [31, 0, 0], [30, 1, 0]], True),  # a part of three: less than a hundredth of 400
+        ([[30, 0, 0], [31, 0, 0], [30, 1, 0], [31, 1, 0]], False),  # four are a hundredth
+        ([[10, 10, 1.9]], True),  # hangs on the one point below it
+        ([[10, 10, 1.2]], False),  # and on four beside that one
+        ([[10, 10, 2.5]], True),  # on none
+    ],
+)
+def test_small_parts_and_what_hangs_by_a_thread_are_loose(extra, loose):
+    points = torch.cat([sheet(), torch.tensor(extra).float()])
+    found = loose_points(points, 1.0)
+    assert not bool(found[:400].any())
+    assert found[400:].tolist() == [loose] * len(extra)
+    moved = points.double() * 0.125 - 64  # exactly
+    assert torch.equal(loose_points(moved, 0.125), found)  # in any unit, anywhere
+
+
+def test_a_dense_speck_counts_as_one():
+    clump = 0.1 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([30.0, 0, 0])
+    assert bool(loose_points(torch.cat([sheet(), clump]), 1.0)[400:].all())
+
+
+def test_a_thread_holds():
+    """Two sheets joined by single points in a row stay whole, and a row alone loses at most its ends."""
+    row = torch.tensor([[0.9, 0.0, 0.0]]) * torch.arange(1, 12)[:, None] + torch.tensor([19.0, 10.0, 0.0])
+    other = sheet() + torch.tensor([30.0, 0.0, 0.0])
+    assert not bool(loose_points(torch.cat([sheet(), row, other]), 1.0).any())
+    assert not bool(loose_points(1.7 * row, 1.0)[1:-1].any())
+
+
+def test_an_object_of_few_points_is_not_loose():
+    for points in (torch.zeros(1, 3), torch.tensor([[0.0, 0, 0], [5, 0, 0]]), 10 * torch.eye(3)):
+        assert not bool(loose_points(points, 1.0).any())
+    with pytest.raises(ValueError, match="side"):
+        loose_points(sheet(), 0.0)
+
+
+def test_joined_numbers_the_parts():
+    pairs = torch.tensor([[0, 4, 2], [4, 5, 6]])
+    assert joined(7, pairs).tolist() == [0, 1, 2, 3, 0, 0, 2]
+    assert joined(2, torch.zeros(2, 0, dtype=torch.long)).tolist() == [0, 1]

@@ -259,10 +259,6 @@ def measure_motion(
     return motion
 
 
-def _quantile(values: Tensor, share: float) -> float:
-    return float(values.double().kthvalue(1 + round(share * (len(values) - 1))).values)
-
-
 def calibrated_suggestion(found: Suggestion, draft: Simulation, sway: float) -> Suggestion:
     """The suggestion with stiffness, thickness and wind from short runs of its draft; the draft is changed too."""
     if found.pin is None or not any(found.flow):

@@ -93,9 +93,9 @@ def estimate_cost(
         seconds = min(_seconds(simulation, lambda: solver.rollout(state, dt, 1, forces)) for _ in range(tries))
     drawn = None
     if picture:  # assumes that all cameras have the size of the first
-        simulation.render(state, 0)
-        work = min(_seconds(simulation, lambda: _encode(simulation.render(state, 0).color)) for _ in range(2))
-        drawn = work * (1 + len(simulation.cameras))
+        simulation.painter.render(state, 0)
+        work = min(_seconds(simulation, lambda: _encode(simulation.painter.render(state, 0).color)) for _ in range(2))
+        drawn = work * (1 + len(simulation.painter.cameras))
     return Cost(
         device=describe_device(simulation.device),
         particles=solver.points.count,

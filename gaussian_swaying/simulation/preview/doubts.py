@@ -53,9 +53,4 @@ def doubts(found: Suggestion, options: argparse.Namespace, defaults: argparse.Na
         )
         for name, words in zip(found.hold.options, ("as guessed", "the next best"), strict=False):
             lines.append(f"  {preview_command(options, defaults, hold=name)}   # {words}")
-    if found.region.loose:
-        lines.append(
-            f"warning: {found.region.loose:,} specks inside the region are loose and will fall; set a smaller "
-            "--region, or raise scene.opacity_threshold"
-        )
     return lines

@@ -38,7 +38,7 @@ class Parts:
 
     Attributes:
         simulated: Those selected by region and opacity.
-        carried: Faint ones that follow them.
+        carried: Faint and loose ones that follow them.
         pinned: Simulated ones that a condition holds.
         pushed: Simulated ones that an impulse pushes.
         names: The kind of each condition and the number of its particles, in words.
@@ -323,7 +323,7 @@ def _legend(
         (WIND, f"wind {[round(v, 2) for v in flow]} m/s (z up), before gusts"),
         (NORMAL, "normals, flipped to the eye"),
         ((190, 190, 190), f"not simulated: {int((~(parts.simulated | parts.carried)).sum()):,} Gaussians, greyed"),
-        ((120, 120, 120), f"faint, follow their neighbours: {int(parts.carried.sum()):,} Gaussians"),
+        ((120, 120, 120), f"faint or loose, follow their neighbours: {int(parts.carried.sum()):,} Gaussians"),
     ]
     if bool(parts.pushed.any()):
         entries.append((PUSHED, f"pushed: {int(parts.pushed.sum()):,} Gaussians"))

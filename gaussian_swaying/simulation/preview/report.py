@@ -66,7 +66,7 @@ def run_lines(run: dict[str, Any]) -> list[str]:
         "this configuration",
         f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
         f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
-        f"  follow them     {run['carried']:,} faint ones",
+        f"  follow them     {run['carried']:,} faint or loose ones",
         f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
         f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
         *(f"                  {region}" for region in run["regions"]),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.gaussians.grouping import joined
 
 SHEET = 0.1  # smallest over middle standard deviation of the centres of a sheet
 FEWEST = 16  # smallest number of Gaussians in an object
@@ -111,15 +112,4 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
             at = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
             found = (key[at] == wanted).nonzero()[:, 0]
             pairs.append(torch.stack([found, at[found]]))
-    one, other = torch.cat(pairs, 1)
-    label = torch.arange(len(key))
-    while True:  # the smaller number spreads, by halving of paths
-        smaller = torch.minimum(label[one], label[other])
-        new = label.clone()
-        for end in (one, other, label[one], label[other]):
-            new.scatter_reduce_(0, end, smaller, "amin")
-        new = new[new]
-        if new.equal(label):
-            break
-        label = new
-    return label.unique(return_inverse=True)[1][of_point]
+    return joined(len(key), torch.cat(pairs, 1))[of_point]

@@ -133,6 +133,7 @@ scene:
   region: {where}
   opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
   faint: carry
+  loose: carry                  # and so do specks that hang on nothing or by a thread
   area: coverage
   particle_spacing: {_fill(s)}
   sampling: grid                # as many points as the grid needs; all Gaussians follow them; gaussian: one for each

@@ -53,7 +53,6 @@ class RegionGuess:
         holes: Boxes inside it that are left out, as corners.
         opacity_threshold: Smallest simulated opacity.
         specks: Number of Gaussians above the threshold that are not part of the object, floor or surroundings.
-        loose: Number of these inside the region.
         reason: In words.
         cuts: Further regions inside it that are left out: walls and everything behind them.
     """
@@ -63,7 +62,6 @@ class RegionGuess:
     holes: list[tuple[list[float], list[float]]]
     opacity_threshold: float
     specks: int
-    loose: int
     reason: str
     cuts: tuple[Region, ...] = ()
 
@@ -332,14 +330,10 @@ def suggest_region(
         caught = Box(*hole).contains(points) & chosen
         if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # removes more specks than parts of the object
             holes.append(hole)
-    guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), 0, "", cuts)
+    guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), "", cuts)
     region = guess.region()
     assert region is not None
     simulated = region.contains(points) & (opacity >= threshold)
-    loose = int((simulated & ~chosen).sum())
-    if shown is not None and loose:  # the grid is coarser than the gap between the object and its surroundings
-        joined = connected_parts(points[simulated], 2 * cell)
-        loose = int((joined != joined.mode().values).sum())
     everything = bool(region.contains(points).all())
     words = [f"{int(chosen.sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
     if bool(ground.any()):
@@ -354,7 +348,7 @@ def suggest_region(
     if holes:
         words.append(f"without {len(holes)} boxes of specks")
     return RegionGuess(
-        simulated, None if everything else (low, high), holes, threshold, guess.specks, loose, "; ".join(words), cuts
+        simulated, None if everything else (low, high), holes, threshold, guess.specks, "; ".join(words), cuts
     )
 
 
@@ -377,7 +371,7 @@ def given_region(
     threshold = suggest_threshold(opacity[inside], weight[inside])
     simulated = inside & (opacity >= threshold)
     corners = ([float(v) for v in low], [float(v) for v in high])
-    return RegionGuess(simulated, corners, [], threshold, 0, 0, "given")
+    return RegionGuess(simulated, corners, [], threshold, 0, "given")
 
 
 # ---- sizes

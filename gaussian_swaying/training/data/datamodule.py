@@ -12,7 +12,6 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying.captures.capture import Capture, View, read_capture
 from gaussian_swaying.captures.images import straight_colors
 from gaussian_swaying.captures.initial_points import initial_points
@@ -130,7 +129,8 @@ class CaptureDataModule(LightningDataModule):
         point_count: Number of points, where they are drawn at random.
         seed: Seed of the order and of random points; by default that of ``seed_everything``, or 0.
         initial_opacity: Opacity of the Gaussians at these points, between 0 and 1; 0.5 suits MCMC.
-        initial_scale: Their standard deviation as a multiple of the distance to their neighbours; 0.1 suits MCMC.
+        initial_scale: Their standard deviation as a multiple of the distance to their neighbours, 0.001 to 100; 0.1
+            suits MCMC.
 
     Raises:
         ValueError: If an argument is out of range; in ``setup``, if the capture is bad.
@@ -154,7 +154,11 @@ class CaptureDataModule(LightningDataModule):
         super().__init__()
         if not 0.0 < initial_opacity < 1.0:
             raise ValueError(f"Expected `initial_opacity` between 0 and 1 (both excluded), but got {initial_opacity}.")
-        check_positive("initial_scale", initial_scale)
+        if not 1e-3 <= initial_scale <= 100:
+            raise ValueError(
+                f"Expected `initial_scale` from 0.001 to 100, but got {initial_scale:g}: with 1 a Gaussian is as large "
+                "as the distance to its neighbours."
+            )
         self.initial_opacity, self.initial_scale = initial_opacity, initial_scale
         if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
             raise ValueError(f"Expected `workers` to be a whole number of at least 0, but got {workers!r}.")

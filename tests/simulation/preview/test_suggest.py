@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import LOOSE
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Cylinder
 from gaussian_swaying.geometry.rotations import quat_to_rotation
@@ -38,6 +39,7 @@ from gaussian_swaying.simulation.preview.suggest import (
     visible_weight,
 )
 from gaussian_swaying.simulation.preview.up import CONVENTION, floor_mask, guess_up
+from gaussian_swaying.simulation.scene import POINTS_PER_CELL
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
@@ -219,7 +221,6 @@ def test_region_leaves_out_floor_and_specks():
     assert found.hold.end == "bottom"
     assert found.region.specks == 12
     assert len(found.region.holes) == 2
-    assert found.region.loose == 0
     simulated = found.region.simulated
     assert bool(simulated[CROWN].all())
     assert not bool(simulated[FLOOR].any())
@@ -340,7 +341,7 @@ def test_sheet_and_broad_side():
     assert broad_side(plate @ turn.T) == pytest.approx(-60, abs=2)
 
 
-def test_specks_beyond_the_boxes_are_counted_as_loose():
+def test_specks_beyond_the_boxes_follow_their_neighbours(make_scene):
     draw = torch.Generator().manual_seed(1)
     angle = torch.arange(10.0) * 0.6
     centre = torch.stack([0.3 * angle.cos(), 0.3 * angle.sin(), 0.2 + 0.045 * torch.arange(10.0)], -1) + 5.0
@@ -352,7 +353,9 @@ def test_specks_beyond_the_boxes_are_counted_as_loose():
     ground = floor_mask(points, smallest_axis_normal(both.quats, both.scales), weight, (0, 0, 1))
     found = suggest_region(points, both.opacities.sigmoid(), weight, ground, 0.05)
     assert len(found.holes) == MAX_BOXES
-    assert found.loose == 3 * (10 - MAX_BOXES)
+    scene = make_scene(both, dx=0.12, region=found.region(), loose="carry")
+    assert scene.loose == 3 * (10 - MAX_BOXES)
+    assert bool((scene.carried >= len(base)).all())
     assert found.specks == 30
 
 
@@ -369,6 +372,8 @@ def test_page_states_the_numbers_of_the_rules():
         f"{100 * calibration.THINNEST:g} to {100 * calibration.THICKEST:g} % of the longest side",
         f"first {calibration.SECONDS:g} s",
         f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
+        f"less than {LOOSE:.0%}".replace("%", " % of what the largest part has"),
+        f"side `dx` / {POINTS_PER_CELL}",
         f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
         f"below {SHEET:g} of the next",
     ):

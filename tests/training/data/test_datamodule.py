@@ -182,7 +182,8 @@ def test_bad_arguments(folder):
         CaptureDataModule(folder, workers=-1)
     with pytest.raises(ValueError, match="`initial_opacity`"):
         CaptureDataModule(folder, initial_opacity=1.0)
-    with pytest.raises(ValueError, match="`initial_scale`"):
-        CaptureDataModule(folder, initial_scale=0.0)
+    for scale in (0.0, 1e-30, 1e30, math.nan):
+        with pytest.raises(ValueError, match=r"`initial_scale` from 0\.001 to 100"):
+            CaptureDataModule(folder, initial_scale=scale)
     with pytest.raises(ValueError, match="`format`"):
         CaptureDataModule(folder, format="nerf").setup()

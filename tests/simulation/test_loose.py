@@ -1,0 +1,101 @@
+"""``scene.loose: carry``: specks that hang on nothing follow what is simulated."""
+
+import dataclasses
+
+import pytest
+import torch
+from gaussian_swaying.data.procedural import FlagScene
+
+from gaussian_swaying.gaussians.ply import GaussianCloud
+from gaussian_swaying.mpm.solver import MPMSolver
+
+SAMPLINGS = ["gaussian", "grid"]
+FLAG = 30 * 20  # Gaussians
+
+
+def speckled():
+    """A flag of 0.04 m between Gaussians, with two clumps of six 0.4 m in front of it."""
+    flag = FlagScene(spacing=0.04).generate()
+    own = flag.select(torch.tensor([300] * 6 + [420] * 6))
+    jitter = 0.01 * torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
+    specks = dataclasses.replace(own, means=own.means + jitter - torch.tensor([0.0, 0.4, 0.0]))
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return GaussianCloud(*(torch.cat([getattr(flag, n), getattr(specks, n)]) for n in names))
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_specks_are_carried_and_weigh_nothing(sampling, make_scene):
+    cloud = speckled()
+    scene = make_scene(cloud, dx=0.1, sampling=sampling, loose="carry")
+    alone = make_scene(cloud.select(torch.arange(FLAG)), dx=0.1, sampling=sampling)
+    specks = torch.arange(FLAG, FLAG + 12)
+    assert scene.loose == 12
+    assert bool(torch.isin(specks, scene.carried).all())
+    assert torch.equal(scene.chosen, torch.arange(FLAG))
+    assert scene.points.count == alone.points.count
+    assert float(scene.points.mass.sum()) == pytest.approx(float(alone.points.mass.sum()), rel=1e-5)
+    simulated = make_scene(cloud, dx=0.1, sampling=sampling)
+    assert simulated.loose == 0
+    assert torch.equal(simulated.chosen, torch.arange(FLAG + 12))
+    assert scene.size == simulated.size  # the region's, whoever is simulated in it
+    assert torch.equal(scene.frame.origin, simulated.frame.origin)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_they_go_where_their_neighbours_take_them(sampling, make_scene):
+    scene = make_scene(speckled(), dx=0.1, sampling=sampling, loose="carry")
+    state = MPMSolver(dx=0.1).init_state(scene.points)
+    assert torch.equal(scene.deformed(state).means, scene.rest().means)
+    F = torch.tensor([[1.1, 0.2, 0.0], [0.0, 0.9, 0.3], [-0.1, 0.0, 1.0]])
+    moved = state.replace(position=state.position @ F.T, F_total=F.expand_as(state.F_total))
+    expected = scene.frame.point_to_scene(scene.frame.point_to_sim(scene.model.means.double()) @ F.double().T)
+    torch.testing.assert_close(scene.deformed(moved).means.double(), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_the_wind_blows_specks_away_unless_they_are_carried(sampling, make_pipeline):
+    moved = {}
+    for loose in ("simulate", "carry"):
+        pipeline = make_pipeline(cloud=speckled(), dx=0.1, scene={"sampling": sampling, "loose": loose})
+        with torch.inference_mode():
+            state = pipeline.start()
+            for _ in range(12):
+                state, _ = pipeline.advance(state)
+            moved[loose] = (pipeline.scene.deformed(state).means - pipeline.scene.rest().means).norm(dim=-1)
+    flag, specks = moved["simulate"][:FLAG], moved["simulate"][FLAG:]
+    assert float(specks.min()) > 2 * float(flag.max())
+    flag, specks = moved["carry"][:FLAG], moved["carry"][FLAG:]
+    assert float(specks.max()) < 1.5 * float(flag.max())
+
+
+def test_what_further_points_join_is_not_loose(make_scene):
+    cloud = FlagScene(spacing=0.025).generate()
+    wide = cloud.scales + 1.4 * (cloud.scales > cloud.scales.amin(-1, keepdim=True))
+    thin = (cloud.means[:, 0] < 0.8) | (torch.arange(len(cloud)) % 5 == 0)  # large ones alone at the free end
+    few = dataclasses.replace(cloud, scales=wide).select(thin)
+    assert make_scene(few, dx=0.06, loose="carry").loose > 0
+    filled = make_scene(few, dx=0.06, particle_spacing=0.025, loose="carry")
+    assert filled.loose == 0
+    assert filled.on_surface > len(filled.simulated)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    alone = few.select(torch.tensor([30]))
+    speck = dataclasses.replace(alone, means=torch.tensor([[0.6, -0.7, 0.4]]), scales=alone.scales - 1.1)
+    assert make_scene(speck, dx=0.06, particle_spacing=0.025).on_surface > 1
+    both = GaussianCloud(*(torch.cat([getattr(few, n), getattr(speck, n)]) for n in names))
+    scene = make_scene(both, dx=0.06, particle_spacing=0.025, loose="carry")
+    assert scene.loose == 1
+    assert scene.points.count == filled.points.count  # its further points are gone with it
+
+
+def test_nothing_changes_where_nothing_is_loose(make_scene):
+    flag = FlagScene(spacing=0.04).generate()
+    for sampling in SAMPLINGS:
+        carry, plain = (make_scene(flag, dx=0.1, sampling=sampling, loose=loose) for loose in ("carry", "simulate"))
+        for name in ("simulated", "carried", "anchor", "share", "patch_area", "patch_normal"):
+            assert torch.equal(getattr(carry, name), getattr(plain, name)), name
+        assert torch.equal(carry.points.position, plain.points.position)
+
+
+def test_bad_choice_is_refused(make_scene):
+    with pytest.raises(ValueError, match=r"`scene.loose`"):
+        make_scene(loose="drop")
