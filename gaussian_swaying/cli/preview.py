@@ -129,7 +129,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     }
     report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found)]
     if simulation.scene.loose:
-        words = f"{simulation.scene.loose:,} specks hang on nothing or by a thread; they follow their neighbours"
+        words = f"{simulation.scene.loose:,} specks hang on nothing or by a thread; they follow their nearest neighbours"
         report.append(f"  note: {words} (scene.loose: carry)")
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
     report += cost_lines(costs["starter"])
