@@ -129,8 +129,8 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     }
     report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found)]
     if simulation.scene.loose:
-        words = f"{simulation.scene.loose:,} specks hang on nothing or by a thread; they follow their nearest neighbours"
-        report.append(f"  note: {words} (scene.loose: carry)")
+        specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
+        report.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
     report += cost_lines(costs["starter"])
     output, stem = Path("outputs"), splat_name(options.scene)

@@ -211,11 +211,11 @@ def test_every_shipped_configuration_builds(config, tmp_path):
         settings.scene.ply = str(tmp_path / "splat.ply")
     elif settings.scene.generator is not None and "spacing" in settings.scene.generator.init_args:
         settings.scene.generator.init_args.spacing = 0.1
-    simulation, recorder = Simulation.from_settings(parser, settings)
+    simulation = Simulation.from_settings(parser, settings)
     assert simulation.scene.points.count > 0
     assert len(simulation.solver.boundaries) > 0
     assert simulation.wind(0.0).norm() > 0
-    assert recorder.video
+    assert simulation.recorder.video
 
 
 def test_there_are_configurations():

@@ -19,7 +19,7 @@ VALUES = (
     [[1e30] * 4] * 4, "../../../etc/passwd", "\u0000", "/dev/zero", [1, 2, 3],
 )  # fmt: skip
 Change = Callable[[random.Random, Path], None]
-TOOLS = load(ROOT / "tests/data/conftest.py")
+TOOLS = load(ROOT / "tests/captures/conftest.py")
 
 
 def _json(folder: Path) -> Any:

@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 import torch
-from gaussian_swaying.data.procedural import FlagScene
 
-from gaussian_swaying.gaussians.ply import GaussianCloud
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene
 
 SAMPLINGS = ["gaussian", "grid"]
 FLAG = 30 * 20  # Gaussians
@@ -53,15 +53,15 @@ def test_they_go_where_their_neighbours_take_them(sampling, make_scene):
 
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_the_wind_blows_specks_away_unless_they_are_carried(sampling, make_pipeline):
+def test_the_wind_blows_specks_away_unless_they_are_carried(sampling, make_simulation):
     moved = {}
     for loose in ("simulate", "carry"):
-        pipeline = make_pipeline(cloud=speckled(), dx=0.1, scene={"sampling": sampling, "loose": loose})
+        simulation = make_simulation(cloud=speckled(), dx=0.1, scene={"sampling": sampling, "loose": loose})
         with torch.inference_mode():
-            state = pipeline.start()
+            state = simulation.start()
             for _ in range(12):
-                state, _ = pipeline.advance(state)
-            moved[loose] = (pipeline.scene.deformed(state).means - pipeline.scene.rest().means).norm(dim=-1)
+                state, _ = simulation.advance(state)
+            moved[loose] = (simulation.scene.deformed(state).means - simulation.scene.rest().means).norm(dim=-1)
     flag, specks = moved["simulate"][:FLAG], moved["simulate"][FLAG:]
     assert float(specks.min()) > 2 * float(flag.max())
     flag, specks = moved["carry"][:FLAG], moved["carry"][FLAG:]
