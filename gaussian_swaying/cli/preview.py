@@ -98,9 +98,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         FileNotFoundError: If there is no such splat.
     """
     check_sway(options.sway)
-    cloud = read_gaussians(
-        Path(options.scene).resolve()
-    )  # as the configurations name it, so that a warning is given once
+    cloud = read_gaussians(Path(options.scene).resolve())  # as in the YAML, so that it warns once
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
