@@ -1,4 +1,4 @@
-"""Examples of README and docs/components.md print what they show, its commands are those that it promises, its numbers were recorded."""
+"""Examples of README and docs/components.md print what they show; commands and numbers are the promised ones."""
 
 import json
 import re
