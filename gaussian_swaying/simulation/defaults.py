@@ -74,6 +74,9 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
 def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene) -> MPMSolver:
     """The solver given, or one whose grid suits the size of the scene.
 
+    What is held has no gravity then, as in the starters of the preview: its shape at rest is one in balance with its
+    weight. What is not held falls.
+
     Raises:
         ValueError: If ``hold`` is given beside a solver.
     """
@@ -85,7 +88,8 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene) -> MP
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
         spacing = particle_spacing(means) * frame.metres_per_unit
-        return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), boundaries=pins)
+        gravity = (0.0, 0.0, -9.8) if hold is None else (0.0, 0.0, 0.0)  # what is held was captured in balance
+        return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins)
     if hold is not None:
         raise ValueError(
             "`hold` pins a region where no solver is given: add PinnedRegion(...) to the `boundaries` of the solver, "
