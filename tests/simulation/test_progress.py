@@ -72,7 +72,7 @@ def test_a_slow_first_frame_is_told_with_the_whole_run(clock, capsys):
     work(progress, clock, 1, 1000, 0.1)
     said = capsys.readouterr().err
     assert said.count("note:") == 1
-    assert "note: Frame 1 takes 1,000 substeps, about 100 s, and the frames to come about 2.8 h." in said
+    assert "note: Frame 1 takes 1,000 substeps, about 100 s, and the remaining frames about 2.8 h." in said
     assert "`solver.dx`" in said
 
 
