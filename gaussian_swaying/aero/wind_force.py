@@ -75,7 +75,7 @@ class WindForce(Force):
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
-        """Whether all winds can be recorded: ``WindField`` with recordable modulations, and recordable spatial winds."""
+        """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
         return all(
             wind.recordable if isinstance(wind, SpatialWind) else type(wind) is WindField for wind in self._fields
         ) and all(

@@ -39,7 +39,7 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
         number = first if index is None else int(index[first])
         text = (
             f"Gaussian {number} lies at {[float(f'{v:.4g}') for v in means[first].tolist()]}, but 98 % of those "
-            f"simulated lie within {most:.3g} scene units, so size and mass would be those of empty space: leave "
+            f"simulated lie within {most:.3g} scene units, so size and mass would come from empty space: leave "
             "it out with `scene.region` or `scene.opacity_threshold`."
         )
         if whole > TOO_FAR * most:

@@ -210,6 +210,6 @@ class Painter(nn.Module):
         write_ply(path, self.cloud(gaussians))
 
     def depth_range(self, frame: int, name: str) -> tuple[float, float]:
-        """Depths at both ends of the colour scale [scene units]: that of the centre, minus and plus the longest side."""
+        """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
         distance = float((self._camera(frame, name).position.to(self.scene.center) - self.scene.center).norm())
         return distance - self.scene.size, distance + self.scene.size

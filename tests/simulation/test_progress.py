@@ -133,7 +133,7 @@ def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monk
     monkeypatch.setattr(simulation_module, "MAX_SUBSTEPS", 20)
     assert main([*SMALL, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
-    assert "substeps, and 20 are the most" in said
+    assert "substeps, more than the limit of 20" in said
     assert (tmp_path / "run/frames/00000.png").exists()
 
 
