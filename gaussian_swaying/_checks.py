@@ -1,4 +1,4 @@
-"""Checks of arguments, with one sentence that names the argument and what was expected.
+"""Argument checks. Each error is one sentence that names the argument and what was expected.
 
 Shape checks are always on and never synchronise with a GPU. Value checks read the tensor, which makes a GPU wait, so
 they run only when the environment variable ``GAUSSIAN_SWAYING_CHECKS`` is 1 (the tests set it).
@@ -20,7 +20,7 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
         name: Name of the argument, for the message.
         tensor: Tensor to check.
         shape: Expected trailing sizes; a letter or None stands for any size.
-        batches: Whether any batch dimensions may lead.
+        batches: Whether leading batch dimensions are allowed.
 
     Raises:
         TypeError: If ``tensor`` is not a tensor.
@@ -58,7 +58,7 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:
-    """Raise ValueError unless ``value`` is a finite number above zero (or not below, with ``allow_zero``)."""
+    """Raise ValueError unless ``value`` is a finite number above zero (or at least zero, with ``allow_zero``)."""
     wanted = "not be negative" if allow_zero else "be positive"
     if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")

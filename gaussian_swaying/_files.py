@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written under a temporary name, then renamed."""
+"""Files that are written completely or not at all: first under a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _KINDS = {
 
 
 def temporary_name(path: Path) -> Path:
-    """The name in the same folder under which this process writes ``path`` before it is whole."""
+    """Temporary name in the same folder under which this process writes ``path`` until it is complete."""
     return path.with_name(f".{path.stem}.gs-writing-{os.getpid()}{path.suffix}")
 
 
 def remove_temporaries(folder: Path) -> None:
-    """Remove what :func:`temporary_name` named and a killed process left; whatever else is there stays."""
+    """Remove temporary files (see :func:`temporary_name`) that a killed process left behind; all other files stay."""
     for path in folder.glob(".*"):
         if _TEMPORARY.fullmatch(path.name) and path.is_file():
             path.unlink()
@@ -39,7 +39,7 @@ def remove_temporaries(folder: Path) -> None:
 def kind_of(path: Path) -> str | None:
     """What a path is, links followed: ``file``, ``folder``, ``named pipe``, ``socket`` ...; None if there is nothing.
 
-    Nothing is opened, so a pipe that nobody writes to keeps nobody waiting.
+    Nothing is opened, so this never waits for a pipe that nobody writes to.
     """
     try:
         return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "special file")
@@ -52,7 +52,7 @@ def kind_of(path: Path) -> str | None:
 
 
 def check_not_taken(path: Path) -> None:
-    """Raise ValueError if something that is no regular file has the name of one that a run writes or reads."""
+    """Raise ValueError if a path that a run writes or reads exists but is not a regular file."""
     kind = kind_of(path)
     if kind not in (None, "file"):
         raise ValueError(f"Expected {path} to be a file, but it is a {kind}: move it away.")
@@ -60,7 +60,7 @@ def check_not_taken(path: Path) -> None:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Give a temporary path in the same folder that becomes ``path`` if the block succeeds, and nothing if not."""
+    """Yield a temporary path in the same folder; it becomes ``path`` if the block succeeds and is removed if not."""
     temporary = temporary_name(path)
     try:
         yield temporary
@@ -70,13 +70,13 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text in UTF-8, whole or not at all."""
+    """Write text in UTF-8, completely or not at all."""
     with atomic(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON, whole or not at all; numbers that are NaN or infinite, which JSON does not have, become null."""
+    """Write JSON, completely or not at all; NaN and infinity, which JSON does not have, become null."""
     write_text(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
 
 
@@ -89,7 +89,7 @@ def _without_nan(value: Any) -> Any:
 
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Write dicts as CSV with a header, whole or not at all; what a row lacks stays empty."""
+    """Write dicts as CSV with a header, completely or not at all; missing values stay empty."""
     names = list({name: None for row in rows for name in row})
     with atomic(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=names)

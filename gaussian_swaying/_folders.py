@@ -1,4 +1,4 @@
-"""Folders of which every file is imported, so that a class is known as soon as its file is there."""
+"""Imports every file of a folder, so that a new class is found as soon as its file exists."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 
 
 def classes_of(folder: str, path: Iterable[str], base: type) -> dict[str, Any]:
-    """Import every file of a folder and find the classes that are written there.
+    """Import every file of a folder and find the classes that are defined there.
 
     Args:
-        folder: Name of the package that the folder is, its ``__name__``.
-        path: Where it lies, its ``__path__``.
-        base: Base of the classes.
+        folder: ``__name__`` of the package that the folder is.
+        path: ``__path__`` of that package.
+        base: Base class.
 
     Returns:
-        The subclasses of ``base`` that are not abstract, by name. Folders within the folder are left out.
+        The subclasses of ``base`` that are not abstract, by name. Subfolders are skipped.
     """
     files = [import_module(f"{folder}.{found.name}") for found in iter_modules(path) if not found.ispkg]
     return {

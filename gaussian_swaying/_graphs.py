@@ -1,4 +1,4 @@
-"""Recording of CUDA graphs, and whether a recorded one still holds."""
+"""Recording CUDA graphs, and checking whether a recorded graph is still valid."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ import torch
 from torch import nn
 
 _RECORDING = threading.Lock()
-"""Held while a graph is recorded: PyTorch cannot give memory back to the driver meanwhile."""
+"""Held while a graph is recorded: PyTorch cannot give memory back to the driver during that time."""
 
 
 class Recordable:
-    """Base of modules of which some can be recorded in a CUDA graph.
+    """Base of modules that may be recorded in a CUDA graph.
 
     Attributes:
-        recordable: Whether ``forward`` depends on nothing but its arguments, numbers and buffers of the module, never
-            makes the host wait, and after a first call copies nothing from or to it, so that a graph may be replayed
-            at other times and substeps. A class with a ``forward`` of its own has to say so itself.
+        recordable: Whether ``forward`` can be recorded, and replayed at other times and substeps. For this it must
+            depend only on its arguments and on numbers and buffers of the module, must never make the host wait, and
+            must copy nothing to or from the host after the first call. A class that defines its own ``forward`` must
+            set this itself.
     """
 
     recordable = False
@@ -33,10 +34,10 @@ class Recordable:
 
 
 def fingerprint(modules: Iterable[nn.Module]) -> tuple[tuple[object, ...], ...]:
-    """What modules depend on besides the contents of their tensors: the same as long as none of it was replaced.
+    """Everything that modules depend on except the contents of their tensors; equal until a part is replaced.
 
-    Their types, numbers and strings, where their tensors lie and which objects they hold; what was changed within an
-    object that is no module, a region say, is not seen.
+    It covers types, numbers, strings, the addresses of tensors and the identities of other objects. A change inside an
+    object that is not a module, such as a region, is not detected.
     """
     plain = (bool, int, float, str, type(None))
     return tuple(
@@ -57,41 +58,41 @@ def fingerprint(modules: Iterable[nn.Module]) -> tuple[tuple[object, ...], ...]:
 def record(
     device: torch.device, work: Callable[[], Any], pool: Any = None, stream: torch.cuda.Stream | None = None
 ) -> torch.cuda.CUDAGraph:
-    """Record what a function launches, without running it.
+    """Record the kernels that a function launches, without running them.
 
-    Everything it launches must have run before, so that nothing is compiled or loaded meanwhile, and it must not make
-    the host wait. What it reads and writes must live as long as the graph.
+    All these kernels must have run before, so that nothing is compiled or loaded during the recording. The function
+    must not make the host wait. The tensors that it reads and writes must live as long as the graph.
 
     Args:
         device: A CUDA device.
         work: The function.
-        pool: Memory pool of what it allocates, shared by graphs of which no two run at once; one of its own if None.
-        stream: Where it is recorded; a new one if None. Graphs that share a pool must share it too: memory that was
-            freed on one stream is given to no other.
+        pool: Memory pool for its allocations, which graphs may share if no two of them run at once; a new pool if None.
+        stream: Stream on which it is recorded; a new one if None. Graphs that share a pool must also share the stream,
+            since memory freed on one stream is not reused on another.
 
     Returns:
         The graph; ``replay()`` runs it.
 
     Raises:
-        RuntimeError: If the function does what cannot be recorded.
+        RuntimeError: If the function does something that cannot be recorded.
     """
     graph, stream = torch.cuda.CUDAGraph(), torch.cuda.Stream(device) if stream is None else stream
     stream.wait_stream(torch.cuda.current_stream(device))
     with _RECORDING:
         collecting = gc.isenabled()
-        gc.disable()  # a graph that is freed meanwhile would break the recording
+        gc.disable()  # freeing another graph during the recording would break it
         try:
-            # numbers that all graphs share are tensors of the mode of the first, and could not be written outside
-            # inference mode if that was it
+            # tensors that all graphs share get the mode of the first recording; if that was inference mode, they
+            # could not be written outside it
             with torch.cuda.stream(stream), torch.inference_mode(False), torch.no_grad():
-                # other threads, that of the recorder say, may go on
+                # other threads, such as the recorder's, may continue
                 graph.capture_begin(pool=pool, capture_error_mode="thread_local")
                 try:
                     work()
                 except BaseException:
-                    with suppress(RuntimeError):  # what broke the recording matters more
+                    with suppress(RuntimeError):  # the original error matters more
                         graph.capture_end()
-                    graph.reset()  # the traceback keeps it, and it would keep its memory
+                    graph.reset()  # the traceback keeps the graph alive, which would keep its memory
                     raise
                 graph.capture_end()
         finally:
@@ -102,18 +103,18 @@ def record(
 
 
 class Repeater:
-    """Repeats pieces of work from CUDA graphs of 16, 4 and 1 repetitions, which share one pool of memory.
+    """Repeats pieces of work by replaying CUDA graphs of 16, 4 and 1 repetitions, which share one memory pool.
 
-    The pool is that of the graphs in use. Once they are all forgotten its memory is given back before the next one is
+    The pool belongs to the graphs in use. Once all of them are dropped, its memory is freed before the next graph is
     recorded.
 
     Args:
-        device: Where the work runs; without CUDA it just runs.
+        device: Device on which the work runs; without CUDA nothing is recorded.
     """
 
     SIZES = (16, 4, 1)
     KEPT = 4
-    """Pieces of work whose graphs are kept, the latest ones."""
+    """Number of pieces of work whose graphs are kept; the oldest are dropped."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -123,17 +124,17 @@ class Repeater:
     def run(self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True) -> None:
         """Run the work ``times`` times.
 
-        The first time a key is seen it runs as it is, which compiles what is not yet compiled; after that it is
-        recorded.
+        The first time a key is used, the work runs without recording, so that all its kernels are compiled. After that
+        it is recorded and replayed.
 
         Args:
-            times: How often.
-            key: Names the work.
+            times: Number of repetitions.
+            key: Identifies the work.
             several: ``several(n)`` runs it n times.
             recordable: Whether it may be recorded.
 
         Raises:
-            RuntimeError: If it was said to be recordable and is not.
+            RuntimeError: If it was declared recordable but is not.
             torch.OutOfMemoryError: If there is no memory left to record it.
         """
         if times == 0:  # nothing runs, so nothing is compiled
@@ -159,10 +160,10 @@ class Repeater:
             self._stream = torch.cuda.Stream(self.device)
         alive = next((graph for graphs in self._graphs.values() for graph in graphs.values()), None)
         if alive is None:
-            # what graphs that are gone have held, and what is cached, cannot be had while recording; PyTorch refuses to
-            # give it back once a recording was broken off
+            # memory of dropped graphs and cached memory cannot be used during a recording; after a failed recording
+            # PyTorch refuses to give it back
             with _RECORDING, suppress(RuntimeError):
-                torch.cuda.synchronize(self.device)  # they may still run
+                torch.cuda.synchronize(self.device)  # the dropped graphs may still be running
                 torch.cuda.empty_cache()
         try:
             return record(self.device, lambda: several(size), None if alive is None else alive.pool(), self._stream)
@@ -170,14 +171,14 @@ class Repeater:
             what = str(error).strip().split("\n")[0].split(" GPU ")[0].rstrip(".")
             if "out of memory" in what:
                 raise torch.OutOfMemoryError(
-                    f"No memory is left on the GPU to record a substep on a grid of this size ({what}): keep what "
-                    "flies away within an EnclosingBox or behind a Plane, or coarsen `solver.dx`."
+                    f"The GPU has no memory left to record a substep on a grid of this size ({what}): stop particles "
+                    "that fly away with an EnclosingBox or a Plane, or raise `solver.dx`."
                 ) from error
-            if "captur" not in str(error):  # it is no matter of recording
+            if "captur" not in str(error):  # not a problem of the recording
                 raise
             raise RuntimeError(
-                f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` of the boundary or force "
-                "that makes the host wait to False, or `transfer` to torch."
+                f"A substep cannot be recorded in a CUDA graph ({what}): set `recordable` to False on the boundary or "
+                "force that makes the host wait, or set `transfer` to torch."
             ) from error
 
     def forget(self, key: Hashable | None = None) -> None:

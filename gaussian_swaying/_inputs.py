@@ -1,4 +1,4 @@
-"""Files that users give: refused before they are read if they are no regular file, or far too large."""
+"""Checks of user files: one that is not a regular file, or far too large, is refused before it is read."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ LONGEST_NUMBER = 32  # digits of a whole number
 
 
 def check_regular(path: str | os.PathLike[str], what: str = "the file", largest: int | None = None) -> Path:
-    """A path, if there is a regular file: no folder, device or pipe, which may never end.
+    """Return a path if it is a regular file, and not a folder, or a device or pipe that may never end.
 
     Args:
         path: The path.
-        what: What it should be, for the message.
-        largest: Largest size [bytes].
+        what: What the file should be, for the message.
+        largest: Largest allowed size [bytes].
 
     Raises:
-        FileNotFoundError: If there is nothing.
-        ValueError: If it is something else, or too large.
+        FileNotFoundError: If the path does not exist.
+        ValueError: If it is not a regular file, or too large.
     """
     path = Path(path)
     try:
         kind = kind_of(path)
     except ValueError as error:  # a zero byte
-        raise ValueError(f"{str(path)!r} is no path ({error}); check the path of {what}.") from None
+        raise ValueError(f"{str(path)!r} is not a valid path ({error}); check the path of {what}.") from None
     if kind in (None, "link to nothing"):
         raise FileNotFoundError(f"{path} does not exist; check the path of {what}.")
     if kind == "folder":
         raise ValueError(f"{path} is a directory; give {what} inside it.")
     if kind != "file":
-        raise ValueError(f"{path} is no regular file but a {kind}; save {what} first and give that.")
+        raise ValueError(f"{path} is not a regular file but a {kind}; save {what} to a file first and give that.")
     size = path.stat().st_size
     if largest is not None and size > largest:
         raise ValueError(f"{path} has {size:,} bytes, more than the {largest:,} that {what} may have; check the path.")
@@ -51,15 +51,15 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
 
     Args:
         path: The file.
-        what: What it is called in the message, for example "camera file".
-        largest: Largest size [bytes].
+        what: Name of the file in the message, for example "camera file".
+        largest: Largest allowed size [bytes].
 
     Returns:
-        What it holds.
+        The parsed content.
 
     Raises:
-        ValueError: If the file cannot be read, is too large, is not UTF-8 or not JSON, is nested too deeply, or holds
-            a whole number of more than 32 digits.
+        ValueError: If the file cannot be read, is too large, is not UTF-8 or not JSON, is nested too deeply, or
+            contains a whole number of more than 32 digits.
     """
     try:
         text = check_regular(path, f"the {what}", largest).read_text(encoding="utf-8")
@@ -77,40 +77,40 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
 
 
 def check_archive(path: str | os.PathLike[str], what: str) -> Path:
-    """A path, if it is a .npz whose arrays take no more than ten times its size, or a gigabyte.
+    """Return a path if it is a .npz file whose arrays take no more than a gigabyte plus ten times its size.
 
     Args:
         path: The path.
-        what: What it should be, for the message.
+        what: What the file should be, for the message.
 
     Raises:
-        FileNotFoundError: If there is nothing.
-        ValueError: If it is no regular file, no .npz, or holds far more than its size.
+        FileNotFoundError: If the path does not exist.
+        ValueError: If it is not a regular file, not a .npz file, or its arrays are far larger than the file.
     """
     path = check_regular(path, what)
     try:
         with zipfile.ZipFile(path) as archive:
             held = sum(entry.file_size for entry in archive.infolist())
     except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError) as error:
-        raise ValueError(f"{path} is no .npz, or not whole ({error}); make {what} again.") from error
+        raise ValueError(f"{path} is not a .npz file, or is incomplete ({error}); make {what} again.") from error
     if held > (1 << 30) + 10 * path.stat().st_size:
-        raise ValueError(f"{path} claims to hold {held:,} bytes, far more than its size; make {what} again.")
+        raise ValueError(f"{path} claims to contain {held:,} bytes, far more than its size; make {what} again.")
     return path
 
 
 def read_arrays(
     path: str | os.PathLike[str], what: str, needed: Sequence[str], optional: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Read arrays of a .npz; no code in it is executed.
+    """Read arrays from a .npz file; no code in it is executed.
 
     Args:
         path: The file.
-        what: What it should be, for the message, for example "the reference".
-        needed: Names of arrays that it must have.
-        optional: Names of arrays that it may have.
+        what: What the file should be, for the message, for example "the reference".
+        needed: Names of the required arrays.
+        optional: Names of optional arrays.
 
     Returns:
-        Those that are there, by name.
+        The arrays found, by name.
 
     Raises:
         ValueError: If the file is missing or damaged, or lacks an array.
@@ -118,7 +118,7 @@ def read_arrays(
     try:
         with np.load(check_archive(path, what)) as archive:
             found = {name: archive[name] for name in (*needed, *optional) if name in archive}
-    except Exception as error:  # not there, not a zip, pickled, ...
+    except Exception as error:  # missing, not a zip, pickled, ...
         raise ValueError(f"{path} cannot be read ({error}): make {what} again.") from error
     for name in needed:
         if name not in found:
@@ -127,7 +127,7 @@ def read_arrays(
 
 
 class _LongNumberError(ValueError):
-    """A whole number that no field can hold."""
+    """A whole number that is too long for any field."""
 
 
 def _whole(digits: str) -> int:

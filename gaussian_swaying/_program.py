@@ -1,4 +1,4 @@
-"""How the commands were called, so that what is printed can be pasted: installed, or from a checkout."""
+"""How the program was started (installed, or from a checkout), so that printed commands can be pasted."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import sys
 from pathlib import Path
 
 INSTALLED = "gaussian-swaying"
-_called: list[str] = []  # the command, if it was called through the installed program
+_called: list[str] = []  # the command, if it was started through the installed program
 
 
 def called(command: str) -> None:
-    """Note that a command was called through the installed program."""
+    """Remember that a command was started through the installed program."""
     _called[:] = [command]
 
 
@@ -28,7 +28,7 @@ def words(command: str) -> list[str]:
 
 
 def name(command: str) -> str:
-    """What a command calls itself in its help."""
+    """The name of a command in its own help."""
     return f"{INSTALLED} {command}" if _called else f"{command}.py"
 
 

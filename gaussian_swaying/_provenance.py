@@ -1,4 +1,4 @@
-"""Where and with what a number was made: device, versions and memory."""
+"""Device, versions and memory of a run, recorded with its numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def describe_device(device: torch.device) -> str:
 
 
 def peak_memory() -> int | None:
-    """Largest memory of the process so far [bytes]; None on Windows, which does not say."""
+    """Largest memory of the process so far [bytes]; None on Windows, which does not report it."""
     try:
         import resource
     except ImportError:
@@ -28,7 +28,7 @@ def peak_memory() -> int | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions that a number depends on."""
+    """Versions of the software that results depend on."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = {"python": platform.python_version(), "gaussian_swaying": gaussian_swaying.__version__}

@@ -1,7 +1,7 @@
-"""Limits of a configuration: what is too large, too deep or grows without end is refused before it is built.
+"""Limits of a configuration: one that is too large, too deep or contains itself is refused before it is built.
 
-A YAML of a few lines may name the same part again and again and mean a billion of them, or a part of itself. So its
-events are counted first, which takes little memory.
+With aliases, a YAML file of a few lines can repeat a part a billion times, or contain itself. So the events of the
+parser are counted first, which takes little memory.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from typing import Any
 
 from gaussian_swaying._inputs import LONGEST_NUMBER, check_regular
 
-LARGEST = 1 << 20  # bytes; the configurations of this project have some 5,000
+LARGEST = 1 << 20  # bytes; the configurations of this project have about 5,000
 DEEPEST = 64  # levels
-MOST = 20_000  # values, with those that aliases repeat
-MOST_WORK = 10_000_000  # entries times values of all lists, as jsonargparse copies a list for each entry: some 10 s
+MOST = 20_000  # values, including those that aliases repeat
+MOST_WORK = 10_000_000  # entries times values of all lists, as jsonargparse copies a list for each entry: about 10 s
 
 
 def check_yaml(text: str) -> str:
-    """The text, unless it is too much of a YAML.
+    """Return a text if it is within the limits for YAML.
 
     Args:
-        text: YAML, or a value of the command line.
+        text: YAML, or a value from the command line.
 
     Raises:
-        ValueError: If it is too long, too deep, holds too many values, names a part of itself, or has a whole number
-            of more than 32 digits.
-        yaml.YAMLError: If it is no YAML.
+        ValueError: If it is too long or too deep, has too many values, contains itself, or has a whole number of more
+            than 32 digits.
+        yaml.YAMLError: If it is not valid YAML.
     """
     if len(text) > LARGEST:
-        raise ValueError(f"A configuration of {len(text):,} characters is too long: {LARGEST:,} are the most.")
-    if len(text) < LONGEST_NUMBER and "*" not in text:  # can neither be deep nor large
+        raise ValueError(f"A configuration of {len(text):,} characters is too long: the limit is {LARGEST:,}.")
+    if len(text) < LONGEST_NUMBER and "*" not in text:  # too short to be deep or large
         return text
     import yaml
 
@@ -47,13 +47,13 @@ def check_yaml(text: str) -> str:
                 sizes[part.anchor] = size
             work += part.entries * size if isinstance(event, yaml.SequenceEndEvent) else 0
             if work > MOST_WORK:
-                raise ValueError(f"A list of {part.entries:,} entries, {size:,} values, is too long to be read.")
+                raise ValueError(f"A list of {part.entries:,} entries with {size:,} values is too long to read.")
             continue
         if isinstance(event, (yaml.ScalarEvent, yaml.AliasEvent, yaml.CollectionStartEvent)) and begun:
             begun[-1].entries += 1
         if isinstance(event, yaml.AliasEvent):
             if any(event.anchor == part.anchor for part in begun):
-                raise ValueError(f"A configuration must not hold itself: remove the alias *{event.anchor}.")
+                raise ValueError(f"A configuration must not contain itself: remove the alias *{event.anchor}.")
             values += sizes.get(event.anchor or "", 1)
         elif isinstance(event, yaml.ScalarEvent):
             values += 1
@@ -66,7 +66,7 @@ def check_yaml(text: str) -> str:
             begun.append(_Part(event.anchor, values))
             values += 1
             if len(begun) > DEEPEST:
-                raise ValueError(f"A configuration is nested too deeply: {DEEPEST} levels are the most.")
+                raise ValueError(f"A configuration is nested too deeply: the limit is {DEEPEST} levels.")
         if values > MOST:
             raise ValueError(f"A configuration of more than {MOST:,} values, aliases included, is too large.")
     return text
@@ -82,7 +82,7 @@ class _Part:
 
 
 def limit_yaml() -> None:
-    """Let jsonargparse refuse what :func:`check_yaml` refuses, in files and in values of the command line."""
+    """Make jsonargparse apply :func:`check_yaml` to files and to values from the command line."""
     from jsonargparse import get_loader, set_loader
 
     load = get_loader("yaml")
@@ -91,7 +91,7 @@ def limit_yaml() -> None:
 
 
 class _Limited:
-    """A loader that checks first."""
+    """A loader that checks the text first."""
 
     def __init__(self, load: Callable[[str], Any]) -> None:
         self.unlimited = load
@@ -107,10 +107,10 @@ def _exceptions() -> tuple[type[Exception], ...]:
 
 
 def check_config_files(arguments: Sequence[str]) -> None:
-    """Refuse configurations on a command line that are no regular file of readable size and UTF-8 text.
+    """Check that the configuration files on a command line are regular files of allowed size with UTF-8 text.
 
     Args:
-        arguments: The command line; what follows ``--config``, and every .yaml and .yml on it, is looked at.
+        arguments: The command line. The value of ``--config`` and every .yaml and .yml file on it are checked.
 
     Raises:
         ValueError: Naming the file and the remedy.
@@ -123,7 +123,7 @@ def check_config_files(arguments: Sequence[str]) -> None:
             continue
         try:
             if not Path(argument).exists():
-                continue  # YAML on the command line, or told by the parser
+                continue  # YAML on the command line, or an error that the parser reports
         except (OSError, ValueError):
             continue
         path = check_regular(argument, "the configuration", LARGEST)

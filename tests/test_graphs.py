@@ -256,7 +256,7 @@ def test_what_is_missing_is_named(driver):
         driver.allocate(3000 if driver.capturing is not None else 1)
 
     for several in (large, fail(RuntimeError("Triton Error [CUDA]: out of memory"))):
-        said = attempt(several, torch.OutOfMemoryError, r"No memory.*out of memory.*EnclosingBox.*coarsen `solver\.dx`")
+        said = attempt(several, torch.OutOfMemoryError, r"no memory.*out of memory.*EnclosingBox.*raise `solver\.dx`")
         assert "recordable" not in said
         assert "GPU 0" not in said
     waits = RuntimeError("CUDA error: operation not permitted when stream is capturing")

@@ -21,8 +21,8 @@ def laughs(levels):
 
 BAD = {
     "laughs": (laughs(10), "values, aliases included"),
-    "cyclic": ("wind: &w {flow: [1, 2, 3], again: *w}", r"hold itself: remove the alias \*w"),
-    "short": ("edits: &w [*w]", "hold itself"),
+    "cyclic": ("wind: &w {flow: [1, 2, 3], again: *w}", r"contain itself: remove the alias \*w"),
+    "short": ("edits: &w [*w]", "contain itself"),
     "deep": ("[" * 100_000, "nested too deeply"),
     "long": ("background: [" + "0, " * 19_000 + "0]", "A list of 19,001 entries"),
     "many": ("edits:\n" + "- {time: 1.0, E: 2.0}\n" * 20_000, "too large"),
@@ -61,11 +61,11 @@ def test_files_that_are_no_configurations(tmp_path):
     (tmp_path / "wide.yaml").write_bytes("output: Blüte\n".encode("utf-16"))
     (tmp_path / "huge.yaml").write_bytes(b"#" * (1 << 20) + b"\n")
     for arguments, words in (
-        (["--config", str(tmp_path / "pipe.yaml")], "no regular file"),
+        (["--config", str(tmp_path / "pipe.yaml")], "not a regular file"),
         ([f"--config={tmp_path / 'latin.yaml'}"], "latin.yaml is not UTF-8 text"),
         (["--config", str(tmp_path / "wide.yaml")], "wide.yaml is not UTF-8 text"),
         (["--wind", str(tmp_path / "huge.yaml")], "1,048,577 bytes"),
-        (["--config", "/dev/zero"], "no regular file"),
+        (["--config", "/dev/zero"], "not a regular file"),
         (["--config", str(tmp_path)], "is a directory"),
     ):
         with pytest.raises(ValueError, match=words):
@@ -77,4 +77,4 @@ def test_files_that_are_no_configurations(tmp_path):
 
 def test_a_group_without_fields(capsys):
     assert main(["--config", "wind: [1, 2]", "--frames", "2"]) == 2
-    assert "Expected `wind` to hold fields" in capsys.readouterr().err
+    assert "Expected `wind` to contain fields" in capsys.readouterr().err

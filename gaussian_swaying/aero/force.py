@@ -34,29 +34,29 @@ def aero_force(
         \mathbf{v}_r = \mathbf{u} - \mathbf{v} = v_r \mathbf{d}, \quad
         \mathbf{d}^t = \mathbf{d} - (\mathbf{d} \cdot \mathbf{n}) \mathbf{n}
 
-    A patch has no inside, so its normal is turned along the flow (n·d >= 0): otherwise drag could push upwind. A patch
-    exactly edge-on keeps the given sign in the ``paper`` law.
+    A patch has no inside or outside, so its normal is flipped to point along the flow (n·d >= 0). Otherwise drag could
+    push upwind. With the ``paper`` law, a patch that is exactly edge-on keeps the given sign.
 
     Args:
         wind: Air velocity u [m/s], broadcastable to (..., P, 3).
         velocity: Patch velocity v [m/s], shape (..., P, 3).
         normal: Unit normal of either sign, shape (..., P, 3).
-        area: Patch area [m²], shape (..., P); a patch of area zero feels nothing.
+        area: Patch area [m²], shape (..., P); a patch of zero area feels no force.
         drag: C_D.
         friction: C_F.
         lift: C_L.
         air_density: Density of the air [kg/m³].
-        law: ``paper`` is literal: the full drag acts along n whatever the incidence. ``projected`` multiplies the drag
-            by n·d, as for a plate, so that it vanishes edge-on.
-        lift_direction: ``side`` is literal, d x n, a force across flow and normal; ``lift`` is (d x n) x d, in their
-            plane.
-        unit_tangent: Normalise d^t (the paper's hat can be read so) instead of the literal projection.
+        law: ``paper`` follows the paper literally: the full drag acts along n at every angle of incidence.
+            ``projected`` multiplies the drag by n·d, as for a plate, so that it vanishes edge-on.
+        lift_direction: ``side`` is the paper's d x n, a force perpendicular to flow and normal; ``lift`` is (d x n) x
+            d, in the plane of flow and normal.
+        unit_tangent: Normalise d^t (a possible reading of the paper's hat) instead of using the projection itself.
 
     Returns:
         Force [N], shape (..., P, 3).
 
     Raises:
-        ValueError: If a shape or an option is not one of the above.
+        ValueError: If a shape does not fit or an option is unknown.
     """
     check_choice("law", law, LAWS)
     check_choice("lift_direction", lift_direction, ("side", "lift"))
@@ -102,16 +102,16 @@ def drag_rate(speed: Tensor, area: Tensor, mass: Tensor, coefficient: Tensor | f
 
 
 def capped_area(area: Tensor, rest_area: Tensor, max_ratio: float) -> Tensor:
-    r"""Area that meets the wind, :math:`\min(A, r_{max} A_0)`.
+    r"""Area that the wind acts on, :math:`\min(A, r_{max} A_0)`.
 
-    The total deformation gradient of material that flows grows without bound, and with it the area that Nanson's
-    formula gives, while a patch of grains catches no more wind than its grains do. Without a cap wind and area drive
+    The total deformation gradient of a plastic material grows without bound, and so does the area from Nanson's
+    formula. But a patch of grains catches no more wind than its grains do. Without a cap, wind and area would amplify
     each other.
 
     Args:
-        area: Patch area now [m²], shape (..., P).
+        area: Current patch area [m²], shape (..., P).
         rest_area: Patch area at rest [m²], shape (..., P).
-        max_ratio: Largest ratio of the two; infinite for no cap.
+        max_ratio: Largest allowed ratio of the two; infinite for no cap.
 
     Returns:
         Shape (..., P). The gradient with respect to ``area`` is zero where the cap holds.
@@ -122,8 +122,8 @@ def capped_area(area: Tensor, rest_area: Tensor, max_ratio: float) -> Tensor:
 class AeroForce(nn.Module):
     """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
 
-    The paper's coefficients are visual parameters: a flat plate across the flow has C_D near 1.2, and skin friction is
-    near 0.005.
+    The paper's coefficients are visual parameters. For comparison, a flat plate across the flow has a C_D of about 1.2,
+    and skin friction is about 0.005.
 
     Args:
         C_D: Drag coefficient.
@@ -133,10 +133,10 @@ class AeroForce(nn.Module):
         law: ``paper`` or ``projected``.
         lift_direction: ``side`` or ``lift``.
         unit_tangent: Normalise the tangential flow direction.
-        drag_step: ``explicit``, or ``semi_implicit``: the solver takes the drag at the velocity that it leads to (see
-            :meth:`resistance`), which needs no shorter substep for very light things in strong wind.
+        drag_step: ``explicit``, or ``semi_implicit``: the solver evaluates the drag at the velocity at the end of the
+            substep (see :meth:`resistance`), so that very light objects in strong wind need no shorter substeps.
         max_area_ratio: Largest ratio of a patch's area in the wind to its area at rest (see :func:`capped_area`); null
-            for no cap, which suits what is elastic. Material that flows needs one, such as 1.
+            for no cap, which suits elastic materials. Plastic materials need a cap, for example 1.
 
     Example:
         >>> aero = AeroForce(C_D=1.0, C_F=0.0, C_L=0.0, air_density=2.0)
@@ -169,7 +169,7 @@ class AeroForce(nn.Module):
             raise ValueError(
                 f"Expected `max_area_ratio` to be positive, or null for no cap on the area, but got {max_area_ratio}."
             )
-        # float64 scalars: they never lower the precision of a float64 run nor raise that of a float32 one
+        # float64 scalars: they neither lower the precision of a float64 run nor raise that of a float32 run
         for name, value in (("C_D", C_D), ("C_F", C_F), ("C_L", C_L)):
             self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
         self.C_D: Tensor
@@ -181,7 +181,7 @@ class AeroForce(nn.Module):
 
     @property
     def idle(self) -> bool:
-        """Whether the force is zero whatever the wind, so that it need not be computed."""
+        """Whether the force is zero in any wind, so that it need not be computed."""
         return self.air_density == 0 or not any(float(c) for c in (self.C_D, self.C_F, self.C_L))
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
@@ -190,10 +190,10 @@ class AeroForce(nn.Module):
         return drag_rate(speed, area, mass, coefficient, self.air_density)
 
     def resistance(self, wind: Tensor, velocity: Tensor, area: Tensor) -> Tensor | None:
-        r"""By how much the force falls as a patch follows it [kg/s], for ``MPMSolver.step(drag=...)``.
+        r"""Decrease of the force per velocity that the patch gains [kg/s], for ``MPMSolver.step(drag=...)``.
 
-        :math:`D = \tfrac12 \rho A C v_r`, so that the force at the end of the step is about
-        :math:`f - D (v^+ - v)`: where nothing moves it is the explicit one, and a free patch never overtakes the wind.
+        :math:`D = \tfrac12 \rho A C v_r`, so that the force at the end of the step is about :math:`f - D (v^+ - v)`. If
+        the velocity does not change, this is the explicit force. A free patch never overtakes the wind.
 
         Args:
             wind: Air velocity [m/s], broadcastable to (..., P, 3).
@@ -235,5 +235,5 @@ class AeroForce(nn.Module):
         )
 
     def extra_repr(self) -> str:
-        """Settings, for printing."""
+        """The settings, for printing."""
         return f"C_D={float(self.C_D):g}, C_F={float(self.C_F):g}, C_L={float(self.C_L):g}, law={self.law}"

@@ -1,4 +1,4 @@
-"""The force of the wind as a Triton function, for the fused substep; the definition is ``aero.wind_force``."""
+"""The force of the wind as a Triton function, for the fused substep. The reference is ``aero.wind_force``."""
 
 import triton
 import triton.language as tl
@@ -25,7 +25,7 @@ def aero_force(
         pressure = drag * speed * speed * sign
     shear = friction * speed
     if UNIT:
-        # the direction first: it is zero in a wind along the normal, where the rest would overflow
+        # normalise first: in a wind along the normal the tangent is zero, and the other order would overflow
         size = tl.maximum(tl.sqrt(tx * tx + ty * ty + tz * tz), 1.2e-38)
         tx = tx / size
         ty = ty / size
@@ -49,10 +49,10 @@ def aero_force(
 
 @triton.jit
 def wind_force(F, velocity, patch, wind, numbers, OPTIONS: tl.constexpr):
-    """The twin of ``WindForce``: force on patches (normal and area at rest) and their resistance [kg/s].
+    """Triton twin of ``WindForce``: force on patches (normal and area at rest) and their resistance [kg/s].
 
-    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: law projected, lift in
-    the plane of flow and normal, unit tangent.
+    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: projected law, lift in
+    the plane of flow and normal, unit tangent, semi-implicit drag.
     """
     normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], tl.load(numbers + 4))
     relative = (

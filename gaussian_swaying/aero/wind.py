@@ -44,7 +44,7 @@ def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tens
     Returns:
         float64, shape (..., lanes).
     """
-    # filled on the device: nothing is copied to it, so that a CUDA graph can record it
+    # filled on the device: nothing is copied from the host, so a CUDA graph can record it
     start = _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
     key = _mix(torch.full((), start, dtype=torch.int64, device=counter.device))
     lane = torch.arange(lanes, device=counter.device)
@@ -59,12 +59,12 @@ def counter_normal(seed: int, stream: int, counter: Tensor, lanes: int) -> Tenso
 
 
 def sample_index(time: Tensor, interval: float) -> Tensor:
-    """Number of the sample that holds at a time [s]; a time within 1e-6 of the next sample counts as there."""
+    """Index of the sample at a time [s]; a time less than 1e-6 intervals before the next sample belongs to that one."""
     return torch.floor(time / interval + 1e-6).long()
 
 
 class Modulation(Recordable, nn.Module, ABC):
-    """Base of all modulations: turns the velocity at a time into another one."""
+    """Base of all modulations, which change the wind velocity at a given time."""
 
     @abstractmethod
     def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
@@ -74,7 +74,7 @@ class Modulation(Recordable, nn.Module, ABC):
             velocity: Air velocity [m/s], shape (..., 3), float64.
             time: Time [s], shape (...), float64.
             seed: Seed of the run.
-            stream: Place of this modulation in its WindField.
+            stream: Position of this modulation in the list of its WindField.
         """
 
 
@@ -82,8 +82,8 @@ class SineSway(Modulation):
     """Lets the largest component of the wind sway about its mean (paper, supplement, "More Details on Parameters").
 
     Args:
-        amplitude: Amplitude as a share of the component; the paper's half.
-        period: Period [s]; the paper gives none.
+        amplitude: Amplitude as a fraction of the component; the paper uses 0.5.
+        period: Period [s]; not given in the paper.
         phase: Phase at time zero [rad].
     """
 
@@ -106,7 +106,7 @@ class UniformGust(Modulation):
     """Multiplies the wind by 1 + U(-delta, delta) (paper, "Aerodynamics").
 
     Args:
-        delta: Half width of the distribution; the paper gives none.
+        delta: Half width of the distribution; not given in the paper.
         interval: Time between samples [s]; each holds until the next.
     """
 
@@ -128,9 +128,9 @@ class GaussianGust(Modulation):
     """Adds N(0, std²) to each component (paper, supplement, "More Details on Parameters").
 
     Args:
-        std: Standard deviation [m/s]; the paper's 0.3.
-        interval: Time between samples [s]; each holds until the next. The paper gives none. Drawn once per substep,
-            white noise would fade as the substep shrinks, so the samples are tied to time instead.
+        std: Standard deviation [m/s]; the paper uses 0.3.
+        interval: Time between samples [s]; each holds until the next. Not given in the paper. White noise drawn once
+            per substep would fade as substeps get shorter, so samples are drawn at fixed times instead.
     """
 
     recordable = True
@@ -160,19 +160,19 @@ class FlowKey:
 
 
 class SpatialWind(Recordable, nn.Module, ABC):
-    """Base of winds that depend on the place: a jet, a boundary layer, a gust that travels.
+    """Base of winds that vary in space: a jet, a boundary layer, a travelling gust.
 
-    A wind of your own is a subclass with a ``forward``; where that can be recorded in a CUDA graph (see ``Force``) it
-    says ``recordable = True``.
+    For a custom wind, write a subclass with a ``forward``. If it can be recorded in a CUDA graph (see ``Force``), set
+    ``recordable = True``.
     """
 
     @abstractmethod
     def forward(self, time: Tensor, position: Tensor) -> Tensor:
-        """Air velocity at some places.
+        """Air velocity at given positions.
 
         Args:
             time: Time [s], scalar float64 tensor.
-            position: Places [m], z up, shape (..., P, 3).
+            position: Positions [m], z up, shape (..., P, 3).
 
         Returns:
             Velocity [m/s], broadcastable to (..., P, 3).
@@ -184,7 +184,7 @@ class WindField(nn.Module):
 
     Args:
         flow: Steady air velocity [m/s], z up.
-        schedule: Flow that changes in time, instead of the steady one; before the first entry its flow holds.
+        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time.
         interpolation: Between entries of the schedule: ``step`` (hold) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.

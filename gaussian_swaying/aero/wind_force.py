@@ -21,17 +21,17 @@ Wind = WindField | SpatialWind
 class WindForce(Force):
     """Wind on surface patches that deform with their particles.
 
-    Give it to ``MPMSolver.rollout`` as one of its ``forces``. Where the wind is the same everywhere it has a Triton
-    twin, so on a GPU the whole of it is computed within the substep's own kernels.
+    Pass it to ``MPMSolver.rollout`` as one of its ``forces``. A uniform wind has a Triton twin, so on a GPU the force
+    is computed inside the kernels of the substep.
 
     Args:
         aero: Coefficients and law of the force.
-        wind: The air, or one for each scene of a batch.
+        wind: The wind, or a list with one wind for each scene of a batch.
         normal: Unit normals of the patches at rest, shape (..., P, 3).
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind.
 
     Raises:
-        ValueError: If the shapes do not agree, or there are not as many winds as scenes.
+        ValueError: If the shapes do not agree, or the numbers of winds and scenes differ.
 
     Example:
         >>> up = torch.tensor([[0.0, 0.0, 1.0]])
@@ -59,13 +59,13 @@ class WindForce(Force):
         self._graph: torch.cuda.CUDAGraph | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """Without the graph, which nothing can copy."""
+        """The state without the CUDA graph, which cannot be copied."""
         kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
         return kept | {"_key": (), "_graph": None}
 
     @property
     def wind(self) -> nn.Module | tuple[nn.Module, ...]:
-        """The air, or one for each scene of a batch."""
+        """The wind, or one wind for each scene of a batch."""
         return self._fields[0] if self._shared else tuple(self._fields)
 
     @property
@@ -75,7 +75,7 @@ class WindForce(Force):
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
-        """Whether the wind can be recorded: what is here, with modulations and spatial winds that say so."""
+        """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
         return all(
             wind.recordable if isinstance(wind, SpatialWind) else type(wind) is WindField for wind in self._fields
         ) and all(
@@ -87,7 +87,7 @@ class WindForce(Force):
 
     @property
     def device(self) -> torch.device | None:
-        """Where the wind is; None if its parts are on several devices."""
+        """Device of the wind; None if its parts are on several devices."""
         found = {tensor.device for tensor in self._wind_tensors()}
         return found.pop() if len(found) == 1 else None
 
@@ -97,17 +97,17 @@ class WindForce(Force):
     def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         """Velocity of a uniform wind [m/s] at the start of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on.
 
-        Gusts take some seventy small kernels. On a GPU they are recorded in a CUDA graph at the second call if all
-        modulations are ``recordable``, and again when a number or a buffer of the wind was replaced; one force must
-        then not be asked by two threads at once.
+        Gusts take about seventy small kernels. On a GPU, if all modulations are ``recordable``, they are recorded in a
+        CUDA graph at the second call, and again when a number or buffer of the wind is replaced. Two threads must then
+        not use the same force at once.
 
         Args:
             time: Scalar float64 tensor.
             dt: Number, or scalar float64 tensor on the same device.
-            steps: How many.
+            steps: Number of substeps.
 
         Returns:
-            Shape (steps, 3), or (steps, B, 1, 3) with a wind for each scene; float64, on the device of ``time``.
+            Shape (steps, 3), or (steps, B, 1, 3) with one wind for each scene; float64, on the device of ``time``.
         """
         on_gpu = time.is_cuda and self.device == time.device
         if not (on_gpu and self.recordable and steps <= MOST_STEPS) or (
@@ -118,13 +118,13 @@ class WindForce(Force):
         new = self._key != key
         if new:
             self._key, self._graph = key, None
-            with torch.inference_mode(False):  # they may be written within inference mode and without
+            with torch.inference_mode(False):  # they must be writable inside and outside inference mode
                 self._now, self._dt = (torch.zeros((), dtype=torch.float64, device=time.device) for _ in range(2))
         elif self._graph is None:
             self._graph = record(time.device, self._tabulate)
         self._now.copy_(time)
         self._dt.copy_(dt) if isinstance(dt, Tensor) else self._dt.fill_(dt)
-        if self._graph is None:  # the first time as it is, so that all is loaded before it is recorded
+        if self._graph is None:  # the first time without a graph, so that all kernels are loaded before recording
             self._tabulate()
         else:
             self._graph.replay()
@@ -140,11 +140,11 @@ class WindForce(Force):
         return torch.stack([wind(times) for wind in self._fields], dim=1)[:, :, None].to(time.device)
 
     def air(self, time: Tensor, position: Tensor) -> Tensor:
-        """Air velocity at some places [m/s].
+        """Air velocity at given positions [m/s].
 
         Args:
             time: Time [s], scalar float64 tensor.
-            position: Places [m], shape (..., P, 3).
+            position: Positions [m], shape (..., P, 3).
 
         Returns:
             Broadcastable to (..., P, 3).
@@ -160,7 +160,7 @@ class WindForce(Force):
         return torch.stack([part.expand_as(position[0]).to(position) for part in parts])
 
     def samples(self, state: MPMState, dt: float, steps: int) -> Tensor:
-        """Air velocity at ``steps`` times, ``dt`` [s] apart, from that of a state on, where its particles are [m/s].
+        """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
 
         Returns:
             Shape (steps, ...), broadcastable to (steps, ..., P, 3) from its second axis on.
@@ -193,11 +193,11 @@ class WindForce(Force):
 
     @property
     def has_twin(self) -> bool:
-        """Whether the kernels can compute it: where the wind is uniform."""
+        """Whether the kernels can compute the force: only if the wind is uniform."""
         return self.uniform
 
     def twin(self) -> ForceTwin:
-        """See ``Force.twin``; of a uniform wind."""
+        """See ``Force.twin``; for a uniform wind only."""
         from gaussian_swaying.aero.force_triton import wind_force
 
         aero = self.aero

@@ -1,4 +1,4 @@
-"""From a YAML file and the command line to settings. The constructors of the components are the schema."""
+"""Turns a YAML file and the command line into settings. The constructors of the components are the schema."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-# imported so that a configuration can name them without their modules
+# imported so that a configuration can use their class names without the module
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
-# what a configuration cannot hold; what may change between a run and the one that resumes it
+# options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
-# arguments of the constructor that a YAML gives within a component; those that may be null as a whole
+# constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer")
 NULLABLE = ("normalisation",)
 
 
 class PhysGaussianAction(Action):
-    """Takes a PhysGaussian configuration as ``--config`` takes a YAML file, and prints the differences in meaning."""
+    """Reads a PhysGaussian configuration as ``--config`` reads a YAML file, and prints the differences in meaning."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        """Convert the file and merge it into what was parsed so far."""
+        """Convert the file and merge it into the settings parsed so far."""
         from jsonargparse import ActionConfigFile
 
         try:
@@ -49,10 +49,10 @@ class PhysGaussianAction(Action):
 
 
 class PresetAction(Action):
-    """Takes the file of the same name in a folder beside the configuration given before."""
+    """Reads the preset: the file of the same name in a folder next to the configuration given before."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        """Merge the preset into what was parsed so far."""
+        """Merge the preset into the settings parsed so far."""
         from jsonargparse import ActionConfigFile
 
         given = [file for file in namespace.get("config") or [] if file is not None]
@@ -64,7 +64,7 @@ class PresetAction(Action):
             there = sorted(path.parent.name for path in config.parent.glob(f"*/{config.name}"))
             raise TypeError(
                 f"There is no preset `{values}` of {config}: {preset} is missing"
-                + (f"; there is {', '.join(there)}." if there else "; leave out --preset.")
+                + (f"; available: {', '.join(there)}." if there else "; leave out --preset.")
             )
         ActionConfigFile.apply_config(parser, namespace, "config", str(preset))
 
@@ -73,7 +73,7 @@ def build_parser(schema: type) -> ArgumentParser:
     """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors.
 
     Args:
-        schema: The class whose constructor says what a configuration holds.
+        schema: The class whose constructor defines the fields of a configuration.
     """
     from jsonargparse import ActionYesNo, ArgumentParser
 
@@ -81,15 +81,15 @@ def build_parser(schema: type) -> ArgumentParser:
     parser = ArgumentParser(
         prog=program.name("sim"),
         exit_on_error=False,
-        description="Let the wind move a 3D Gaussian scene: splat in, video out. Lengths that say where something is "
-        "are in scene units and axes; velocities, gravity and light are in metres, z up.",
+        description="Move a 3D Gaussian scene in the wind: splat in, video out. Positions and regions are in scene "
+        "units and axes; velocities, gravity and light are in metres, z up.",
     )
     parser.add_argument("--config", action="config", help="YAML file; options given after it override it.")
     parser.add_argument(
         "--physgaussian",
         action=PhysGaussianAction,
         default=SUPPRESS,
-        help="The same for a JSON file of PhysGaussian, which is converted.",
+        help="Like --config, for a JSON file of PhysGaussian, which is converted.",
     )
     parser.add_argument(
         "--preset",
@@ -98,8 +98,8 @@ def build_parser(schema: type) -> ArgumentParser:
         help="preview: fewer Gaussians, a coarser grid and a small picture, for a laptop; options given after it "
         "override it.",
     )
-    parser.add_argument("--output", type=str | None, help="Folder of the results. Default: outputs/<config name>.")
-    parser.add_argument("--frames", type=int, default=250, help="Number of frames, the first at rest.")
+    parser.add_argument("--output", type=str | None, help="Folder for the results. Default: outputs/<config name>.")
+    parser.add_argument("--frames", type=int, default=250, help="Number of frames; the first is at rest.")
     parser.add_argument(
         "--resume",
         action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
@@ -114,12 +114,12 @@ def build_parser(schema: type) -> ArgumentParser:
 
 
 def arguments_of(schema: type) -> list[str]:
-    """The arguments of a constructor that a configuration holds."""
+    """The arguments of a constructor that a configuration can contain."""
     return [name for name in inspect.signature(schema).parameters if name not in PYTHON_ONLY]
 
 
 def _groups(schema: type) -> dict[str, type]:
-    """Those that are one component each, and so a group of options."""
+    """The arguments that are a single component each; they become groups of options."""
     hints = get_type_hints(schema.__init__)  # type: ignore[misc]
     found: dict[str, type] = {}
     for name in arguments_of(schema):
@@ -138,7 +138,7 @@ def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespac
         path: The YAML file.
 
     Raises:
-        ValueError: If it is not right; the message names the field.
+        ValueError: If the file or a value in it is invalid; the message names the field.
     """
     arguments = ["--config", os.fspath(path)]
     check_config_files(arguments)
@@ -149,28 +149,28 @@ def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespac
 
 
 def check_settings(schema: type, settings: Namespace) -> None:
-    """Raise ValueError if parsed settings hold what no configuration can.
+    """Raise ValueError if parsed settings contain something that a configuration cannot.
 
     Args:
-        schema: As of :func:`build_parser`.
-        settings: What its parser parsed.
+        schema: As in :func:`build_parser`.
+        settings: The settings that its parser returned.
     """
     from jsonargparse import Namespace
 
     for name in COMMAND_LINE_ONLY:
         if name in settings:
-            raise ValueError(f"`{name}` is an option of the command line, not of a YAML: remove it and give --{name}.")
+            raise ValueError(f"`{name}` is a command-line option, not a YAML field: remove it and use --{name}.")
     for name in _groups(schema):
         if not isinstance(settings[name], Namespace):
             raise ValueError(
-                f"Expected `{name}` to hold fields, such as those that --help lists, but got {settings[name]!r}."
+                f"Expected `{name}` to contain fields, such as those that --help lists, but got {settings[name]!r}."
             )
     if settings.frames < 1:
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
 
 
 def config_text(parser: ArgumentParser, settings: Namespace) -> str:
-    """The settings that decide the result, as YAML."""
+    """The settings that determine the result, as YAML."""
     kept = settings.clone()
     for name in RUN_ONLY:
         kept.pop(name, None)
@@ -178,7 +178,7 @@ def config_text(parser: ArgumentParser, settings: Namespace) -> str:
 
 
 def note_changes(changes: Mapping[str, Any]) -> str:
-    """What took the place of the settings of a file, as YAML, so that a run in other settings is not continued."""
+    """Arguments that replaced settings of a file, as YAML, so that a run with other settings is not continued."""
     import yaml
 
     noted = {"changed_in_python": {name: repr(value) for name, value in sorted(changes.items())}}

@@ -1,4 +1,4 @@
-"""What the constructor of a simulation takes in Python besides components, and what stands for those not given."""
+"""Short forms that the constructor of a simulation accepts in Python, and defaults for missing components."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
     WindLike = WindField | SpatialWind | Sequence[float]
     DeviceLike = torch.device | str
-else:  # what a YAML can say: the annotations of the constructor are its schema
+else:  # what a YAML file can contain: the annotations of the constructor are its schema
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
 
 CELLS = 32
-"""Cells of the grid along the longest side, at most, where no solver is given."""
+"""Largest number of grid cells along the longest side if no solver is given."""
 
 
 def resolve_device(device: DeviceLike) -> torch.device:
-    """``auto``, ``cpu`` or ``cuda`` as a device; ValueError if CUDA is asked for and missing."""
+    """``auto``, ``cpu`` or ``cuda`` as a device; ValueError if CUDA is requested but not available."""
     if isinstance(device, torch.device):
         return device
     if device != "auto" and not device.startswith("cuda"):
@@ -42,27 +42,27 @@ def resolve_device(device: DeviceLike) -> torch.device:
         return torch.device("cuda" if device == "auto" else device)
     if device != "auto":
         raise ValueError(
-            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, and there is none: use --device auto or cpu."
+            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, but found none: use --device auto or cpu."
         )
     return torch.device("cpu")
 
 
 def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
-    """A scene from settings, a file, Gaussians or a scene made in code.
+    """Make a scene from settings, a file, Gaussians or a scene made in code.
 
     Args:
         source: What to simulate.
         up: Direction that points up in it; z if None.
 
     Returns:
-        The settings as they are; of anything else, all of it, with points chosen for the grid.
+        A :class:`Scene` as it is. Anything else is simulated as a whole, with points chosen for the grid.
 
     Raises:
         ValueError: If ``up`` is given twice.
     """
     if isinstance(source, Scene):
         if up is not None:
-            raise ValueError("`up` is given by the scene: write Scene(..., up=...), and leave out `up` beside it.")
+            raise ValueError("`up` belongs to the scene: write Scene(..., up=...), and leave out the separate `up`.")
         return source
     direction = [0.0, 0.0, 1.0] if up is None else list(check_vector("up", up))
     if isinstance(source, ProceduralScene | GaussianCloud):
@@ -72,13 +72,13 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
 
 
 def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene) -> MPMSolver:
-    """The solver given, or one whose grid suits the size of the scene.
+    """Return the given solver, or make one whose grid suits the size of the scene.
 
     What is held has no gravity then, as in the starters of the preview: its shape at rest is one in balance with its
     weight. What is not held falls.
 
     Raises:
-        ValueError: If ``hold`` is given beside a solver.
+        ValueError: If ``hold`` is given together with a solver.
     """
     if solver is None:
         pins = [] if hold is None else [PinnedRegion(hold)]
@@ -92,14 +92,14 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene) -> MP
         return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins)
     if hold is not None:
         raise ValueError(
-            "`hold` pins a region where no solver is given: add PinnedRegion(...) to the `boundaries` of the solver, "
-            "and leave out `hold`."
+            "`hold` only works without a solver: add PinnedRegion(...) to the `boundaries` of the solver, and leave "
+            "out `hold`."
         )
     return solver
 
 
 def as_wind(wind: WindLike | None) -> WindField | SpatialWind:
-    """The wind given, a steady one of three numbers [m/s], or still air for None."""
+    """Return the given wind, a steady wind from three numbers [m/s], or still air for None."""
     if isinstance(wind, WindField | SpatialWind):
         return wind
     if isinstance(wind, nn.Module):

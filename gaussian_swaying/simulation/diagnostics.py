@@ -1,4 +1,4 @@
-"""What a run reports about its own health, and how it ends when it is not."""
+"""Measures the health of a run, and ends the run when it diverges."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.simulation.health import particle_of_extremes
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
-_SAMPLE = 4096  # particles whose nearest neighbour is looked for
+_SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
 class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way StopIteration ends a loop)
-    """The simulation left the range where its numbers mean anything.
+    """The simulation diverged: its numbers no longer mean anything.
 
     Attributes:
         time: Simulated time [s].
         particle: Index of the first bad particle, or None if no single one is to blame.
-        cause: What was seen.
+        cause: What went wrong.
         remedy: What to change.
     """
 
@@ -53,8 +53,8 @@ class FrameDiagnostics:
         angular_momentum_y: Angular momentum about the origin [kg m²/s].
         angular_momentum_z: Angular momentum about the origin [kg m²/s].
         lost: Particles that left the grid.
-        torn: Particles of elastic material of which a neighbour at rest is now farther than two cells, so that the grid
-            no longer ties them together; only in ``updated``.
+        torn: Elastic particles with a rest neighbour that is now more than two cells away, so that the grid no longer
+            connects them; only in ``updated``.
         J_min: Smallest determinant of F.
         J_max: Largest determinant of F.
         stretch_min: Smallest singular value of F.
@@ -62,8 +62,8 @@ class FrameDiagnostics:
         displacement_mean: Mean distance from rest [m].
         displacement_max: Largest distance from rest [m].
         moved_particle: Index of the particle that is farthest from rest.
-        compressed_particle: Index of that with the smallest stretch.
-        stretched_particle: Index of that with the largest stretch.
+        compressed_particle: Index of the particle with the smallest stretch.
+        stretched_particle: Index of the particle with the largest stretch.
     """
 
     time: float
@@ -99,12 +99,12 @@ class FrameDiagnostics:
 class TearingGauge:
     """Counts the particles that a sheet has numerically torn apart.
 
-    In the ``updated`` formulation two particles feel each other through common grid nodes. Neighbours that drift more
-    than two cells apart share none, and the sheet between them is gone without any law having broken it.
+    In the ``updated`` formulation, two particles interact through shared grid nodes. Neighbours that drift more than
+    two cells apart share no node, so the sheet between them is torn although no material law broke it.
 
     Args:
-        solver: A solver with its material; plastic laws and fluids may flow apart and are not counted.
-        count: Neighbours of each particle that are watched, those within two cells at rest.
+        solver: A solver with its material; particles with plastic laws may flow apart and are not counted.
+        count: Number of neighbours watched for each particle, among those within two cells at rest.
     """
 
     def __init__(self, solver: MPMSolver, count: int = 4) -> None:
@@ -123,7 +123,7 @@ class TearingGauge:
         self.elastic = solver.laws.elastic_particles()
 
     def __call__(self, position: Tensor) -> Tensor:
-        """Which particles are torn off a neighbour, from positions (..., P, 3) [m]; bool, shape (scenes, P)."""
+        """Which particles are torn from a neighbour, from positions (..., P, 3) [m]; bool, shape (scenes, P)."""
         flat = position.reshape(-1, *position.shape[-2:])
         near = flat.reshape(-1, 3).index_select(0, self.neighbour).reshape(*flat.shape[:2], -1, 3)
         apart = torch.linalg.vector_norm(near - flat[:, :, None], dim=-1)
@@ -132,7 +132,7 @@ class TearingGauge:
 
 
 def check_spacing(solver: MPMSolver) -> None:
-    """Raise ValueError if most particles are alone on the grid, so that no law could hold them together.
+    """Raise ValueError if most particles are isolated on the grid, so that no law could hold them together.
 
     Args:
         solver: A solver with its material.
@@ -141,14 +141,14 @@ def check_spacing(solver: MPMSolver) -> None:
         ValueError: Naming the spacing and the remedy.
     """
     position = solver.points.position.detach().reshape(-1, *solver.points.position.shape[-2:])[0]
-    if len(position) < 16:  # a few may be meant to be alone
+    if len(position) < 16:  # a few may be isolated on purpose
         return
     some = position[:: math.ceil(len(position) / _SAMPLE)]
     spacing = float(nearest_neighbours(position, 2, some)[0][:, 1].median())  # the first is the particle itself
     if spacing > 2 * solver.dx:
         raise ValueError(
             f"Half of the particles are more than {spacing:.3g} m from their nearest neighbour, more than two cells of "
-            f"`solver.dx` = {solver.dx:g} m, so the grid does not tie them together: raise `solver.dx` to about "
+            f"`solver.dx` = {solver.dx:g} m, so the grid does not connect them: raise `solver.dx` to about "
             f"{spacing:.2g} m."
         )
 
@@ -171,7 +171,7 @@ def diagnose(
         cfl: Largest Courant number of the frame.
         wind_work: Work of the wind during the frame [J].
         tearing: Counts torn particles; none are counted without it.
-        check: Also do what :func:`check_state` does, within the same synchronisation.
+        check: Also run :func:`check_state`, within the same synchronisation.
 
     Returns:
         The measurements.
@@ -183,7 +183,7 @@ def diagnose(
 
 
 class Measurement:
-    """What :func:`measure` has computed on the device, and nobody has waited for yet."""
+    """Results of :func:`measure` on the device, which the host has not waited for yet."""
 
     def __init__(self, solver: MPMSolver, substeps: int, parts: dict[str, Tensor], given: list[Tensor | float]) -> None:
         self._solver, self._substeps, self._given = solver, substeps, given
@@ -222,7 +222,7 @@ def measure(
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
 ) -> Measurement:
-    """Start what :func:`diagnose` does, with the same arguments, without waiting for the device."""
+    """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device."""
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
     energy = torch.stack([energies[name] for name in ("kinetic", "elastic", "potential")]).double()
@@ -248,11 +248,11 @@ def measure(
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:
-    """Raise SimulationDiverged if a particle is NaN, infinite, out of the grid or absurdly far away.
+    """Raise SimulationDiverged if a particle is NaN, infinite, outside the grid or extremely far away.
 
     Args:
         solver: The solver that made the state.
-        state: The state to look at (one GPU synchronisation).
+        state: The state to check (one GPU synchronisation).
 
     Raises:
         SimulationDiverged: Naming time, particle, cause and remedy.
@@ -266,7 +266,7 @@ _FAR, _LOST, _NOT_FINITE = 1, 2, 3  # what is wrong with a particle; the last is
 
 
 def _verdict(solver: MPMSolver, state: MPMState, moved: Tensor) -> Tensor:
-    """What is wrong with the first bad particle (0 for none), its index, the lost ones, the object's size [m].
+    """Problem of the first bad particle (0 for none), its index, number of lost particles, size of the object [m].
 
     ``moved`` is how far each particle is from rest [m], shape (..., P). Four float64 values.
     """

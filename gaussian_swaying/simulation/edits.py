@@ -1,4 +1,4 @@
-"""Another material or another colour for a part of the object, at load or during a run."""
+"""Changes of material or colour for a part of the object, at load or during a run."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
 
 @dataclass
 class Edit:
-    """A change of a part of the object.
+    """A change to a part of the object.
 
     Deformations and velocities stay as they are; stresses follow the new material from then on. Where the law changes,
-    its internal variable starts anew.
+    its internal variable is reset.
 
     Args:
-        region: Where at rest, in scene units, also among Gaussians that stay; all that moves if null.
-        time: When [s]: holds from the first frame at or after it. 0 is at load.
+        region: Region at rest, in scene units; it may also contain Gaussians that do not move. Everything that moves if
+            null.
+        time: Time [s]: the edit applies from the first frame at or after it. 0 means at load.
         E: Young's modulus [Pa]; unchanged if null.
         nu: Poisson's ratio; unchanged if null.
         density: Density at rest [kg/m³]; unchanged if null.
-        law: Constitutive law; unchanged if null. One that flows needs ``solver.formulation: updated``.
-        color: Red, green and blue in [0, 1], the same from everywhere; unchanged if null.
-        detail: Which part of the differences in brightness within the region the new colour keeps, in [0, 1].
+        law: Constitutive law; unchanged if null. A plastic law needs ``solver.formulation: updated``.
+        color: Red, green and blue in [0, 1], the same from every direction; unchanged if null.
+        detail: Fraction of the brightness differences within the region that the new colour keeps, in [0, 1].
     """
 
     region: Region | None = None
@@ -68,18 +69,18 @@ class Edit:
 
 
 def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bool = False) -> MaterialPoints:
-    """The material with an edit.
+    """Apply an edit to the material.
 
     Args:
         points: The material of one scene, shapes (P, ·).
         inside: Which points are edited, bool, shape (P,).
         edit: What to change.
-        flowed: Whether the points have moved already. Where a law has flowed, the elastic and the total deformation
-            differ for good. If none is left that flows, one of the laws is told to keep both, and the one that flowed
-            stays in the list, without particles, for kernels that look at the list.
+        flowed: Whether the points have already moved. After plastic flow, the elastic and the total deformation differ
+            for good. If no plastic law is left, one of the other laws is set to keep both, and the plastic law stays in
+            the list without particles, because the kernels check the list.
 
     Returns:
-        The material; laws that hold for no point any more are left out.
+        The material; laws that no point uses any more are left out.
     """
 
     def field(value: float | None, old: Tensor) -> Tensor:
@@ -111,14 +112,14 @@ def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bo
 
 
 def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float = 0.0) -> Tensor:
-    """Harmonics of a splat with one colour for a part of it.
+    """Spherical harmonics of a splat, with one colour for a part of it.
 
     Args:
         sh: Coefficients, shape (N, K, 3).
         inside: Which Gaussians get the colour, bool, shape (N,).
         color: Red, green and blue in [0, 1].
-        detail: Which part of the differences in brightness is kept: the colour is multiplied by
-            ``1 + detail (Y / mean(Y) - 1)`` with the luminance Y of the old colours.
+        detail: Fraction of the brightness differences that is kept: the colour is multiplied by ``1 + detail (Y /
+            mean(Y) - 1)`` with the luminance Y of the old colours.
 
     Returns:
         Shape (N, K, 3).
@@ -133,14 +134,14 @@ def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float 
 
 
 class SceneEditor:
-    """Applies edits to a scene, in order of their times, and takes them back.
+    """Applies edits to a scene, in order of their times, and can undo them.
 
     Args:
         scene: The scene, which is changed.
-        edits: What changes when; those of the same time in the order given, so that later entries win.
+        edits: The edits. Those with the same time are applied in the given order, so that later entries win.
 
     Raises:
-        ValueError: If the region of an edit holds nothing that it could change.
+        ValueError: If the region of an edit contains nothing that it could change.
     """
 
     def __init__(self, scene: SimulatedScene, edits: Sequence[Edit] = ()) -> None:
@@ -179,7 +180,7 @@ class SceneEditor:
         return particles, gaussians
 
     def reset(self) -> None:
-        """The scene as it was before its first edit."""
+        """Restore the scene as it was before its first edit."""
         self.applied = 0
         if self._loaded is None:
             return
@@ -190,13 +191,13 @@ class SceneEditor:
         self._loaded = None
 
     def due(self, time: float) -> list[Edit]:
-        """The edits of the list up to a time [s] that were not yet applied; they count as applied from now on."""
+        """Return the edits up to a time [s] that were not yet applied, and mark them as applied."""
         found = [edit for edit in self.edits[self.applied :] if edit.time <= time]
         self.applied += len(found)
         return found
 
     def apply(self, edit: Edit, flowed: bool = False) -> Tensor:
-        """Change the scene.
+        """Apply an edit to the scene.
 
         Args:
             edit: What to change.

@@ -1,4 +1,4 @@
-"""Whether the size of an object makes sense: no Gaussian far away from all others, and a grid that it fills."""
+"""Checks the size of an object: no Gaussian far away from all others, and not too small for the grid."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ import warnings
 
 from torch import Tensor
 
-_SAMPLE = 100_000  # Gaussians that are sorted
-_FEW = 16  # fewer may be meant to lie anywhere
-FAR, TOO_FAR = 20, 1000  # times the side that 98 % of the Gaussians lie within
+_SAMPLE = 100_000  # Gaussians that are sorted, at most
+_FEW = 16  # fewer Gaussians are not checked
+FAR, TOO_FAR = 20, 1000  # multiples of the side of the box around 98 % of the Gaussians
 SHORT, TOO_SHORT = 3.0, 0.5  # cells along the longest side
 
 
 def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor | None = None) -> None:
-    """Refuse an object whose size is the distance to a stray Gaussian, or that is far smaller than the grid.
+    """Refuse an object whose size comes from a stray Gaussian, or that is far too small for the grid.
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
         metres_per_unit: Length of a scene unit [m].
         dx: Grid spacing [m].
-        index: Numbers of the Gaussians in the splat, for the message, shape (N,).
+        index: Indices of the Gaussians in the splat, for the message, shape (N,).
 
     Raises:
         ValueError: If a Gaussian lies a thousand sides away from the others, or the object is shorter than half a cell.
@@ -39,7 +39,7 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
         number = first if index is None else int(index[first])
         text = (
             f"Gaussian {number} lies at {[float(f'{v:.4g}') for v in means[first].tolist()]}, but 98 % of those "
-            f"simulated lie within {most:.3g} scene units, so size and mass would be those of empty space: leave "
+            f"simulated lie within {most:.3g} scene units, so size and mass would come from empty space: leave "
             "it out with `scene.region` or `scene.opacity_threshold`."
         )
         if whole > TOO_FAR * most:

@@ -20,10 +20,10 @@ class Frame:
     """A frame of a simulation.
 
     Attributes:
-        simulation: Where it comes from.
-        index: Its number; 0 is at rest.
+        simulation: The simulation that made it.
+        index: Its number; 0 is the frame at rest.
         state: The state at its end.
-        health: Energies, momenta, stretch and what else was measured.
+        health: Energies, momenta, stretch and other measurements.
     """
 
     simulation: Simulation
@@ -43,10 +43,10 @@ class Frame:
         return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
 
     def render(self, camera: str = "") -> RenderOutput:
-        """The picture of the frame.
+        """Render the frame.
 
         Args:
-            camera: Which of ``cameras``; empty for ``camera``.
+            camera: Name of one of ``cameras``; empty for the main ``camera``.
 
         Returns:
             Colour, opacity and depth.

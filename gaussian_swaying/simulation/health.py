@@ -1,4 +1,4 @@
-"""What the diagnostics of a run come to, in sentences: whether it held together, what moved most, what to change."""
+"""Sums up the diagnostics of a run: whether the object held together, what moved most, what to change."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-SOUND = (0.5, 2.0)  # stretch beyond which material is no longer what anyone meant
+SOUND = (0.5, 2.0)  # range of stretch within which the object keeps its intended shape
 
-USUAL = 0.2  # largest displacement as a share of the size that still looks like wind
+USUAL = 0.2  # largest displacement, as a fraction of the size, that still looks like wind
 
 
 def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elastic: Tensor | None) -> dict[str, Any]:
     """What moved most, and what was compressed and stretched most, over the frames of a run.
 
     Args:
-        log: Diagnostics of the frames, as of ``FrameDiagnostics.as_dict``.
+        log: Diagnostics of the frames, as from ``FrameDiagnostics.as_dict``.
         where: Rest positions of the particles [scene units], shape (P, 3).
         size: Longest side of the object [m].
-        elastic: Which particles are elastic, shape (P,), None for all; the stretch of what flows says nothing.
+        elastic: Which particles are elastic, shape (P,), None for all; the stretch of plastic materials means nothing.
 
     Returns:
         ``moved``, ``compressed`` and ``stretched``, each a dictionary with ``value`` (in m or as a ratio of lengths),
-        ``at`` (rest position, scene units) and ``time`` [s]; ``moved`` with its ``share`` of the size too. None where
-        no frame tells.
+        ``at`` (rest position, scene units) and ``time`` [s]; ``moved`` also has its ``share`` of the size. None where
+        no frame has a value.
     """
     found: dict[str, Any] = {}
     for name, field, particle, sign in (
@@ -48,15 +48,15 @@ def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elast
 
 
 def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -> list[str]:
-    """What went wrong with the shape of the object and what to change, in sentences; none if all is well.
+    """Sentences on what went wrong with the shape of the object and what to change; none if all is well.
 
     Args:
         found: From :func:`extremes`.
         E: Largest Young's modulus of the run [Pa].
-        thickness_matters: Whether ``material.thickness`` decides about the volume.
+        thickness_matters: Whether ``material.thickness`` determines the volume.
 
     Returns:
-        Sentences.
+        The sentences.
     """
     low, high = SOUND
     small, large, moved = found["compressed"], found["stretched"], found["moved"]
@@ -71,7 +71,7 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
         return []
     said = [f"The material was {' and '.join(bad)}; between {low:g} and {high:g} it keeps its shape."]
     if moved is not None:
-        said.append(f"What moved most moved by {_digits(moved['value'])} m, {moved['share']:.0%} of the size, "
+        said.append(f"The largest displacement was {_digits(moved['value'])} m, {moved['share']:.0%} of the size, "
                     f"{_place(moved)}.")  # fmt: skip
     share = 0.0 if moved is None else moved["share"]
     factor = min(max(2 * factor, share / USUAL, 3.0), 10.0)
@@ -80,7 +80,7 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
         stiffer += f" or `material.thickness` to {factor:.0f} times"
     said.append(
         f"What to change: {stiffer}; or weaken `wind.flow`; or enlarge the `region` of the pins in "
-        "`solver.boundaries`, if what should stay in place moves."
+        "`solver.boundaries`, if parts move that should stay in place."
     )
     return said
 

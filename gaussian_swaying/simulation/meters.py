@@ -1,4 +1,4 @@
-"""What a run costs: seconds of its parts, and memory."""
+"""Measures what a run costs: seconds for each part, and memory."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gaussian_swaying._provenance import peak_memory
 class WallClock:
     """Seconds spent in each part of the run.
 
-    Startup: on a GPU, a first frame that is thrown away, with which kernels are loaded and compiled. Simulation,
-    shading and rendering: from their begin to their end, on a GPU as its stream gets to them, so that the host need not
-    wait there. Writing: how long the main thread was kept by the recorder, not what its threads did meanwhile.
+    Startup: on a GPU, a first frame that is thrown away, which loads and compiles the kernels. Simulation, shading and
+        rendering: from start to end; on a GPU this is measured on its stream, so that the host need not wait. Writing:
+        the time that the main thread spends in the recorder, not the time of the recorder's own threads.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -26,7 +26,7 @@ class WallClock:
 
     @contextmanager
     def __call__(self, part: str) -> Iterator[None]:
-        """Count the block among a part."""
+        """Add the time of the block to a part."""
         if self.device.type == "cuda" and part != "writing":
             stream = torch.cuda.current_stream(self.device)
             start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
@@ -44,7 +44,7 @@ class WallClock:
             self.seconds[part] += time.perf_counter() - begin
 
     def read(self, wait: bool = False) -> dict[str, float]:
-        """The seconds of each part [s], without what a GPU has still to do unless asked to wait for it."""
+        """The time of each part [s]; with ``wait`` also that of GPU work that is not finished yet."""
         if wait and self._events:
             self._events[-1][2].synchronize()
         while self._events and self._events[0][2].query():
@@ -62,6 +62,6 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats(device)
 
     def read(self) -> dict[str, int | None]:
-        """Bytes of the process and of torch's allocator; None where it is not known."""
+        """Bytes of the process and of torch's allocator; None if unknown."""
         device = torch.cuda.max_memory_allocated(self.device) if self.device.type == "cuda" else None
         return {"host": peak_memory(), "device": device}

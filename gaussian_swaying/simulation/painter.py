@@ -1,4 +1,4 @@
-"""Pictures of a simulated scene: cameras, colours, renders, and the Gaussians as a splat again."""
+"""Pictures of a simulated scene: cameras, colours, renders, and export of the Gaussians as a splat."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.recording.layout import check_camera_name
 from gaussian_swaying.simulation.scene import SimulatedScene
 
-MAX_PIXELS = 1 << 26  # of a picture: twice those of 8K
+MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
 
 
 class Painter(nn.Module):
@@ -32,8 +32,8 @@ class Painter(nn.Module):
 
     Args:
         scene: The Gaussians, and how they follow the material.
-        shader: Colours from normals and light; None leaves the colours of the splat.
-        camera: Where each frame is seen from; an orbit camera if None.
+        shader: Colours from normals and light; None keeps the colours of the splat.
+        camera: Camera path; an orbit camera if None.
         cameras: Further cameras by name.
         background: Background colour, in [0, 1].
         frame_dt: Time between frames [s].
@@ -41,7 +41,7 @@ class Painter(nn.Module):
             picture.
 
     Raises:
-        ValueError: If the background or the name of a camera is not one.
+        ValueError: If the background or the name of a camera is invalid.
     """
 
     def __init__(
@@ -67,12 +67,12 @@ class Painter(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device of the Gaussians."""
         return self.background.device
 
     @property
     def renderer(self) -> Renderer:
-        """What draws the Gaussians."""
+        """The renderer that draws the Gaussians."""
         if self._renderer is None:
             self._renderer = make_renderer(self.device)
         return self._renderer
@@ -82,7 +82,7 @@ class Painter(nn.Module):
         self._renderer = renderer
 
     def camera_at(self, frame: int, name: str = "") -> Camera:
-        """The camera of a frame, on the device and in the precision of the Gaussians; one copy, which nobody awaits.
+        """The camera of a frame, on the device and in the precision of the Gaussians; one copy, without waiting for it.
 
         Args:
             frame: Frame number.
@@ -98,15 +98,15 @@ class Painter(nn.Module):
     def check_camera(self, frame: int) -> None:
         """Raise ValueError if a camera of a frame lies inside the box of the object at rest, or has too many pixels.
 
-        The first is not asked of cameras of a capture, which stood where they stood: around an object or in a room.
+        Cameras of a capture may lie inside the box, as their places are given: around an object or in a room.
         """
         low, high = self.scene.bounds
         for name, path in {"": self.camera, **self.cameras}.items():
             camera, field = self._camera(frame, name), f"cameras.{name}" if name else "camera"
             if camera.width * camera.height > MAX_PIXELS:
                 raise ValueError(
-                    f"A picture of {camera.width:,} x {camera.height:,} pixels is too large, {MAX_PIXELS:,} are the "
-                    f"most: lower `{field}.init_args.width` and `height`."
+                    f"A picture of {camera.width:,} x {camera.height:,} pixels is too large (the limit is "
+                    f"{MAX_PIXELS:,}): lower `{field}.init_args.width` and `height`."
                 )
             if path.captured:
                 continue
@@ -123,7 +123,7 @@ class Painter(nn.Module):
         return self.scene.deformed(state, rotations=self.scene.model.view_dependent)
 
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
-        """Shaded colours, shape (N, 3): harmonics seen from the rest frame of each patch, times the shading."""
+        """Shaded colours, shape (N, 3): harmonics evaluated in the rest frame of each patch, times the shading."""
         scene = self.scene
         view = torch.nn.functional.normalize(gaussians.means - camera.position.to(gaussians.means), dim=-1)
         at_rest = (view[..., None] * gaussians.rotations).sum(-2) if scene.model.view_dependent else view
@@ -143,7 +143,7 @@ class Painter(nn.Module):
         return replace(gaussians, colors=self.colors(gaussians, camera))
 
     def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
-        """Draw Gaussians given in scene units."""
+        """Draw Gaussians in scene units."""
         opacity = self.scene.model.opacity()
         return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
 
@@ -176,10 +176,10 @@ class Painter(nn.Module):
         return passes.normal_colors(picture.color, picture.alpha, rotation)
 
     def draw_pressure(self, pressure: Tensor, gaussians: DeformedGaussians, camera: Camera, largest: float) -> Tensor:
-        """Picture of a force per area, its colours ending at ``largest`` [Pa], shape (H, W, 3).
+        """Picture of a force per area, with a colour scale that ends at ``largest`` [Pa], shape (H, W, 3).
 
         Args:
-            pressure: Of each particle [Pa], shape (P,).
+            pressure: Force per area of each particle [Pa], shape (P,).
             gaussians: In scene units.
             camera: The camera, on the device of the Gaussians.
             largest: End of the colour scale [Pa].
@@ -189,11 +189,11 @@ class Painter(nn.Module):
         return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest)
 
     def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
-        """Blend any three numbers of each Gaussian."""
+        """Blend any three values of each Gaussian."""
         return self.renderer(gaussians.means, gaussians.covariances, self.scene.model.opacity(), values, camera)
 
     def cloud(self, gaussians: DeformedGaussians) -> GaussianCloud:
-        """Deformed Gaussians in storage form, harmonics turned with the patches."""
+        """Deformed Gaussians in storage form, with harmonics rotated with the patches."""
         cloud = self.scene.model.to_cloud()
         quats, scales = covariance_to_quat_scale(gaussians.covariances)
         return GaussianCloud(
@@ -206,10 +206,10 @@ class Painter(nn.Module):
         )
 
     def export(self, gaussians: DeformedGaussians, path: Path) -> None:
-        """Write deformed Gaussians as a 3DGS .ply that any splat viewer opens, harmonics turned with the patches."""
+        """Write deformed Gaussians as a 3DGS .ply for any splat viewer, with harmonics rotated with the patches."""
         write_ply(path, self.cloud(gaussians))
 
     def depth_range(self, frame: int, name: str) -> tuple[float, float]:
-        """Ends of the depth's colours [scene units]: the object's longest side before its centre, and behind it."""
+        """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
         distance = float((self._camera(frame, name).position.to(self.scene.center) - self.scene.center).norm())
         return distance - self.scene.size, distance + self.scene.size

@@ -1,4 +1,4 @@
-"""What a run shows while it computes: a bar of frames, and progress within a frame that takes long."""
+"""Progress of a run: a bar of frames, and progress within a slow frame."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import time
 
 from tqdm import tqdm
 
-LONG_FRAME = 60.0  # s; a first frame that takes longer is told of
-MANY_TIMES = 20  # a frame with so many times the substeps of the first is told of
-PAUSE = 1.0  # s between two signs of life within a frame
+LONG_FRAME = 60.0  # s; a first frame that takes longer is reported
+MANY_TIMES = 20  # a frame with this many times the substeps of the first is reported
+PAUSE = 1.0  # s between two updates within a frame
 
 
 class RunProgress:
-    """A progress bar of frames that also tells how far a slow frame is, and says what is slow.
+    """A progress bar of frames that also shows the progress within a slow frame, and reports why it is slow.
 
     Args:
         frames: Frames of the whole run.
-        done: Those that are there already.
+        done: Frames that are already done.
         shown: Whether to show anything.
     """
 
@@ -27,7 +27,7 @@ class RunProgress:
         self._bar = tqdm(total=frames, initial=min(done, frames), unit="frame", disable=not shown, file=sys.stderr)
         self._frames, self._frame = frames, done
         self._usual: int | None = None  # substeps of the first frame that was simulated
-        self._told = 0  # substeps of the frame that was told of
+        self._told = 0  # substeps of the frame that was last reported
         self._steps = self._first = self._last = 0
         self._began = self._looked = time.perf_counter()
 
@@ -36,7 +36,7 @@ class RunProgress:
         self._frame, self._steps = frame, 0
 
     def substep(self, done: int, steps: int) -> None:
-        """So many of the substeps of the frame are done."""
+        """Show how many substeps of the frame are done."""
         now = time.perf_counter()
         if steps != self._steps or done <= self._last:  # a new frame, or the same again with shorter substeps
             self._began = self._looked = now
@@ -52,7 +52,7 @@ class RunProgress:
         self._tell(steps, each * steps)
 
     def _tell(self, steps: int, whole: float) -> None:
-        """Say once that a frame takes long, and again if it gets four times as long."""
+        """Report a slow frame once, and again if its substeps become four times as many."""
         many = self._usual is not None and steps > MANY_TIMES * self._usual
         if not self.shown or steps < 4 * self._told or not (many or (self._usual is None and whole > LONG_FRAME)):
             return
@@ -62,10 +62,10 @@ class RunProgress:
             text += (
                 f", {steps // self._usual:,} times those of the first: something stiffened or moves fast. Weaken the "
             )
-            text += "wind or what drives it, or raise `solver.damping`."
+            text += "wind or other driving forces, or raise `solver.damping`."
         else:
             rest = duration(whole * max(self._frames - self._frame, 1))
-            text += f", and the frames to come about {rest}. Fewer substeps: a lower `material.E`, a higher "
+            text += f", and the remaining frames about {rest}. For fewer substeps: a lower `material.E`, a higher "
             text += "`material.density`, a coarser `solver.dx`, a longer `solver.substep`."
         tqdm.write(f"note: {text}", file=sys.stderr)
 
@@ -87,7 +87,7 @@ class RunProgress:
 
 
 def duration(seconds: float) -> str:
-    """A duration as people say it: 12 ms, 3.4 s, 5 min, 2.1 h, 3 days.
+    """A duration in a readable form: 12 ms, 3.4 s, 5 min, 2.1 h, 3 days.
 
     Example:
         >>> [duration(seconds) for seconds in (0.012, 3.4, 300, 7560, 3 * 86400)]

@@ -28,7 +28,7 @@ from gaussian_swaying.simulation.recording.recorder import frame_folder
 if TYPE_CHECKING:
     from gaussian_swaying.simulation.simulation import Simulation
 
-MAX_LOOKS = 2_000  # how many frames' cameras are looked at before a run
+MAX_LOOKS = 2_000  # largest number of frames whose cameras are checked before a run
 
 
 @torch.inference_mode()
@@ -40,7 +40,7 @@ def run(
     recorder = simulation.recorder
     for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
         simulation.painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
-    state = simulation.start()  # what is refused is refused before anything is written
+    state = simulation.start()  # errors are raised before anything is written
     splat = _splat(simulation)
 
     def check(checkpoint: dict[str, Any]) -> None:
@@ -58,7 +58,7 @@ def run(
 
 
 def _splat(simulation: Simulation) -> str | None:
-    """Checksum of the splat's file, which tells it from another one of the same name."""
+    """Checksum of the splat's file, to distinguish it from another file with the same name."""
     path = simulation.scene.source
     return None if path is None else sha256(Path(path))
 
@@ -66,12 +66,12 @@ def _splat(simulation: Simulation) -> str | None:
 def _check_checkpoint(
     simulation: Simulation, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
 ) -> None:
-    """Raise ValueError unless the run can go on from a checkpoint as if it had never stopped."""
+    """Raise ValueError unless the run can continue from a checkpoint as if it had never stopped."""
     scene, held = simulation.scene, checkpoint["state"].get("position")
     if checkpoint.get("splat") != splat:
         raise ValueError(
-            f"The splat {scene.source} is not the one that the run in {output} began with, its content has "
-            "changed: put that file back, or start again without --resume."
+            f"The splat {scene.source} has changed since the run in {output} began: restore the old file, or "
+            "start again without --resume."
         )
     if isinstance(held, Tensor) and held.ndim == 2 and len(held) != scene.points.count:
         raise ValueError(
@@ -85,16 +85,16 @@ def _check_checkpoint(
         raise unreadable(output / "checkpoint.pt", error) from error
     if checkpoint["frame"] >= frames:
         raise ValueError(
-            f"The run in {output} has {checkpoint['frame'] + 1} frames already, and `frames` asks for {frames}: "
-            "ask for more, or leave out --resume."
+            f"The run in {output} has {checkpoint['frame'] + 1} frames already, but `frames` is {frames}: raise "
+            "`frames`, or leave out --resume."
         )
 
 
 def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
-    """What moved and was stretched most in a run, and sentences on what to change; none if all is well.
+    """Find what moved and stretched most in a run, with sentences on what to change; none if all is well.
 
     Args:
-        simulation: What ran.
+        simulation: The simulation.
         log: Diagnostics of its frames.
     """
     scene, points = simulation.scene, simulation.scene.points
@@ -106,7 +106,7 @@ def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tupl
 
 
 class Run:
-    """What a run carries from frame to frame besides the state."""
+    """Data that a run carries from frame to frame besides the state."""
 
     def __init__(self, simulation: Simulation, frames: int, splat: str | None) -> None:
         self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
@@ -118,7 +118,7 @@ class Run:
     def go(
         self, state: MPMState, checkpoint: dict[str, Any] | None, settings: dict[str, Any], progress: bool
     ) -> dict[str, Any]:
-        """Run from a state at rest, or from a checkpoint, to the end; the summary."""
+        """Run from a state at rest, or from a checkpoint, to the end; returns the summary."""
         simulation, recorder, walls = self.simulation, self.recorder, self.walls
         first = 0
         if checkpoint is not None:
@@ -156,7 +156,7 @@ class Run:
             status, reason = "failed", str(error)
             raise
         finally:
-            with suppress(OSError):  # a terminal that has gone
+            with suppress(OSError):  # the terminal may be closed
                 bar.close()
                 if progress:
                     for sentence in run_health(simulation, self.log[:done])[1]:
@@ -166,7 +166,7 @@ class Run:
             summary |= self.summary(state, self.log[:done]) | settings
             if recorder.images and "force" in recorder.renders:
                 summary["force_scale_Pa"] = self.force_end
-            # the video of a run that was stopped early is made too: nothing that was recorded is lost
+            # a run that was stopped early gets its video too, so that nothing recorded is lost
             simulation.files = []
             try:
                 with walls("writing"):
@@ -174,14 +174,14 @@ class Run:
             except OSError as error:
                 if status == "complete":
                     raise
-                print(f"{error}", file=sys.stderr)  # what stopped the run matters more
+                print(f"{error}", file=sys.stderr)  # the error that stopped the run matters more
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
         return summary
 
     def warm_up(self, state: MPMState, frame: int) -> None:
-        """Load and compile the kernels of a frame, of which nothing is kept."""
-        with suppress(SimulationDiverged):  # the frame itself will say so
+        """Load and compile the kernels of a frame; its results are thrown away."""
+        with suppress(SimulationDiverged):  # the real frame will report it
             state, _ = self.simulation.advance(state)
         if self.recorder.images:
             self.painter.render(state, frame)
@@ -201,7 +201,7 @@ class Run:
             )
 
     def record(self, state: MPMState, frame: int) -> None:
-        """Draw, export and keep what is wanted of a frame."""
+        """Draw, export and record the requested outputs of a frame."""
         recorder, walls = self.recorder, self.walls
         exporting = recorder.ply_every > 0 and frame % recorder.ply_every == 0
         if recorder.images or exporting:
@@ -217,7 +217,7 @@ class Run:
                 recorder.write_trajectory(frame, state.position, state.F_total)
 
     def picture(self, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str) -> None:
-        """Draw and hand over what is wanted of a frame from one camera."""
+        """Draw the requested pictures of a frame from one camera and pass them to the recorder."""
         recorder, painter, walls = self.recorder, self.painter, self.walls
         with walls("shading"):
             camera = painter.camera_at(frame, name)
@@ -243,7 +243,7 @@ class Run:
                 recorder.write_depth(frame, steps, frame_folder("depth", name))
 
     def summary(self, state: MPMState, log: list[dict[str, Any]]) -> dict[str, Any]:
-        """What is told of a run: see docs/runs.md."""
+        """The summary of a run; docs/runs.md describes it."""
         simulation, scene, solver = self.simulation, self.simulation.scene, self.simulation.solver
         moved = [entry["displacement_mean"] for entry in log]
         found, sentences = run_health(simulation, log)

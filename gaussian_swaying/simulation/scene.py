@@ -60,8 +60,8 @@ class Material:
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
             (PhysGaussian's rule for solids: cell volume / particles in it).
         law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
-            elasticity if null. Those that flow need ``solver.formulation: updated``.
-        regions: Parts made of something else; later entries win.
+            elasticity if null. Plastic laws need ``solver.formulation: updated``.
+        regions: Parts with a different material; later entries win.
     """
 
     E: float = 1e5
@@ -89,34 +89,37 @@ class Scene:
     Args:
         ply: A 3DGS .ply, a compressed .ply or a .splat; takes precedence over ``generator``.
         generator: A scene made in code.
-        region: Part that is simulated, in scene units; the rest stays as it is and is rendered with it.
-        opacity_threshold: Gaussians of the region below this opacity carry no mass and feel no wind.
-        faint: What those do: ``carry`` (follow their nearest simulated neighbour), ``static`` or ``drop``.
-        loose: What specks do that hang on nothing, or by a thread (see
-            :func:`~gaussian_swaying.gaussians.grouping.loose_points`): ``simulate``, as all others, so that the wind
-            blows them away; or ``carry`` (no mass, no wind; they follow their nearest simulated neighbour).
+        region: Part that is simulated, in scene units; the rest does not move and is rendered as well.
+        opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.
+        faint: What happens to Gaussians below that opacity: ``carry`` (they follow their nearest simulated neighbour),
+            ``static`` or ``drop``.
+        loose: What happens to specks that are not connected to the object, or only by a thin thread (see
+            :func:`~gaussian_swaying.gaussians.grouping.loose_points`): ``simulate`` (like all others, so the wind blows
+            them away) or ``carry`` (no mass, no wind; they follow their nearest simulated neighbour).
         up: Direction in the scene that points up, for example [0, -1, 0].
-        longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Excludes metres_per_unit.
+        longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Cannot be combined with
+            metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
         area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface), ``paper`` (pi s1 s2), or
-            ``equal``, the same for all, which together have the surface of ``coverage``: for comparison with a wind
-            that knows no patches.
+            ``equal`` (the same area for all, with the total of ``coverage``; for comparison with a wind that does not
+            use patches).
         filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
-        wind_on: Which simulated Gaussians feel the wind: ``surface``, those in touch with open air, or ``all``, also
-            those within the solid that ``filling`` finds. Without ``filling`` all are on the surface.
-        max_stretch: How many times its size at rest a Gaussian is drawn at most (see
+        wind_on: Which simulated Gaussians feel the wind: ``surface`` (those in contact with open air) or ``all`` (also
+            those inside the solid that ``filling`` finds). Without ``filling``, all are on the surface.
+        max_stretch: Largest size at which a Gaussian is drawn, as a multiple of its size at rest (see
             :func:`~gaussian_swaying.geometry.covariances.limit_deformed`), in pictures and exports; null for no limit.
-            Nothing changes below the limit. Beyond it a Gaussian would be a streak: there two parts of the object that
+            Nothing changes below the limit. Above it a Gaussian would look like a streak: two parts of the object that
             share cells of the grid were pulled apart, or a material flowed.
-        layers: Layers of material points through the thickness: 1, a membrane that folds without resistance, or 3,
-            which resists bending as a plate does (the Gaussians in the middle plane, two more points at the faces of
-            the sheet, weights of Simpson's rule). Three times the points.
-        particle_spacing: Largest distance of neighbouring material points on the surface [m]: Gaussians larger than
-            that get further points (see :func:`~gaussian_swaying.gaussians.subdivision.subdivide`), as a splat that
-            was trained without a limit on sizes needs; 0.45 ``solver.dx`` or less. Null for one point a Gaussian.
-        sampling: Which points carry the material: ``gaussian`` (every simulated Gaussian), or ``grid`` (one for each
-            cube of side ``solver.dx`` / 2.2, with the mass and the area of all in it; the other Gaussians follow the
-            points around them). ``grid`` is many times faster where the splat is much finer than the grid.
+        layers: Layers of material points through the thickness: 1 is a membrane that folds without resistance; 3
+            resists bending like a plate (the Gaussians in the middle plane, two more points at the faces of the sheet,
+            weights of Simpson's rule) and needs three times the points.
+        particle_spacing: Largest distance between neighbouring material points on the surface [m]. Larger Gaussians get
+            extra points (see :func:`~gaussian_swaying.gaussians.subdivision.subdivide`). A splat trained without a
+            limit on sizes needs this: use 0.45 ``solver.dx`` or less. Null for one point per Gaussian.
+        sampling: Which points carry the material: ``gaussian`` (every simulated Gaussian), or ``grid`` (one point for
+            each cube of side ``solver.dx`` / 2.2, with the total mass and area of the Gaussians in it; the other
+            Gaussians follow the points around them). ``grid`` is many times faster where the splat is much finer than
+            the grid.
     """
 
     def __init__(
@@ -154,11 +157,11 @@ class Scene:
         if layers not in (1, 3):
             raise ValueError(f"Expected `scene.layers` to be 1 or 3, but got {layers}.")
         if layers > 1 and filling is not None:
-            raise ValueError("Expected `scene.layers` 1 with `scene.filling`: a solid resists bending by itself.")
+            raise ValueError("Expected `scene.layers` 1 with `scene.filling`: a solid resists bending without layers.")
         if particle_spacing is not None:
             check_positive("scene.particle_spacing", particle_spacing)
             if filling is not None:
-                raise ValueError("Expected `scene.particle_spacing` null with `scene.filling`, which fills in points.")
+                raise ValueError("Expected `scene.particle_spacing` null with `scene.filling`, which adds points.")
         if sampling == "grid" and filling is not None:
             raise ValueError('Expected `scene.sampling` "gaussian" with `scene.filling`, which chooses points itself.')
         if ply is None and generator is None:
@@ -178,19 +181,19 @@ class Scene:
         return self.generator.generate()
 
 
-POINTS_PER_CELL = 2.2  # and direction, of ``sampling: grid``; more is finer than the grid can show
-FOLLOWED = 6  # points that a Gaussian without one of its own follows
+POINTS_PER_CELL = 2.2  # per direction, for ``sampling: grid``; more is finer than the grid can resolve
+FOLLOWED = 6  # number of points that a Gaussian without its own point follows
 _SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 
 
 class SimulatedScene(nn.Module):
-    """Gaussians, material points and patches of one scene, and how the first follow the second.
+    """Gaussians, material points and patches of one scene, and how the Gaussians follow the points.
 
-    Gaussians are of three kinds: simulated ones are material points themselves, carried ones follow the nearest
-    simulated one (with ``sampling: grid`` the nearest few), static ones stay. The points that fill a solid, and those
-    at the faces of a sheet of three layers, are material only: no Gaussian belongs to them, and their patch area is
-    zero. The further points of large Gaussians (``particle_spacing``) are patches of their own, but no Gaussian is
-    drawn where they are.
+    There are three kinds of Gaussians: simulated ones are material points themselves, carried ones follow the nearest
+    simulated one (with ``sampling: grid`` the nearest few), and static ones do not move. The points that fill a solid,
+    and those at the faces of a sheet of three layers, are material only: no Gaussian belongs to them, and their patch
+    area is zero. The extra points of large Gaussians (``particle_spacing``) are separate patches, but no Gaussian is
+    drawn at them.
 
     Args:
         scene: Where the Gaussians come from.
@@ -200,21 +203,22 @@ class SimulatedScene(nn.Module):
         dtype: Precision of the simulation.
 
     Attributes:
-        chosen: Indices of the Gaussians that the region and the opacity choose; with ``sampling: gaussian`` these are
-            the simulated ones, with ``grid`` the others of them are carried. Without those that are loose.
-        loose: Number of Gaussians that the region and the opacity choose but that are loose, and carried.
-        points: The material, for the solver: the simulated Gaussians in their order, then the points without one.
-        filled: Number of points within a solid.
-        on_surface: Number of points on the surface, which are the first: the simulated Gaussians, then the further
-            points of large ones.
+        chosen: Indices of the Gaussians selected by region and opacity, without loose ones. With ``sampling: gaussian``
+            all of them are simulated; with ``grid`` some are simulated and the others are carried.
+        loose: Number of Gaussians selected by region and opacity that are loose and therefore carried.
+        points: The material, for the solver: the simulated Gaussians in their order, then the points without a
+            Gaussian.
+        filled: Number of points inside a solid.
+        on_surface: Number of points on the surface. They come first: the simulated Gaussians, then the extra points of
+            large ones.
         patch_normal: Unit normals of the points at rest in the z-up frame, shape (P, 3).
-        patch_area: Their areas that feel the wind [m²], shape (P,).
-        frame: Scene units to metres.
+        patch_area: Areas of the points that feel the wind [m²], shape (P,).
+        frame: Conversion from scene units to metres.
         bounds: Smallest and largest corner of the simulated part at rest [scene units].
         size: Its longest side [scene units].
-        moving: Indices of the Gaussians that move, the simulated and then the carried ones, shape (M,).
-        all_move: Whether these are all, in their order.
-        rest_facing: Normals at rest of those that move, in the z-up frame, shape (M, 3).
+        moving: Indices of the Gaussians that move, first the simulated and then the carried ones, shape (M,).
+        all_move: Whether ``moving`` is all Gaussians, in their order.
+        rest_facing: Normals at rest of the Gaussians that move, in the z-up frame, shape (M, 3).
         source: The .ply file; None for a scene made in code.
     """
 
@@ -263,7 +267,7 @@ class SimulatedScene(nn.Module):
         self.on_surface = len(source)
         outer = torch.ones(len(source), dtype=torch.bool) if filling is None else filling.on_surface
         areas = cloud.means.new_zeros(len(source))
-        for group in (outer, ~outer):  # what lies within takes no area from the surface
+        for group in (outer, ~outer):  # inner points take no area from the surface
             areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
         self.max_stretch = scene.max_stretch
         followed = 1
@@ -290,13 +294,13 @@ class SimulatedScene(nn.Module):
         facing = self.frame.direction_to_sim(normals[normal_of].double())
         area = self.frame.area_to_sim(areas)
         body_area, area = area, area if scene.wind_on == "all" else torch.where(outer, area, 0)
-        if filling is not None:  # a filled point is a patch of no area
+        if filling is not None:  # a filled point is a patch of zero area
             position = torch.cat([position, filling.position])
             facing = torch.cat([facing, torch.tensor([[0.0, 0.0, 1.0]]).to(facing).expand(self.filled, 3)])
             body_area, area = (torch.cat([part, part.new_zeros(self.filled)]) for part in (body_area, area))
         self.register_buffer("patch_normal", facing.to(dtype))
         self.register_buffer("patch_area", area.to(dtype))
-        # what every picture would otherwise compute again
+        # computed once here, as every picture needs it
         moving = torch.cat([simulated, carried])
         self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
         self.register_buffer("moving", moving, persistent=False)
@@ -383,14 +387,14 @@ class SimulatedScene(nn.Module):
         return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye)
 
     def deformed(self, state: MPMState, rotations: bool = True) -> DeformedGaussians:
-        """The Gaussians where the material has taken them: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
+        """The Gaussians moved by the material: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
 
-        Where the scene has a ``max_stretch``, covariances keep to it.
+        If the scene has a ``max_stretch``, it limits the covariances.
 
         Args:
             state: State of one scene, fields of shape (P, ·).
-            rotations: Whether to compute the rotations; otherwise they are those of rest, which is enough for colours
-                that are the same from everywhere.
+            rotations: Whether to compute the rotations; otherwise they are those at rest, which is enough for colours
+                that are the same from every direction.
 
         Returns:
             All Gaussians, the static ones at rest.
@@ -427,8 +431,8 @@ class SimulatedScene(nn.Module):
         return deform_all(F, covariances, normals, rotations, self.max_stretch, solid)
 
     def _solid(self) -> Tensor:
-        """Which of the Gaussians that move keep their shape, as their law has no return map; bool, shape (M,)."""
-        if self._kept is None or self._kept[0] is not self.points:  # an edit brings other points
+        """Which moving Gaussians keep their shape because their law has no return map; bool, shape (M,)."""
+        if self._kept is None or self._kept[0] is not self.points:  # an edit replaces the points
             laws, index = self.points.laws, self.points.law_index
             with torch.inference_mode(False):  # it outlives the call
                 solid = torch.tensor([not law.plastic for law in laws], device=self.simulated.device)
@@ -438,13 +442,13 @@ class SimulatedScene(nn.Module):
         return self._kept[1]
 
     def _blend(self, values: Tensor) -> Tensor:
-        """Values (C, K, ...) of what each carried Gaussian follows, as one, shape (C, ...)."""
+        """Blend the values (C, K, ...) of the points that each carried Gaussian follows into one, shape (C, ...)."""
         if values.shape[1] == 1:
             return values[:, 0]
         return (values * self.share.reshape(self.share.shape + (1,) * (values.ndim - 2))).sum(1)
 
     def on_gaussians(self, values: Tensor) -> Tensor:
-        """Values of the particles for all Gaussians: those carried along take their neighbour's, static ones have 0.
+        """Particle values for all Gaussians: carried ones take the values of their neighbours, static ones get 0.
 
         Args:
             values: One number per particle, shape (P,).
@@ -458,7 +462,7 @@ class SimulatedScene(nn.Module):
 
 
 def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None) -> Subdivision | None:
-    """Further points on the large ones of the simulated Gaussians, no farther apart than a spacing [scene units]."""
+    """Extra points on large simulated Gaussians, no farther apart than a spacing [scene units]."""
     if spacing is None:
         return None
     part = cloud.select(simulated)
@@ -468,7 +472,7 @@ def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None) -> S
 def _areas(
     cloud: GaussianCloud, normals: Tensor, source: Tensor, pieces: Subdivision | None, group: Tensor, mode: str
 ) -> Tensor:
-    """Areas [scene units^2] of a group of points, shared among the group; each is of a Gaussian of the cloud."""
+    """Areas [scene units^2] of a group of points, shared within it; each point belongs to a Gaussian of the cloud."""
     if mode == "paper":
         shares = torch.bincount(source, minlength=len(cloud.means)).to(cloud.means)
         return (patch_area(cloud.scales) / shares.clamp_min(1))[source[group]]
@@ -489,7 +493,7 @@ def within_region(filling: Filling, region: Region, frame: SimFrame) -> Filling:
 
 
 def cell_volume(position: Tensor, dx: float) -> Tensor:
-    """PhysGaussian's rule for solids: the volume of the grid cell over the number of particles in it.
+    """PhysGaussian's rule for solids: the volume of the grid cell divided by the number of particles in it.
 
     Args:
         position: Rest position [m], shape (P, 3).

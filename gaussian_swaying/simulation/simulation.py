@@ -1,4 +1,4 @@
-"""The front door: a splat in the wind, frame by frame."""
+"""The main entry point: a splat in the wind, frame by frame."""
 
 from __future__ import annotations
 
@@ -64,43 +64,43 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 MAX_RETRIES = 4
-CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is done again with shorter substeps
-CFL_SAMPLES = 8  # how often a frame is looked at, as material may stiffen and slacken again within it
+CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
+CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
 MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
-MAX_WIND = 1e6  # m/s; any more is a mistake, and would overflow positions
-MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first is past saving
-MAX_SUBSTEPS = 1_000_000  # in a frame: hours of a processor, and minutes of the fastest GPU
+MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
+MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first ends the run
+MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastest GPU
 
 
 class Simulation(nn.Module):
-    """A splat in the wind. The constructor is the schema of the YAML; every component can be used without it.
+    """A splat in the wind. The constructor is the schema of the YAML; every component also works on its own.
 
     Positions and regions are given in scene units and axes; velocities, gravity and light in metres, z up.
 
     Args:
-        scene: Where the Gaussians come from and which of them move. In Python also a file, Gaussians or a scene made
-            in code, of which all is simulated, by points chosen for the grid (``sampling: grid``).
-        material: What it is made of; :class:`Material` with its defaults if None.
+        scene: Where the Gaussians come from and which of them move. In Python also a file, Gaussians or a scene made in
+            code; these are simulated as a whole, with points chosen for the grid (``sampling: grid``).
+        material: What the object is made of; :class:`Material` with its defaults if None.
         solver: Grid, formulation, gravity and boundaries; if None, a grid of 32 cells along the longest side.
-        wind: Air velocity over time; in Python also one that depends on the place, or three numbers [m/s]. Still air
-            if None.
+        wind: Air velocity over time; in Python also one that varies in space, or three numbers [m/s]. Still air if
+            None.
         aero: Force of the wind on patches; :class:`AeroForce` with its defaults if None.
-        forces: Custom forces beside gravity and wind, each by its class path.
+        forces: Custom forces besides gravity and wind, each given by its class path.
         shader: Shading; null keeps the splat's colours.
-        camera: Where each frame is seen from; an orbit camera if null.
-        cameras: Further cameras by name; their pictures and videos are in the folders cameras/NAME.
-        edits: Changes of a part of the object: its `region` (at rest, scene units; null for all that moves), the
-            `time` from which they hold [s], any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a `color` (red,
-            green, blue in [0, 1]) with the part `detail` of the old differences in brightness.
+        camera: Camera path; an orbit camera if null.
+        cameras: Additional cameras by name; their pictures and videos go to the folders cameras/NAME.
+        edits: Changes to parts of the object. Each has a `region` (at rest, in scene units; null for everything that
+            moves), a `time` [s] from which it applies, any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a
+            `color` (red, green, blue in [0, 1]) that keeps the fraction `detail` of the old brightness differences.
         recorder: What :meth:`run` writes; :class:`Recorder` with its defaults if None.
-        normalisation: Take boundaries and regions of the material in PhysGaussian's normalised space; null for scene
-            units.
+        normalisation: Read boundaries, and the regions of material and edits, in PhysGaussian's normalised space; null
+            for scene units.
         background: Background colour in [0, 1].
         frame_dt: Time between frames [s].
         dtype: Precision of the solver.
-        device: auto takes a CUDA GPU if there is one.
-        up: Python only, where ``scene`` is no :class:`Scene`: direction in the scene that points up.
-        hold: Python only, where no solver is given: region whose points are held.
+        device: auto uses a CUDA GPU if there is one.
+        up: Python only, if ``scene`` is not a :class:`Scene`: direction in the scene that points up.
+        hold: Python only, if no solver is given: region whose points are held in place.
         renderer: Python only: draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
 
     Raises:
@@ -158,12 +158,12 @@ class Simulation(nn.Module):
         self.to(target)
         self.editor = SceneEditor(model, edits)
         self.recorder = recorder or Recorder()
-        self.config = ""  # the whole configuration as YAML, where there is one
-        self.progress: RunProgress | None = None  # of the run under way
+        self.config = ""  # the whole configuration as YAML, if there is one
+        self.progress: RunProgress | None = None  # of the current run
         self.files: list[Path] = []  # what the last run wrote
         self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self._most_substeps = MAX_SUBSTEPS
-        self._wind_force: list[WindForce] = []  # in a list, as it is no part of the module's state
+        self._wind_force: list[WindForce] = []  # in a list, so that it is not part of the module's state
         self._wind_parts: tuple[object, ...] = ()
         self._tearing: TearingGauge | None = None
 
@@ -180,13 +180,13 @@ class Simulation(nn.Module):
 
         Args:
             path: The YAML file.
-            changes: Arguments of the constructor that take the place of those of the file.
+            changes: Arguments of the constructor that replace those of the file.
 
         Returns:
-            The simulation. :meth:`run` keeps the configuration with the results, and a note of the changes.
+            The simulation. :meth:`run` saves the configuration with the results, with a note of the changes.
 
         Raises:
-            ValueError: If the file or a value in it is not right; the message names the field.
+            ValueError: If the file or a value in it is invalid; the message names the field.
             TypeError: If the constructor has no such argument.
         """
         parser = cls.parser()
@@ -198,7 +198,7 @@ class Simulation(nn.Module):
 
         Args:
             parser: From :meth:`parser`.
-            settings: What it parsed.
+            settings: The settings that it parsed.
             changes: As in :meth:`from_yaml`.
         """
         check_settings(cls, settings)
@@ -216,7 +216,7 @@ class Simulation(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the components are."""
+        """Device of the components."""
         return self.painter.device
 
     @property
@@ -230,8 +230,8 @@ class Simulation(nn.Module):
 
     @property
     def idle(self) -> bool:
-        """Whether the wind has no effect; asked once for each wind, as it makes the host wait."""
-        self.wind_force  # noqa: B018  (a new one forgets what was known of the old)
+        """Whether the wind has no effect; computed once for each wind, as it makes the host wait."""
+        self.wind_force  # noqa: B018  (a new wind force drops the cached value)
         return self._still
 
     @cached_property
@@ -240,7 +240,7 @@ class Simulation(nn.Module):
 
     @property
     def forces(self) -> list[Force]:
-        """What pushes the particles besides gravity: the wind, unless it has no effect, and the custom forces."""
+        """The forces on the particles besides gravity: the wind, unless it has no effect, and the custom forces."""
         custom = [force for force in self.custom_forces if isinstance(force, Force)]
         return custom if self.idle else [self.wind_force, *custom]
 
@@ -249,7 +249,7 @@ class Simulation(nn.Module):
     def frames(self, count: int) -> Iterator[Frame]:
         """Simulate from rest, frame by frame. Timed edits act between frames, as in :meth:`run`.
 
-        What was assigned between two frames, such as another ``wind``, holds from the next frame on.
+        Anything assigned between two frames, such as another ``wind``, applies from the next frame on.
 
         Args:
             count: Number of frames, the first at rest.
@@ -258,8 +258,8 @@ class Simulation(nn.Module):
             The frames.
 
         Raises:
-            SimulationDiverged: If a frame does not end well.
-            ValueError: As :meth:`start`.
+            SimulationDiverged: If the simulation diverges.
+            ValueError: As in :meth:`start`.
         """
         check_positive("count", count)
         yield from self.frames_from(self.start(), 0, count)
@@ -268,7 +268,7 @@ class Simulation(nn.Module):
         """The frames from number ``first`` up to ``count``.
 
         Args:
-            state: The state at rest from :meth:`start` if ``first`` is 0, otherwise that of the frame before.
+            state: The state at rest from :meth:`start` if ``first`` is 0, otherwise the state of the frame before.
             first: Number of the first frame.
             count: Number of frames of the whole run.
         """
@@ -281,7 +281,7 @@ class Simulation(nn.Module):
             yield Frame(self, index, state, health)
 
     def start(self) -> MPMState:
-        """The state at rest, time zero, with the edits of that time.
+        """The state at rest at time zero, with the edits of that time applied.
 
         Raises:
             ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long, now or after one
@@ -289,7 +289,7 @@ class Simulation(nn.Module):
         """
         editor, frame = self.editor, self.scene.frame
         editor.reset()
-        for later in (moment for moment in editor.times if moment > 0):  # what they make impossible is refused now
+        for later in (moment for moment in editor.times if moment > 0):  # refuse impossible edits now
             self._edit(editor.due(0.0))
             self._edit(editor.due(later), flowed=True)
             rehearsed = self.solver.init_state(self.scene.points, frame=frame)
@@ -300,7 +300,7 @@ class Simulation(nn.Module):
         state = self.solver.init_state(self.scene.points, frame=frame)
         self.__dict__.pop("_still", None)  # coefficients may have changed
         check_spacing(self.solver)
-        self.solver.fused()  # what its kernels refuse is refused here
+        self.solver.fused()  # errors of its kernels are raised here
         at_rest = self.solver.substeps(state, self.frame_dt)
         if at_rest > MAX_SUBSTEPS:
             remedy = "soften it (`material.E`, `material.nu`), raise its density or `solver.dx`, or shorten `frame_dt`"
@@ -308,38 +308,38 @@ class Simulation(nn.Module):
                 remedy = "raise `solver.substep`, set it to null for the longest that is stable, or shorten `frame_dt`"
             raise ValueError(
                 f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
-                f"than the {MAX_SUBSTEPS:,} that are of use: {remedy}."
+                f"than the limit of {MAX_SUBSTEPS:,}: {remedy}."
             )
         self._most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
         return state
 
     def edit(self, state: MPMState, *edits: Edit) -> MPMState:
-        """Change material or colour now, between two frames; the time of the edits is not looked at.
+        """Change material or colour now, between two frames; the time of the edits is ignored.
 
-        The solver takes the material anew, and with it its kernels and CUDA graphs. Positions, velocities and
-        deformations stay, so momentum changes with the mass and elastic energy with the stiffness.
+        The solver is set up again for the new material, including its kernels and CUDA graphs. Positions, velocities
+        and deformations stay, so momentum changes with the mass and elastic energy with the stiffness.
 
         Args:
-            state: The state now.
+            state: The current state.
             edits: What to change, in this order.
 
         Returns:
-            The state with which the run goes on.
+            The state from which the run continues.
 
         Raises:
-            ValueError: If a region holds nothing, or a law flows in the ``total`` formulation.
+            ValueError: If a region contains nothing, or a plastic law is used in the ``total`` formulation.
         """
         return self._take(state, self._edit(edits, flowed=True))
 
     def _edit(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
-        """Change the scene; which particles (P,) have another law then, None if the material is the same."""
+        """Change the scene; returns which particles (P,) got another law, None if the material is the same."""
         changed = [self.editor.apply(edit, flowed) for edit in edits]
         changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
         return torch.stack(changed).any(0) if changed else None
 
     def _take(self, state: MPMState, changed: Tensor | None) -> MPMState:
-        """Bind the solver to the material of the scene; ``changed`` as of :meth:`_edit`."""
+        """Bind the solver to the material of the scene; ``changed`` as from :meth:`_edit`."""
         if changed is None:
             return state
         start = self.solver.init_state(self.scene.points, frame=self.scene.frame).internal
@@ -352,12 +352,12 @@ class Simulation(nn.Module):
         )
         if self._tearing is not None:
             elastic = self.solver.laws.elastic_particles()
-            if elastic is not None:  # what has flowed apart before is no tear
+            if elastic is not None:  # particles that flowed apart before are not torn
                 self._tearing.elastic = elastic if self._tearing.elastic is None else elastic & self._tearing.elastic
         return state
 
     def edit_due(self, state: MPMState, resumed: bool = False) -> MPMState:
-        """The state after the edits up to its time; a resumed state has seen them already."""
+        """Apply the edits up to the time of a state; a resumed state contains them already."""
         edits = self.editor.due(float(state.time) + 1e-3 * self.frame_dt)
         edited = self._take(state, self._edit(edits, flowed=True))
         return state if resumed else edited
@@ -365,8 +365,9 @@ class Simulation(nn.Module):
     def advance(self, state: MPMState) -> tuple[MPMState, FrameDiagnostics]:
         """Advance by one frame.
 
-        A frame whose material stiffened so much that its substep was too long is thrown away and done again with a
-        shorter one; so is one in which a particle outran the grid of the ``updated`` formulation, on a larger grid.
+        If the material stiffens so much that the substep was too long, the frame is thrown away and repeated with a
+        shorter one. If a particle outruns the grid of the ``updated`` formulation, the frame is repeated on a larger
+        grid.
 
         Args:
             state: The state at the start of the frame.
@@ -375,18 +376,18 @@ class Simulation(nn.Module):
             The state at its end, and its diagnostics.
 
         Raises:
-            SimulationDiverged: If the frame does not end well.
+            SimulationDiverged: If the simulation diverges in the frame.
         """
         margin = 0
         try:
             steps = self._substeps(state)
             for retry in range(MAX_RETRIES + 1):
                 if steps > self._most_substeps:
-                    cause = f"a frame would take {steps:,} substeps, and {self._most_substeps:,} are the most"
+                    cause = f"a frame would take {steps:,} substeps, more than the limit of {self._most_substeps:,}"
                     self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
                 end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 work = (end.work - state.work).sum()
-                # everything is under way before the host waits for the first time
+                # everything is launched before the host waits for the first time
                 health = measure(self.solver, end, steps, courant, work, self._tearing)
                 outran = (end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any()
                 cfl, outrun = torch.stack([courant.double(), outran.double()]).tolist()
@@ -409,7 +410,7 @@ class Simulation(nn.Module):
         return end, measured
 
     def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
-        """Raise SimulationDiverged, blaming the particle with the largest deformation."""
+        """Raise SimulationDiverged, naming the particle with the largest deformation."""
         particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
         if remedy is None:
             field = "solver.cfl" if self.solver.substep is None else "solver.substep"
@@ -442,7 +443,7 @@ class Simulation(nn.Module):
     # ---- what is measured
 
     def wind_pressure(self, state: MPMState) -> Tensor:
-        """Force of the wind per area of the patches as they are now [Pa], shape (P,); 0 for what feels no wind."""
+        """Force of the wind per area of the patches as they are now [Pa], shape (P,); 0 for patches without wind."""
         area = self.scene.patch_area
         if self.idle:
             return torch.zeros_like(area)
@@ -458,7 +459,7 @@ class Simulation(nn.Module):
         return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
 
     def flows(self) -> Tensor:
-        """Flows of the wind without gusts [m/s], shape (K, 3); of one that depends on the place, at the particles."""
+        """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
         if isinstance(self.wind, WindField):
             return self.wind.flows
         position = self.scene.points.position
@@ -479,17 +480,17 @@ class Simulation(nn.Module):
 
         Args:
             output: Folder of the results.
-            frames: Number of frames, the first one the state at rest.
+            frames: Number of frames; the first is the state at rest.
             resume: Continue the run found in ``output`` after its last complete frame.
-            settings: Further entries for the summary.
+            settings: Additional entries for the summary.
             progress: Show a progress bar.
-            recorder: What to write, from now on; that of the constructor if None.
+            recorder: What to write from now on; the recorder of the constructor if None.
 
         Returns:
             The summary, as in ``summary.json``.
 
         Raises:
-            SimulationDiverged: After everything recorded so far was saved.
+            SimulationDiverged: If the simulation diverges; everything recorded so far is saved first.
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         self.recorder = recorder or self.recorder

@@ -355,7 +355,7 @@ def test_a_header_that_lies_is_refused_before_the_data(lines, words, tmp_path):
 def test_a_pipe_is_refused(tmp_path):
     """Reading it would wait for ever."""
     os.mkfifo(tmp_path / "pipe.ply")
-    _assert_rejected(tmp_path / "pipe.ply", "no regular file")
+    _assert_rejected(tmp_path / "pipe.ply", "not a regular file")
 
 
 def test_only_the_element_of_the_gaussians_is_read(tmp_path):

@@ -72,7 +72,7 @@ def test_a_slow_first_frame_is_told_with_the_whole_run(clock, capsys):
     work(progress, clock, 1, 1000, 0.1)
     said = capsys.readouterr().err
     assert said.count("note:") == 1
-    assert "note: Frame 1 takes 1,000 substeps, about 100 s, and the frames to come about 2.8 h." in said
+    assert "note: Frame 1 takes 1,000 substeps, about 100 s, and the remaining frames about 2.8 h." in said
     assert "`solver.dx`" in said
 
 
@@ -133,7 +133,7 @@ def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monk
     monkeypatch.setattr(simulation_module, "MAX_SUBSTEPS", 20)
     assert main([*SMALL, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
-    assert "substeps, and 20 are the most" in said
+    assert "substeps, more than the limit of 20" in said
     assert (tmp_path / "run/frames/00000.png").exists()
 
 
