@@ -15,6 +15,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
+from gaussian_swaying.simulation.description import describe
 from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
 from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
 
@@ -29,6 +30,8 @@ RUN_ONLY = ("config", "output", "device", "frames", "resume")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer")
 NULLABLE = ("normalisation",)
+# arguments that may change between a run and the one that resumes it
+NOT_COMPARED = ("device", "recorder", "renderer")
 
 
 class PhysGaussianAction(Action):
@@ -177,9 +180,8 @@ def config_text(parser: ArgumentParser, settings: Namespace) -> str:
     return str(parser.dump(kept, skip_validation=True))
 
 
-def note_changes(changes: Mapping[str, Any]) -> str:
-    """Arguments that replaced settings of a file, as YAML, so that a run with other settings is not continued."""
+def python_text(heading: str, arguments: Mapping[str, Any]) -> str:
+    """Arguments that were given in Python, as YAML, so that a run with other ones is not continued."""
     import yaml
 
-    noted = {"changed_in_python": {name: repr(value) for name, value in sorted(changes.items())}}
-    return yaml.safe_dump(noted) if changes else ""
+    return yaml.safe_dump({heading: describe(dict(sorted(arguments.items())))}) if arguments else ""

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from torch import nn
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.physgaussian.space import Normalisation
 from gaussian_swaying.simulation.preview.suggest import particle_spacing, suggest_spacing
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.scene import Material, Scene
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
@@ -102,6 +110,57 @@ def as_wind(wind: WindLike | None) -> WindField | SpatialWind:
     """Return the given wind, a steady wind from three numbers [m/s], or still air for None."""
     if isinstance(wind, WindField | SpatialWind):
         return wind
-    if isinstance(wind, nn.Module):
-        raise TypeError(f"Expected `wind` to be a WindField, a SpatialWind or three numbers, but got {wind!r}.")
     return WindField([0.0, 0.0, 0.0] if wind is None else list(check_vector("wind", wind)))
+
+
+def check_types(given: Mapping[str, Any]) -> None:
+    """Raise TypeError if an argument is not of its kind; None is accepted.
+
+    Args:
+        given: Arguments of a simulation by their names.
+    """
+    for name, value in given.items():
+        if name in _KINDS and value is not None and not isinstance(value, _KINDS[name]):
+            words = " or ".join(kind.__name__ for kind in _KINDS[name])
+            raise TypeError(f"Expected `{name}` to be a {words}, but got {value!r}.")
+        for part in value if name in _LISTS and isinstance(value, list | tuple) else ():
+            if not isinstance(part, _LISTS[name]) and not (name == "forces" and callable(part)):
+                raise TypeError(f"Expected `{name}` to be a list of {_LISTS[name].__name__}, but it has {part!r}.")
+
+
+def check_count(name: str, count: Any) -> int:
+    """Return a number of frames, or raise an error that names the field."""
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ValueError(f"Expected `{name}` to be a whole number of at least 1, but got {count!r}.")
+    return count
+
+
+def copies(
+    scene: Scene,
+    material: Material,
+    solver: MPMSolver,
+    camera: CameraPath | None,
+    cameras: Mapping[str, CameraPath] | None,
+) -> tuple[Scene, Material, MPMSolver, CameraPath | None, dict[str, CameraPath]]:
+    """Copies of what a normalisation places, so that the user's own components stay as they are."""
+    own = copy.copy(solver)
+    own._modules = dict(solver._modules)  # the boundaries are exchanged in the copy alone
+    paths = {name: copy.copy(path) for name, path in (cameras or {}).items()}
+    return copy.copy(scene), dataclasses.replace(material), own, copy.copy(camera), paths
+
+
+_KINDS: dict[str, tuple[type, ...]] = {
+    "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
+    "material": (Material,),
+    "solver": (MPMSolver,),
+    "aero": (AeroForce,),
+    "forces": (list, tuple),
+    "shader": (Shader,),
+    "camera": (CameraPath,),
+    "cameras": (Mapping,),
+    "edits": (list, tuple),
+    "recorder": (Recorder,),
+    "normalisation": (Normalisation,),
+    "hold": (Region,),
+}
+_LISTS: dict[str, type] = {"forces": Force, "edits": Edit}

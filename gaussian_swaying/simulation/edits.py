@@ -148,9 +148,19 @@ class SceneEditor:
         self.scene = scene
         self.edits = sorted(edits, key=lambda edit: edit.time)
         self.applied = 0
+        self.version = 0  # counts the changes of colour
         self._loaded: tuple[MaterialPoints, Tensor, Tensor] | None = None
         for edit in self.edits:
             self.reach(edit)
+
+    def snapshot(self) -> tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]:
+        """The scene as it is now, for :meth:`restore`."""
+        model = self.scene.model
+        return self.scene.points, model.sh0, model.shN, self.version
+
+    def restore(self, snapshot: tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]) -> None:
+        """Put the scene back to what it was at a :meth:`snapshot`."""
+        self.scene.points, self.scene.model.sh0, self.scene.model.shN, self.version = snapshot
 
     @property
     def times(self) -> list[float]:
@@ -219,6 +229,7 @@ class SceneEditor:
         return particles & (edit.law is not None)
 
     def _paint(self, sh0: Tensor, shN: Tensor) -> None:
+        self.version += 1
         with torch.inference_mode(False):
             self.scene.model.sh0 = nn.Parameter(sh0.clone(), requires_grad=False)
             self.scene.model.shN = nn.Parameter(shN.clone(), requires_grad=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,7 @@ class Frame:
     index: int
     state: MPMState
     health: FrameDiagnostics
+    _version: int = field(repr=False, default=0)
 
     @property
     def time(self) -> float:
@@ -40,6 +41,11 @@ class Frame:
     def gaussians(self) -> DeformedGaussians:
         """All Gaussians in scene units: means, covariances, normals, and colours as the camera sees them."""
         painter = self.simulation.painter
+        if self.simulation.editor.version != self._version:
+            raise RuntimeError(
+                f"An edit has changed the colours since frame {self.index}: read `gaussians` or `render()` of a frame "
+                "before the next one."
+            )
         return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
 
     def render(self, camera: str = "") -> RenderOutput:
@@ -52,6 +58,9 @@ class Frame:
             Colour, opacity and depth.
         """
         painter, gaussians = self.simulation.painter, self.gaussians
+        if camera and camera not in painter.cameras:
+            known = ", ".join(painter.cameras) or "none"
+            raise ValueError(f"There is no camera {camera!r} in `cameras` ({known}): leave it out for the main one.")
         if camera:
             gaussians = painter.shade(gaussians, painter.camera_at(self.index, camera))
         assert gaussians.colors is not None

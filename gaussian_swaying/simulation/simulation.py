@@ -6,32 +6,33 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Region, RegionInFrame
-from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.forces import Force, as_forces
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
 from gaussian_swaying.rendering.protocol import Renderer
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.config import (
+    NOT_COMPARED,
+    PYTHON_ONLY,
     arguments_of,
     build_parser,
     check_settings,
     config_text,
-    note_changes,
     parse_file,
+    python_text,
 )
 from gaussian_swaying.simulation.defaults import (
     DeviceLike,
@@ -40,6 +41,9 @@ from gaussian_swaying.simulation.defaults import (
     as_scene,
     as_solver,
     as_wind,
+    check_count,
+    check_types,
+    copies,
     resolve_device,
 )
 from gaussian_swaying.simulation.diagnostics import (
@@ -139,12 +143,18 @@ class Simulation(nn.Module):
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__()
+        given = {name: value for name, value in locals().items() if name not in ("self", "__class__", *NOT_COMPARED)}
         check_positive("frame_dt", frame_dt)
+        check_types(given | {"recorder": recorder})
+        check_choice("dtype", dtype, ("float32", "float64"))
         colour = check_vector("background", background)
         target = resolve_device(device)
         settings, material = as_scene(scene, up), material or Material()
         solver = as_solver(solver, hold, settings)
         if normalisation is not None:
+            if hold is not None:
+                raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
+            settings, material, solver, camera, cameras = copies(settings, material, solver, camera, cameras)
             space = normalisation.place(settings, material, solver, camera)
             for path in (cameras or {}).values():
                 if isinstance(path, PhysGaussianCamera):
@@ -154,18 +164,45 @@ class Simulation(nn.Module):
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
         self.wind = as_wind(wind)
-        self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in forces)
+        self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in as_forces(forces))
         self.to(target)
         self.editor = SceneEditor(model, edits)
         self.recorder = recorder or Recorder()
-        self.config = ""  # the whole configuration as YAML, if there is one
+        self.frames_wanted = 250  # of a run; those of the file, if there is one
         self.progress: RunProgress | None = None  # of the current run
         self.files: list[Path] = []  # what the last run wrote
         self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self._most_substeps = MAX_SUBSTEPS
         self._wind_force: list[WindForce] = []  # in a list, so that it is not part of the module's state
         self._wind_parts: tuple[object, ...] = ()
+        self._idle: tuple[tuple[object, ...], bool] | None = None
         self._tearing: TearingGauge | None = None
+        self._started = 0  # how often; a loop over frames ends when another one begins
+        self._text, self._changed, self._given = "", set(given), given
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Of the arguments, only ``wind``, ``aero`` and ``recorder`` can be assigned once a simulation is made."""
+        if "_given" in self.__dict__ and name in (*self._given, *PYTHON_ONLY, "device"):
+            if name not in ("wind", "aero"):
+                raise AttributeError(
+                    f"`{name}` is given when a simulation is made: make another Simulation. Between frames you can "
+                    "assign `wind` and `aero`, change the material with `edit`, and the pictures in `painter`."
+                )
+            check_types({name: value})
+            value = (as_wind(value) if name == "wind" else value or AeroForce()).to(self.device)
+            self._given[name] = value
+            self._changed.add(name)
+        super().__setattr__(name, value)
+
+    @property
+    def config(self) -> str:
+        """What a run is compared with before it is resumed, as YAML: the file, and the arguments given in Python."""
+        heading = "changed_in_python" if self._text else "made_in_python"
+        return self._text + python_text(heading, {name: self._given[name] for name in self._changed})
+
+    @config.setter
+    def config(self, text: str) -> None:
+        self._text, self._changed = text, set()
 
     # ---- from a YAML file
 
@@ -204,7 +241,9 @@ class Simulation(nn.Module):
         check_settings(cls, settings)
         text, parts = config_text(parser, settings), parser.instantiate(settings)
         simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)
-        simulation.config = text + note_changes(changes)
+        simulation.config = text
+        simulation._changed |= set(changes) - set(NOT_COMPARED)
+        simulation.frames_wanted = settings.frames
         return simulation
 
     # ---- parts
@@ -225,18 +264,16 @@ class Simulation(nn.Module):
         parts = (self.aero, self.wind, self.scene.patch_normal, self.scene.patch_area)
         if not self._wind_force or any(a is not b for a, b in zip(parts, self._wind_parts, strict=True)):
             self._wind_force, self._wind_parts = [WindForce(*parts)], parts
-            self.__dict__.pop("_still", None)
         return self._wind_force[0]
 
     @property
     def idle(self) -> bool:
-        """Whether the wind has no effect; computed once for each wind, as it makes the host wait."""
-        self.wind_force  # noqa: B018  (a new wind force drops the cached value)
-        return self._still
-
-    @cached_property
-    def _still(self) -> bool:
-        return self.aero.idle
+        """Whether the wind has no effect; computed again only if a coefficient changed, as it makes the host wait."""
+        aero = self.aero
+        key = (aero, aero.air_density, *(0 if c.is_inference() else c._version for c in (aero.C_D, aero.C_F, aero.C_L)))
+        if self._idle is None or self._idle[0] != key:
+            self._idle = (key, aero.idle)
+        return self._idle[1]
 
     @property
     def forces(self) -> list[Force]:
@@ -254,15 +291,16 @@ class Simulation(nn.Module):
         Args:
             count: Number of frames, the first at rest.
 
-        Yields:
-            The frames.
+        Returns:
+            The frames. Read a frame before the next one: an edit changes the scene for all of them. One loop at a time:
+            starting again ends the loop before.
 
         Raises:
             SimulationDiverged: If the simulation diverges.
             ValueError: As in :meth:`start`.
         """
-        check_positive("count", count)
-        yield from self.frames_from(self.start(), 0, count)
+        check_count("count", count)
+        return self.frames_from(self.start(), 0, count)
 
     def frames_from(self, state: MPMState, first: int, count: int) -> Iterator[Frame]:
         """The frames from number ``first`` up to ``count``.
@@ -272,13 +310,19 @@ class Simulation(nn.Module):
             first: Number of the first frame.
             count: Number of frames of the whole run.
         """
+        started = self._started
         for index in range(first, count):
+            if self._started != started:
+                raise RuntimeError(
+                    "This simulation was started again, so the earlier loop over its frames cannot go on: finish one "
+                    "loop before the next, or make a Simulation for each."
+                )
             if index == 0:
                 health = diagnose(self.solver, state, 0, 0.0)
             else:
                 state, health = self.advance(state)
                 state = self.edit_due(state)
-            yield Frame(self, index, state, health)
+            yield Frame(self, index, state, health, self.editor.version)
 
     def start(self) -> MPMState:
         """The state at rest at time zero, with the edits of that time applied.
@@ -288,6 +332,7 @@ class Simulation(nn.Module):
                 of the edits.
         """
         editor, frame = self.editor, self.scene.frame
+        self._started += 1
         editor.reset()
         for later in (moment for moment in editor.times if moment > 0):  # refuse impossible edits now
             self._edit(editor.due(0.0))
@@ -298,7 +343,7 @@ class Simulation(nn.Module):
         editor.reset()
         self._edit(editor.due(0.0))
         state = self.solver.init_state(self.scene.points, frame=frame)
-        self.__dict__.pop("_still", None)  # coefficients may have changed
+        self._idle = None  # coefficients may have changed
         check_spacing(self.solver)
         self.solver.fused()  # errors of its kernels are raised here
         at_rest = self.solver.substeps(state, self.frame_dt)
@@ -330,7 +375,13 @@ class Simulation(nn.Module):
         Raises:
             ValueError: If a region contains nothing, or a plastic law is used in the ``total`` formulation.
         """
-        return self._take(state, self._edit(edits, flowed=True))
+        before = self.editor.snapshot()
+        try:
+            return self._take(state, self._edit(edits, flowed=True))
+        except Exception:  # nothing stays half changed
+            self.editor.restore(before)
+            self.solver.init_state(self.scene.points, frame=self.scene.frame)
+            raise
 
     def _edit(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
         """Change the scene; returns which particles (P,) got another law, None if the material is the same."""
@@ -470,7 +521,7 @@ class Simulation(nn.Module):
     def run(
         self,
         output: str | os.PathLike[str],
-        frames: int = 250,
+        frames: int | None = None,
         resume: bool = False,
         settings: Mapping[str, Any] | None = None,
         progress: bool = True,
@@ -480,7 +531,7 @@ class Simulation(nn.Module):
 
         Args:
             output: Folder of the results.
-            frames: Number of frames; the first is the state at rest.
+            frames: Number of frames; the first is the state at rest; those of the file, or 250, if None.
             resume: Continue the run found in ``output`` after its last complete frame.
             settings: Additional entries for the summary.
             progress: Show a progress bar.
@@ -494,4 +545,5 @@ class Simulation(nn.Module):
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         self.recorder = recorder or self.recorder
-        return run(self, Path(output), frames, resume, dict(settings or {}), progress)
+        count = self.frames_wanted if frames is None else check_count("frames", frames)
+        return run(self, Path(output), count, resume, dict(settings or {}), progress)

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,10 +19,13 @@ from gaussian_swaying import (
     GaussianCloud,
     Material,
     MPMSolver,
+    Normalisation,
     PinnedRegion,
     Recorder,
+    Sand,
     Scene,
     Simulation,
+    SineSway,
     SpatialWind,
     WindField,
     load_trajectory,
@@ -222,7 +226,7 @@ def test_a_file_and_what_takes_the_place_of_it(config, tmp_path):
     assert plain.wind.flows.tolist() == [[6.0, 1.5, 0.0]]
     assert changed.wind.flows.tolist() == [[0.0, 9.0, 0.0]]
     assert (plain.frame_dt, changed.frame_dt) == (0.04, 0.02)
-    assert changed.config == plain.config + "changed_in_python:\n  frame_dt: '0.02'\n  wind: '[0, 9, 0]'\n"
+    assert changed.config == plain.config + "changed_in_python:\n  frame_dt: 0.02\n  wind:\n  - 0\n  - 9\n  - 0\n"
     changed.run(tmp_path / "run", 2, progress=False, recorder=Recorder(images=False, video=False))
     assert (tmp_path / "run/config.yaml").read_text() == changed.config
     with pytest.raises(ValueError, match=r"The configuration differs .*changed_in_python"):
@@ -297,3 +301,164 @@ def test_what_is_held_has_no_weight_and_what_is_not_falls():
     *_, free = _flag(wind=None, hold=None, aero=AeroForce(C_D=0.0, C_F=0.0, C_L=0.0)).frames(5)
     fallen = (free.state.position - free.simulation.scene.points.position)[:, 2].mean()
     assert float(fallen) == pytest.approx(-0.5 * 9.8 * free.time**2, rel=0.05)
+
+
+# ---- what may not go wrong silently
+
+
+QUIET = {"images": False, "video": False}
+
+
+def _record(simulation, folder, frames, resume=False):
+    return simulation.run(folder, frames, resume=resume, progress=False, recorder=Recorder(**QUIET))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wind": [0.0, 9.0, 0.0]},
+        {"wind": WindField([6.0, 1.5, 0.0], modulations=[SineSway()])},
+        {"material": Material(E=9e4, density=30.0)},
+        {"hold": Box([None, None, None], [0.21, None, None])},
+        {"aero": AeroForce(C_D=0.1)},
+        {"edits": [Edit(time=1.0, E=1e4)]},
+        {"frame_dt": 0.02},
+    ],
+)
+def test_a_run_made_in_python_is_continued_with_the_same_arguments_only(change, tmp_path):
+    _record(_flag(), tmp_path / "run", 2)
+    with pytest.raises(ValueError, match=r"configuration differs .*made_in_python"):
+        _record(_flag(**change), tmp_path / "run", 3, resume=True)
+    assert _record(_flag(), tmp_path / "run", 3, resume=True)["frames"] == 3
+
+
+def test_equal_arguments_are_described_alike_in_another_process():
+    code = (
+        "from gaussian_swaying import *; from gaussian_swaying.scenes import FlagScene\n"
+        "s = Simulation(FlagScene(spacing=0.1), camera=OrbitCamera(width=8, height=8), solver=MPMSolver(dx=0.2,"
+        " boundaries=[PinnedRegion(Box([None, None, None], [0.11, None, None]))]), wind=WindField([1, 0, 0]),"
+        " device='cpu', recorder=Recorder(video=False))\nprint(s.config)"
+    )
+    one, other = (subprocess.run([sys.executable, "-c", code], capture_output=True, text=True) for _ in range(2))
+    assert one.returncode == 0, one.stderr
+    assert one.stdout == other.stdout
+    assert "recorder" not in one.stdout
+    assert " at 0x" not in one.stdout
+    assert "OrbitCamera" in one.stdout
+
+
+def test_a_wind_that_was_assigned_counts_too(config, tmp_path):
+    _record(Simulation.from_yaml(config), tmp_path / "run", 2)
+    other = Simulation.from_yaml(config)
+    other.wind = [0, 9, 0]
+    with pytest.raises(ValueError, match=r"configuration differs .*changed_in_python"):
+        _record(other, tmp_path / "run", 3, resume=True)
+
+
+def test_the_frames_of_the_file_are_the_default_of_a_run(config, tmp_path):
+    config.write_text("frames: 3\n" + YAML)
+    assert Simulation.from_yaml(config).run(tmp_path / "run", progress=False, recorder=Recorder(**QUIET))["frames"] == 3
+
+
+def test_a_frame_is_read_before_an_edit_changes_its_colours():
+    simulation = _flag(edits=[Edit(time=0.08, color=[1.0, 0.0, 0.0])])
+    frames = list(simulation.frames(4))
+    assert float(frames[-1].gaussians.colors[:, 1].max()) < 1e-6
+    with pytest.raises(RuntimeError, match="since frame 0: read `gaussians`"):
+        _ = frames[0].gaussians
+
+
+def test_one_loop_at_a_time():
+    simulation = _flag()
+    first = simulation.frames(5)
+    next(first)
+    list(simulation.frames(2))
+    with pytest.raises(RuntimeError, match="started again"):
+        next(first)
+
+
+def test_a_coefficient_changed_in_place_is_felt():
+    simulation = _flag(aero=AeroForce(C_D=0.0, C_F=0.0, C_L=0.0))
+    state = simulation.start()
+    assert simulation.forces == []
+    simulation.aero.C_D.fill_(1.2)
+    state, _ = simulation.advance(state)
+    assert float((state.position - simulation.scene.points.position).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["camera", "material", "frame_dt", "solver", "scene", "forces", "hold", "device"])
+def test_what_cannot_be_assigned_says_so(name):
+    with pytest.raises(AttributeError, match=rf"`{name}` is given when a simulation is made"):
+        setattr(_flag(), name, None)
+
+
+def test_wind_is_assigned_as_it_is_given():
+    simulation = _flag()
+    simulation.wind = [8, 0, 0]
+    assert simulation.wind.flows.tolist() == [[8.0, 0.0, 0.0]]
+    simulation.wind = None
+    assert simulation.wind.flows.tolist() == [[0.0, 0.0, 0.0]]
+    for wrong in ([1, 2], "north"):
+        with pytest.raises((ValueError, TypeError), match="`wind`"):
+            simulation.wind = wrong
+
+
+def test_an_edit_that_is_refused_changes_nothing():
+    simulation = _flag()
+    state = simulation.start()
+    with pytest.raises(ValueError, match=r"`solver\.formulation`"):
+        simulation.edit(state, Edit(E=9e4, color=[1.0, 0.0, 0.0]), Edit(law=Sand()))
+    assert float(simulation.scene.points.youngs_modulus.max()) == 3e3
+    one, _ = simulation.advance(simulation.edit(state, Edit(E=1e4)))
+    other = _flag()
+    two, _ = other.advance(other.edit(other.start(), Edit(E=1e4)))
+    assert torch.equal(one.position, two.position)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"scene": 5}, "`scene`"),
+        ({"material": {}}, "`material`"),
+        ({"solver": MPMSolver}, "`solver`"),
+        ({"aero": {}}, "`aero`"),
+        ({"camera": "orbit"}, "`camera`"),
+        ({"recorder": "x"}, "`recorder`"),
+        ({"hold": [0, 1]}, "`hold`"),
+        ({"edits": Edit(E=1e4)}, "`edits`"),
+        ({"forces": [3]}, "`forces`"),
+        ({"dtype": "float16"}, "`dtype`"),
+    ],
+)
+def test_an_argument_of_another_kind_is_named(given, words):
+    with pytest.raises((TypeError, ValueError), match=f"Expected {words}"):
+        Simulation(**({"scene": FlagScene(spacing=0.1), "device": "cpu"} | given))
+
+
+@pytest.mark.parametrize("count", [0, -1, 2.5, True])
+def test_a_number_of_frames_is_checked_at_once(count):
+    with pytest.raises(ValueError, match="`count`"):
+        _flag().frames(count)
+
+
+def test_a_camera_that_is_not_there():
+    (frame,) = _flag().frames(1)
+    with pytest.raises(ValueError, match="no camera 'side'"):
+        frame.render("side")
+
+
+def test_a_function_is_a_force_too():
+    simulation = _flag(wind=None, forces=[lambda state: torch.tensor([0.0, 0.01, 0.0]).expand_as(state.velocity)])
+    *_, last = simulation.frames(3)
+    assert float((last.state.position - simulation.scene.points.position)[:, 1].mean()) > 1e-4
+
+
+def test_a_normalisation_leaves_the_components_as_they_are():
+    scene, material = Scene(generator=FlagScene(spacing=0.1)), Material(E=3e3)
+    solver = MPMSolver(dx=0.1, boundaries=[PinnedRegion(Box([None, None, None], [0.6, None, None]))])
+    given = vars(scene).copy(), dataclasses.asdict(material), list(solver.boundaries)
+    for _ in range(2):
+        Simulation(scene, material, solver, normalisation=Normalisation(scale=1.0), device="cpu").start()
+        assert (vars(scene), dataclasses.asdict(material), list(solver.boundaries)) == given
+    with pytest.raises(ValueError, match="`hold` cannot be combined with `normalisation`"):
+        Simulation(FlagScene(spacing=0.1), hold=POLE, normalisation=Normalisation(), device="cpu")
