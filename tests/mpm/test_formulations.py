@@ -316,7 +316,7 @@ def test_a_third_formulation_is_one_class(monkeypatch):
 def test_a_formulation_without_kernels_says_so(monkeypatch):
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)
-    with pytest.raises(ValueError, match="as the loose formulation has no kernels: set it to auto or torch"):
+    with pytest.raises(ValueError, match="because the loose formulation has no kernels: set it to auto or torch"):
         MPMSolver(0.1, "loose", transfer="triton").init_state(points)
 
 

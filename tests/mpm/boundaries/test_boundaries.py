@@ -296,7 +296,7 @@ def test_share_that_no_node_reaches_names_its_condition(kind, block):
         (lambda: Plane([0, 0], [0, 0, 1]), "`point` to have 3 numbers"),
         (lambda: Plane([0, 0, 0], [0, 0, 1], friction=-1), "`friction` to not be negative"),
         (lambda: Plane([0, 0, 0], [0, 0, 1], start=2.0, end=1.0), "`end` to be later than `start`"),
-        (lambda: EnclosingBox([0, 0, 0], [1, 0, 1]), "`min` of the box below `max`"),
+        (lambda: EnclosingBox([0, 0, 0], [1, 0, 1]), "`min` of the box to be below `max`"),
         (lambda: VelocityBox(Sphere([0, 0, 0], 1), [1, 2]), "`velocity` to have 3 numbers"),
         (lambda: PinnedRegion(Sphere([0, 0, 0], 1), held_share=1.0), "`held_share` to lie in"),
         (lambda: Handle(Sphere([0, 0, 0], 1), held_share=-0.1), "`held_share` to lie in"),
@@ -312,7 +312,7 @@ def test_share_that_no_node_reaches_names_its_condition(kind, block):
         (lambda: SequentialRelease(Sphere([0, 0, 0], 1), first=[0, 0, 0]), "both `first` and `last`"),
         (
             lambda: SequentialRelease(Sphere([0, 0, 0], 1), [0, 0, 1], first=[0, 0, 1], last=[5, 0, 1]),
-            "`last` of the SequentialRelease farther along",
+            "`last` of the SequentialRelease to be farther along",
         ),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0, 0], end=None), "`end` of the Impulse to be a finite time"),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0, 0], end=math.inf), "`end` of the Impulse to be a finite time"),

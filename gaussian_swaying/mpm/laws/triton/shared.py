@@ -1,4 +1,4 @@
-"""What the device functions of several laws are made of, as :mod:`gaussian_swaying.mpm.laws.shared`."""
+"""Building blocks of the laws' device functions, as in :mod:`gaussian_swaying.mpm.laws.shared`."""
 
 import math
 
@@ -62,7 +62,7 @@ def share_above(x, y, floor):
 
 @triton.jit
 def log_difference(x, y):
-    """(log x - log y) / (x - y) of the continued logarithm, to round-off where x and y are near each other too."""
+    """(log x - log y) / (x - y) of the continued logarithm, accurate to round-off also if x is close to y."""
     share = share_above(x, y, LOG_FLOOR)
     x = tl.maximum(x, LOG_FLOOR)
     y = tl.maximum(y, LOG_FLOOR)
