@@ -104,7 +104,7 @@ def saint(tmp_path, monkeypatch):
 
 
 def _run(folder, law):
-    """Two frames of a flag of twelve by eight Gaussians held at its left edge."""
+    """Two frames of a flag of twelve by eight Gaussians, held at its left edge."""
     pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
     changes = {
         "material": {"law": law},
