@@ -34,7 +34,7 @@ def split_strain(e0, e1, e2):
     trace = e0 + e1 + e2
     d = (e0 - trace / 3, e1 - trace / 3, e2 - trace / 3)
     squared = dot3(d, d)
-    some = squared > 1.4210855e-14  # the square of float32's epsilon, as in the definition
+    some = squared > 1.4210855e-14  # the square of float32's epsilon, as in the reference
     norm = tl.where(some, tl.sqrt(tl.where(some, squared, 1.0)), 0.0)
     scale = 1.0 / tl.where(some, norm, 1.0)
     return trace, d, norm, (d[0] * scale, d[1] * scale, d[2] * scale)
