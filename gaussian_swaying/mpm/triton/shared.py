@@ -13,8 +13,8 @@ from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue,
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
 
-# Numbers that differ between bodies and between grids. Otherwise Triton would compile a kernel again whenever one of
-# them becomes one or a multiple of 16, in the middle of a run, and even while a graph is recorded.
+# Numbers that differ between bodies and between grids, and are not specialised. Otherwise Triton would compile a kernel
+# again whenever one of them becomes one or a multiple of 16, in the middle of a run, even while a graph is recorded.
 VARIES = (
     "count", "cells", "pieces", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
     "nx", "ny", "nz",
