@@ -15,13 +15,14 @@ from gaussian_swaying.mpm.state import MaterialPoints
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """The particles that a boundary holds, and the nodes that they hold in turn.
+    """The particles that a boundary holds, and the nodes held through them.
 
     Attributes:
         mass: Mass of those particles [kg], zero elsewhere, shape (..., P).
         total: Mass of all of them [kg], shape (...).
-        release: Time at which each particle is let go [s], shape (..., P), or None if they are not let go one by one.
-        share: Their share of the mass of each node, shape (..., G), where that never changes, or None.
+        release: Time at which each particle is released [s], shape (..., P), or None if they are not released one by
+            one.
+        share: Their share of the mass of each node, shape (..., G), if it is constant, else None.
         threshold: Share above which a node is held.
     """
 
@@ -46,8 +47,8 @@ class Body:
     Attributes:
         laws: The laws of the material, bound to its particles.
         held: What each boundary holds; None for one that holds no particles.
-        needs_position: Whether a boundary looks at where nodes are.
-        needs_lattice: Whether a boundary looks at where lattice points are.
+        needs_position: Whether a boundary uses the positions of nodes.
+        needs_lattice: Whether a boundary uses the positions of lattice points.
     """
 
     def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary]) -> None:
@@ -58,7 +59,7 @@ class Body:
         self.needs_lattice = any(b.needs_lattice for b in self.boundaries)
 
     def tensors(self) -> list[Tensor]:
-        """What a substep depends on besides its state and its forces, any of which may ask for a gradient."""
+        """Tensors that a substep depends on, besides its state and forces; any of them may require a gradient."""
         points = self.points
         own = [points.position, points.mass, points.volume, points.youngs_modulus, points.poisson_ratio]
         return own + [t for boundary in self.boundaries for t in (*boundary.parameters(), *boundary.buffers())]

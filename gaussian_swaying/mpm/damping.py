@@ -1,4 +1,4 @@
-"""Damping in proportion to stiffness: a viscous stress beside the elastic one."""
+"""Stiffness-proportional damping: a viscous stress added to the elastic one."""
 
 import math
 
@@ -34,9 +34,9 @@ def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: f
 
 
 def damped_substep(limit: float, time: float) -> float:
-    r"""Substep that is as stable with stiffness damping as ``limit`` is without.
+    r"""Substep with stiffness damping that is as stable as ``limit`` is without damping.
 
-    Symplectic Euler with the damping force of the last velocity is stable for
+    Symplectic Euler with the damping force at the last velocity is stable for
     :math:`\omega^2 (\Delta t^2 + 2 \beta \Delta t) \le 4` (Jury's criterion for one mode).
 
     Args:

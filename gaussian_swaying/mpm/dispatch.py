@@ -1,4 +1,4 @@
-"""Which constitutive law holds for which particle: calls each law once, on its own particles only."""
+"""Dispatch of particles to their constitutive laws: each law is called once, on its own particles only."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gaussian_swaying.mpm.state import MaterialPoints
 class LawDispatch:
     """The laws of a body, bound to its particles.
 
-    With one law there is no indexing at all; with several, each sees its own particles, and the results are put back in
-    order.
+    With one law there is no indexing. With several, each law gets only its own particles, and the results are put back
+    in order.
 
     Args:
         points: The material (one GPU synchronisation if it has several laws).
@@ -43,7 +43,7 @@ class LawDispatch:
         return [type(law).__name__ for law, _ in self._groups if law.plastic]
 
     def elastic_particles(self) -> Tensor | None:
-        """Particles whose law has no return map, bool, shape (P,) over all scenes; None if that is all of them."""
+        """Particles whose law has no return map, bool, shape (P,) over all scenes; None if all of them."""
         if not self.plastic:
             return None
         mask = torch.zeros(self.mu.numel(), dtype=torch.bool, device=self.mu.device)
@@ -107,7 +107,7 @@ class LawDispatch:
 
 
 def _as_tuple(found: Tensor | tuple[Tensor, Tensor | None], internal: Tensor | None) -> tuple[Tensor, ...]:
-    """The results of a law; an internal variable that it does not have stays what it was."""
+    """The results of a law; if it has no internal variable, the given one is returned unchanged."""
     if isinstance(found, Tensor):
         return (found,)
     first, second = found

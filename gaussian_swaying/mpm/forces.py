@@ -1,4 +1,4 @@
-"""Forces on material points: what a force is, several of them, and what one of them gives to the fused substep."""
+"""Forces on material points: the base class, sums of forces, and Triton twins for the fused substep."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.state import MPMState
 
 MOST_STEPS = 256
-"""Substeps for which a :class:`ForceTwin` is asked for its vectors at a time, at most."""
+"""Largest number of substeps for which a :class:`ForceTwin` computes its vectors at once."""
 
 TWIN_VALUES, TWIN_NUMBERS = 4, 8
-"""How many numbers a :class:`ForceTwin` has for each particle and in all, at most."""
+"""Largest number of values per particle, and of shared numbers, in a :class:`ForceTwin`."""
 
 Given = Tensor | tuple[Tensor, Tensor | None]
 """A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
@@ -28,23 +28,23 @@ ForceFunction = Callable[[MPMState], Given]
 
 @dataclass(frozen=True)
 class ForceTwin:
-    """A force as a Triton function, which the particle kernels call; its definition is the force in torch.
+    """A force as a Triton function that the particle kernels call; the force in torch is its reference.
 
     Attributes:
         function: A ``@triton.jit`` function ``(F, velocity, values, vector, numbers, OPTIONS)`` that returns the force
             (three numbers) and the resistance of some particles. ``F`` is the total deformation gradient in nine parts,
             ``velocity`` has three, ``values`` four; ``vector`` and ``numbers`` are pointers. The force must be zero
-            where all values are.
+            where all values are zero.
         options: Constants that the function is compiled for.
-        implicit: Whether there is a resistance, so that the force acts with the velocity that it leads to; if not, the
-            function returns zero for it.
-        sources: The tensors that the values are made of: these are asked for again when one is another tensor or was
-            changed in place.
-        values: Gives up to four numbers for each particle, shape (..., P, n).
+        implicit: Whether there is a resistance, so that the force acts at the velocity at the end of the substep; if
+            not, the function returns a resistance of zero.
+        sources: The tensors that the values are computed from: ``values`` is called again when one of them is replaced
+            or changed in place.
+        values: Returns up to four numbers for each particle, shape (..., P, n).
         numbers: Up to eight numbers, shape (n,).
-        vectors: ``vectors(time, dt, steps)`` is what depends on time alone: a vector for the start of each of ``steps``
-            (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3), or
-            (steps, B, 1, 3) for a batch of scenes.
+        vectors: ``vectors(time, dt, steps)`` returns what depends only on time: a vector for the start of each of
+            ``steps`` (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3),
+            or (steps, B, 1, 3) for a batch of scenes.
     """
 
     function: Any
@@ -57,17 +57,17 @@ class ForceTwin:
 
 
 class Force(Recordable, nn.Module, ABC):
-    """Base of all forces: gives the force on every particle from the state, in torch.
+    """Base class of all forces: computes the force on every particle from the state, in torch.
 
-    A force of your own is a subclass with a ``forward``. It may keep numbers, tensors (``register_buffer``) and
-    parameters; gradients reach them. Move it to the device of the material, as any module.
+    A custom force is a subclass with a ``forward``. It may have numbers, tensors (``register_buffer``) and parameters;
+    they receive gradients. Move it to the device of the material, like any module.
 
     Attributes:
-        recordable: Whether ``forward`` may be recorded in a CUDA graph with the substep: it depends on nothing but the
+        recordable: Whether ``forward`` may be recorded in a CUDA graph with the substep: it must depend only on the
             position, velocity, affine, F_elastic, F_total, internal, lost and time of the state and on numbers and
-            tensors of the module, and never makes the host wait (no ``float(tensor)``, no ``if tensor``, no copy from
-            the host). Where it is False (the default) the host calls the force in every substep, which is slow on a
-            GPU; everywhere else it makes no difference.
+            tensors of the module, and must never make the host wait (no ``float(tensor)``, no ``if tensor``, no copy
+            from the host). If it is False (the default), the host calls the force in every substep, which is slow on a
+            GPU; in all other cases it makes no difference.
 
     Example:
         >>> class Weight(Force):
@@ -82,24 +82,25 @@ class Force(Recordable, nn.Module, ABC):
         """The force at the start of a substep.
 
         Args:
-            state: The state then.
+            state: The state at that time.
 
         Returns:
-            Force [N], shape (..., P, 3); or the force and its resistance: by how much it falls per velocity gained in
-            the substep [kg/s], shape (..., P). A force with a resistance acts with the velocity that it leads to, so it
-            is stable however light the particle.
+            Force [N], shape (..., P, 3); or the force and its resistance: how much it decreases per unit of velocity
+            gained in the substep [kg/s], shape (..., P). A force with a resistance acts at the velocity at the end of
+            the substep, so it is stable for particles of any mass.
         """
 
     def in_frame(self, frame: SimFrame) -> Force:
-        """The same force with its places brought from scene units to metres, z up; itself if it names no place.
+        """The same force with its positions converted from scene units to metres, z up; itself if it has none.
 
         Args:
-            frame: How a scene is brought to metres. A force that a configuration names gets it before the run.
+            frame: Transform from the scene to metres. For a force in a configuration, this method is called before the
+                run.
         """
         return self
 
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
-        """The force in each of several substeps; what depends on time alone can be computed here, for all at once.
+        """The force in each of several substeps; what depends only on time can be computed here, for all at once.
 
         Args:
             time: Start of the first substep [s], scalar float64 tensor.
@@ -117,7 +118,7 @@ class Force(Recordable, nn.Module, ABC):
         return False
 
     def twin(self) -> ForceTwin:
-        """The force for the fused substep, of a force that ``has_twin``."""
+        """The Triton twin of this force, for the fused substep; only if ``has_twin``."""
         raise NotImplementedError(f"The force {type(self).__name__} has no Triton twin.")
 
 
@@ -125,7 +126,7 @@ class FunctionForce(Force):
     """A function of the state as a force; the host calls it in every substep.
 
     Args:
-        function: Gives the force [N], shape (..., P, 3), or the force and its resistance.
+        function: Returns the force [N], shape (..., P, 3), or the force and its resistance.
     """
 
     def __init__(self, function: ForceFunction) -> None:
@@ -133,7 +134,7 @@ class FunctionForce(Force):
         self.function = function
 
     def forward(self, state: MPMState) -> Given:
-        """What the function gives."""
+        """The result of the function."""
         return self.function(state)
 
 
@@ -145,7 +146,7 @@ def as_forces(forces: Forces | None) -> tuple[Force, ...]:
     """One force, several or none as a tuple.
 
     Raises:
-        TypeError: If something else is among them.
+        TypeError: If one of them is neither a Force nor a function.
     """
     if forces is None:
         return ()
@@ -160,10 +161,10 @@ def as_forces(forces: Forces | None) -> tuple[Force, ...]:
 
 
 def split(found: Given, force: Force, state: MPMState) -> tuple[Tensor, Tensor | None]:
-    """What a force gave for a state: the force and its resistance or None, in the precision of the state.
+    """Split the result of a force into the force and its resistance or None, in the dtype of the state.
 
     Raises:
-        TypeError: If it gave no tensor.
+        TypeError: If it returned no tensor.
         ValueError: If its shape is wrong.
     """
     value, drag = found if isinstance(found, tuple) else (found, None)
@@ -176,7 +177,7 @@ def split(found: Given, force: Force, state: MPMState) -> tuple[Tensor, Tensor |
 
 
 def added(parts: Sequence[tuple[Tensor | None, Tensor | None]]) -> tuple[Tensor | None, Tensor | None]:
-    """The sum of forces and that of their resistances; None where there is none."""
+    """The sum of the forces and the sum of their resistances; None if there are none."""
     value = drag = None
     for one, its_drag in parts:
         if one is not None:
@@ -187,12 +188,12 @@ def added(parts: Sequence[tuple[Tensor | None, Tensor | None]]) -> tuple[Tensor 
 
 
 def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
-    """Parameters and buffers of forces, of which one might ask for a gradient."""
+    """Parameters and buffers of forces, which may require gradients."""
     return [tensor for force in forces for tensor in (*force.parameters(), *force.buffers())]
 
 
 def divide(forces: Sequence[Force]) -> tuple[Force | None, tuple[Force, ...]]:
-    """The first force that has a twin, and the others, which are left to torch."""
+    """The first force that has a twin, and the others, which run in torch."""
     for k, force in enumerate(forces):
         if force.has_twin:
             return force, (*forces[:k], *forces[k + 1 :])

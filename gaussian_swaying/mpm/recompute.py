@@ -1,4 +1,4 @@
-"""Gradients through long rollouts in the memory of a short one."""
+"""Gradients through long rollouts with the memory of a short one."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def leaves_of(state: MPMState) -> list[Tensor]:
 
 
 def recompute(advance: Advance, state: MPMState) -> MPMState:
-    """Advance a state without keeping what the gradient needs: the backward pass computes it again.
+    """Advance a state without keeping what the gradient needs: the backward pass recomputes it.
 
-    ``torch.utils.checkpoint`` keeps the graph and forgets only its tensors, and the graph of thousands of substeps is
-    large. Here nothing is left but the state and one node. The tensors beside the state that ``advance`` depends on are
-    found by walking the graph of its first run, which is dropped.
+    ``torch.utils.checkpoint`` keeps the graph and frees only its tensors, but the graph of thousands of substeps is
+    large. Here only the state and one node are kept. The other tensors that ``advance`` depends on are found by walking
+    the graph of its first run, which is then dropped.
 
     Args:
         advance: Computes the later state; must give the same result each time.
@@ -61,7 +61,7 @@ def recompute(advance: Advance, state: MPMState) -> MPMState:
 
 
 def _flatten(state: MPMState) -> tuple[Layout, list[Tensor]]:
-    """The different tensors of a state (F_total may be F_elastic), and where each field finds its own or its value."""
+    """The distinct tensors of a state (F_total may be F_elastic), and for each field its index or its value."""
     values = {f.name: getattr(state, f.name) for f in dataclasses.fields(MPMState)}
     unique = {id(v): v for v in values.values() if isinstance(v, Tensor)}
     place = {key: k for k, key in enumerate(unique)}
@@ -101,7 +101,7 @@ class _Recompute(torch.autograd.Function):
         wanted = [k for k, t in enumerate(inputs) if t.requires_grad]
         found: list[Tensor | None] = [None] * len(inputs)
         if pairs and wanted:
-            # retained: what lies between the leaves and the material is shared by all segments
+            # retained: all segments share the graph between the leaves and the material
             gradients = torch.autograd.grad(
                 [o for o, _ in pairs],
                 [inputs[k] for k in wanted],

@@ -35,31 +35,31 @@ class MPMSolver(nn.Module):
     """Material point method in two formulations over one set of transfers.
 
     ``total`` (total Lagrangian MPM; de Vaucorbeil, Nguyen & Hutchinson 2020): stencils at the rest positions, computed
-    once; nodal displacement and velocity are the state. For elastic things that keep their neighbours: flags, leaves,
-    cords. It cannot tear, and has no transfer dissipation.
+    once; nodal displacement and velocity are the state. Use it for elastic objects whose particles keep their
+    neighbours: flags, leaves, cords. It cannot model tearing and has no transfer dissipation.
 
     ``updated`` (the paper and PhysGaussian): stencils at the current positions, momentum on the particles (APIC, Jiang
-    et al. 2015). For material that flows, mixes or touches itself; plastic laws and fluids need it. A soft sheet tears
-    numerically once local stretch times particle spacing nears two cells.
+    et al. 2015). Use it for material that flows, mixes or touches itself; plastic laws and fluids need it. A soft sheet
+    tears numerically once local stretch times particle spacing approaches two cells.
 
     Args:
         dx: Grid spacing [m].
         formulation: ``total`` or ``updated``.
         gravity: Acceleration [m/s²], z up.
         damping: Rate at which velocities decay [1/s]; 0 for none.
-        stiffness_damping: Time [s] by which the stress looks ahead: damps a vibration of circular frequency omega with
-            the ratio stiffness_damping * omega / 2, and rigid motion not at all; it shortens the stable substep.
+        stiffness_damping: Time constant of the stiffness damping [s]. A vibration of circular frequency omega is damped
+            with the ratio stiffness_damping * omega / 2; rigid motion is not damped. It shortens the stable substep.
         cfl: Courant number of the adaptive substep, ``dt = cfl dx / (c + |v|)``; up to 0.47 is stable near rest for any
             arrangement of particles and any Poisson's ratio.
         substep: Fixed substep [s] instead of the adaptive one; checked against the stable one.
-        max_nodes: Largest grid [nodes]; an object that spreads beyond it is reported instead of eating the memory.
+        max_nodes: Largest grid [nodes]; a larger grid raises an error instead of filling the memory.
         mls: Stress term and update of F as in MLS-MPM (Hu et al. 2018); only in ``updated``.
-        deterministic: On a GPU, sum in a fixed order, so that the same run gives the same bits; slower. On a CPU it is
-            so anyway. Gradients on a GPU are not covered.
+        deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
+            order is always fixed. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order, impulses first.
-        transfer: How substeps are computed. ``torch`` is the definition, on any device and with gradients; ``triton``
-            has a whole substep in two kernels on a CUDA device, in float32 and without gradients; ``auto`` takes
-            triton where it can.
+        transfer: How substeps are computed. ``torch`` is the reference and works on any device and with gradients;
+            ``triton`` runs a whole substep in two kernels on a CUDA device, in float32 and without gradients; ``auto``
+            uses triton where possible.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -108,13 +108,13 @@ class MPMSolver(nn.Module):
         self.formulation, self.cfl, self.substep, self.transfer = formulation, float(cfl), substep, transfer
         FORMULATIONS[formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
-        # the same in metres; in a tuple, as these copies are no part of the module's state
+        # the same in metres; in a tuple, because these copies do not belong to the module's state
         self._framed: tuple[Boundary, ...] | None = None
         self._bound: Formulation | None = None
         self._fused: Fused | None = None
         self._fused_obstacle: str | None = None
 
-    # ---- what was given
+    # ---- settings
 
     @property
     def dx(self) -> float:
@@ -133,7 +133,7 @@ class MPMSolver(nn.Module):
 
     @property
     def stiffness_damping(self) -> float:
-        """Time by which the stress looks ahead [s]."""
+        """Time constant of the stiffness damping [s]."""
         return self.settings.stiffness_damping
 
     @property
@@ -143,7 +143,7 @@ class MPMSolver(nn.Module):
 
     @property
     def mls(self) -> bool:
-        """Whether stress term and update of F are those of MLS-MPM."""
+        """Whether the stress term and the update of F are those of MLS-MPM."""
         return self.settings.mls
 
     @property
@@ -153,7 +153,7 @@ class MPMSolver(nn.Module):
 
     @property
     def neighbours_fixed(self) -> bool:
-        """Whether particles keep the neighbours that they have at rest: they cannot tear, flow or leave the grid."""
+        """Whether particles keep their neighbours from the rest state: they cannot tear, flow or leave the grid."""
         return FORMULATIONS[self.formulation].neighbours_fixed
 
     # ---- the object at rest
@@ -184,7 +184,7 @@ class MPMSolver(nn.Module):
         return self
 
     def _bind(self, points: MaterialPoints) -> None:
-        """Take the material and compute what never changes."""
+        """Bind the material and compute everything that stays constant."""
         conditions = _conditions(self.boundaries) if self._framed is None else self._framed
         self._bound = self._fused = None
         bound = FORMULATIONS[self.formulation](Body(points, conditions), self.settings)
@@ -192,7 +192,7 @@ class MPMSolver(nn.Module):
         self._bound = bound
 
     def _why_not_fused(self, bound: Formulation) -> str | None:
-        """Why the Triton kernels cannot be used, whatever the state; None if they can."""
+        """Why the Triton kernels cannot be used with this material; None if they can."""
         if self.transfer == "torch":
             return "`transfer` is torch"
         try:
@@ -204,17 +204,17 @@ class MPMSolver(nn.Module):
             if twin is not None:
                 obstacle = twin.unsupported(bound, interpret=self.transfer == "triton")
         if self.transfer == "triton" and obstacle is not None:
-            raise ValueError(f"`transfer: triton` cannot be used, as {obstacle}: set it to auto or torch.")
+            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
         return obstacle
 
     def fused(self, *tensors: Tensor | None) -> Fused | None:
-        """The Triton substep of this material; None where the torch one is to be used.
+        """The Triton substep of this material; None if the torch substep is used.
 
         Args:
-            tensors: What the substep starts from; if one asks for a gradient, the torch substep is used.
+            tensors: Inputs of the substep; if one of them requires a gradient, the torch substep is used.
 
         Raises:
-            ValueError: If ``transfer`` is triton and a gradient is asked for.
+            ValueError: If ``transfer`` is triton and a gradient is required.
         """
         if self._fused_obstacle is not None:
             return None
@@ -227,13 +227,13 @@ class MPMSolver(nn.Module):
         if self._fused is None or not self._fused.holds():
             twin = bound.twin()
             assert twin is not None
-            # ordinary tensors, which may be written within inference mode and without
+            # ordinary tensors, which can be written inside and outside inference mode
             with torch.inference_mode(False), torch.no_grad():
                 self._fused = twin(bound)
         return self._fused
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
-        """As :meth:`fused`, for rollouts in some forces; None too if one of them has to be asked in every substep."""
+        """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
         if not all(force.recordable for force in divide(forces)[1]):
             return None
         asking = [*state.tensors(), *tensors_of(forces)] if torch.is_grad_enabled() else []
@@ -252,15 +252,15 @@ class MPMSolver(nn.Module):
             points: The material, shapes (..., P, ·).
             velocity: Initial velocity [m/s], shape (..., P, 3); zero if None.
             margin: Cells around the object in the first grid of the ``updated`` formulation.
-            frame: The frame from scene units to metres in which the boundaries are given; None if they are in metres.
+            frame: Transform from scene units to metres, for boundaries in scene units; None if they are in metres.
 
         Returns:
-            The state, on the device and with the type of ``points``.
+            The state, with the device and dtype of ``points``.
 
         Raises:
             TypeError: If ``points`` is not a MaterialPoints.
-            ValueError: If a pin holds nothing, the grid is too large, ``velocity`` has another shape, or a plastic law
-                or a fluid meets the ``total`` formulation.
+            ValueError: If a pin holds nothing, the grid is too large, ``velocity`` has the wrong shape, or a plastic
+                law or a fluid is used with the ``total`` formulation.
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
@@ -268,7 +268,7 @@ class MPMSolver(nn.Module):
         if frame is not None:
             self._framed = tuple(b.in_frame(frame) for b in _conditions(self.boundaries))
         self._bound = None
-        self.to(points.position.device)  # the solver goes where its material is
+        self.to(points.position.device)  # the solver moves to the device of its material
         self._bind(points)
         if velocity is None:
             velocity = torch.zeros_like(points.position)
@@ -285,7 +285,7 @@ class MPMSolver(nn.Module):
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
 
         Raises:
-            ValueError: If the fixed substep is longer than the stable one, which the message gives.
+            ValueError: If the fixed substep is longer than the stable one; the message gives the limit.
         """
         if self.substep is not None:
             limit = self.stable_substep(state)
@@ -300,14 +300,14 @@ class MPMSolver(nn.Module):
         return substeps_per_frame(frame_dt, damped_substep(longest, self.bound.viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
-        """Largest Courant number ``dt (c + |v|) / dx`` of a substep; in ``total`` without v, as stencils rest.
+        """Largest Courant number ``dt (c + |v|) / dx`` of a substep; in ``total`` without v, as stencils do not move.
 
-        With stiffness damping it is that of the undamped substep which is as stable.
+        With stiffness damping it is the number of the undamped substep that is equally stable.
         """
         return math.sqrt(dt * dt + 2 * self.bound.viscous_time(state) * dt) * self._cells_per_second(state)
 
     def _cells_per_second(self, state: MPMState) -> Tensor:
-        """How many cells the fastest wave crosses in a second, in a kernel where there is one."""
+        """How many cells the fastest wave crosses per second; computed in a kernel if there is one."""
         if self._fused_obstacle is None:
             from gaussian_swaying.mpm.triton.measures import largest_speed
 
@@ -317,12 +317,13 @@ class MPMSolver(nn.Module):
         return self.bound.cells_per_second(state)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
-        """Move and resize the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
+        """Fit the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
 
         Args:
             state: The state now.
-            horizon: Time that the grid has to serve [s]; reckoned with twice the present speeds, and gravity.
-            margin: Further cells on each side, for what the wind and the boundaries may do.
+            horizon: Time for which the grid must be large enough [s]; estimated from twice the current speeds and
+                gravity.
+            margin: Extra cells on each side, for motion caused by the wind and the boundaries.
 
         Returns:
             The state with its new grid.
@@ -343,17 +344,17 @@ class MPMSolver(nn.Module):
     ) -> MPMState:
         """Advance by one substep of symplectic Euler; no host synchronisation, no data-dependent shapes.
 
-        Where the substep changes, forces act for the mean of the old and the new one: the velocities stand half a
-        substep beside the positions, and the full new one would jolt them (an error of first order, and energy). A
-        substep that shrinks to less than a third is the exception: forces then act for twice the new one.
+        When the substep changes, forces act for the mean of the old and the new one: velocities are half a substep away
+        from the positions, and the full new substep would cause a first-order error and change the energy. If the
+        substep shrinks to less than a third, forces act for twice the new one instead.
 
         Args:
             state: The state now.
             dt: Substep [s].
-            forces: What pushes the particles, see :meth:`rollout`.
-            force: A force on each particle that is known already [N], shape (..., P, 3); it is added to ``forces``.
-            drag: By how much that force falls per velocity gained in the substep [kg/s], shape (..., P); a drag that is
-                taken so is stable however light the particle (see ``AeroForce.resistance``).
+            forces: Forces on the particles, see :meth:`rollout`.
+            force: A force on each particle that is already known [N], shape (..., P, 3); it is added to ``forces``.
+            drag: How much that force decreases per unit of velocity gained in the substep [kg/s], shape (..., P); drag
+                that is passed this way is stable for particles of any mass (see ``AeroForce.resistance``).
 
         Returns:
             The state ``dt`` later.
@@ -370,7 +371,7 @@ class MPMSolver(nn.Module):
         return self._step(state, dt, force, drag)
 
     def _step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
-        """One substep with a force and a drag that are known."""
+        """One substep with a given force and drag."""
         fused = self.fused(*state.tensors(), force, drag)
         if fused is not None:
             return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
@@ -381,7 +382,7 @@ class MPMSolver(nn.Module):
     def _work(self, state: MPMState, after: MPMState, dt: float, force: Tensor, drag: Tensor | None) -> Tensor:
         """Work of the external force up to the end of a substep [J].
 
-        It is counted at the mean velocity: exactly what the step adds to the kinetic energy.
+        It is computed at the mean velocity, which gives exactly what the step adds to the kinetic energy.
         """
         if drag is not None:
             force = force - drag[..., None] * (after.velocity - state.velocity)
@@ -399,21 +400,23 @@ class MPMSolver(nn.Module):
     ) -> MPMState:
         """Advance by several substeps.
 
-        With the Triton kernels the substeps are replayed from CUDA graphs, and with them the forces: the first that
-        has a Triton twin within the kernels, the others in torch. If one of these is not ``recordable``, as functions
-        are not, the host goes from substep to substep and asks them all.
+        With the Triton kernels, substeps and forces are replayed from CUDA graphs: the first force that has a Triton
+        twin runs inside the kernels, the others run in torch. If one of these others is not ``recordable`` (plain
+        functions are not), the host runs the substeps one by one and calls every force.
 
         Args:
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            forces: What pushes the particles, one or several that add up: each a ``Force``, such as ``WindForce``, or a
-                function of the state that gives the force [N], shape (..., P, 3), or the force and its resistance
-                [kg/s], shape (..., P) (``drag`` in :meth:`step`).
-            checkpoint: For gradients through long rollouts: keep only every so many states and compute the others again
-                in the backward pass; about the square root of ``steps`` needs the least memory. 0 keeps everything.
-                The forces must then be the same each time they see the same state.
-            watch: Told now and then how many substeps are done, or under way on a GPU; not with ``checkpoint``.
+            forces: Forces on the particles, one or several that are summed: each is a ``Force``, such as ``WindForce``,
+                or a function of the state that returns the force [N], shape (..., P, 3), or the force and its
+                resistance [kg/s], shape (..., P) (``drag`` in :meth:`step`).
+            checkpoint: For gradients through long rollouts: keep one state per this many substeps and recompute the
+                others in the backward pass; a value near the square root of ``steps`` needs the least memory. 0 keeps
+                everything. With checkpoints, forces must return the same values each time they are called with the same
+                state.
+            watch: Called from time to time with the number of substeps that are done, or queued on a GPU; not with
+                ``checkpoint``.
 
         Returns:
             The state ``steps * dt`` later.
@@ -451,14 +454,14 @@ class MPMSolver(nn.Module):
         looks: int = 8,
         watch: WatchFunction | None = None,
     ) -> tuple[MPMState, Tensor]:
-        """Advance by several substeps and look at the Courant number on the way, as material may stiffen and slacken.
+        """Advance by several substeps and check the Courant number on the way, as material may stiffen or soften.
 
         Args:
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
             forces: As in :meth:`rollout`.
-            looks: How often to look, evenly, the last time at the end.
+            looks: Number of checks, evenly spaced; the last one is at the end.
             watch: As in :meth:`rollout`.
 
         Returns:

@@ -1,4 +1,4 @@
-"""What the solver is given (material points, grid) and what it moves (state)."""
+"""The inputs of the solver (material points, grid) and the state that it advances."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 class GridSpec:
     """A box of grid nodes on the world lattice: node (i, j, k) lies at ``(offset + (i, j, k)) * dx``.
 
-    Because every box lies on one lattice, a grid that follows the object does not change the physics.
+    All boxes lie on the same lattice, so a grid that follows the object does not change the physics.
 
     Attributes:
         dx: Grid spacing [m].
@@ -46,13 +46,13 @@ class GridSpec:
         return self.dx == other.dx and all(inside)
 
     def with_room(self, before: GridSpec) -> GridSpec:
-        """A larger grid that will serve for longer, where the nodes of this one are needed now.
+        """A larger grid that contains this one and can be used for longer.
 
-        There are four more cells on each side, and an eighth of the length where ``before`` did not reach far enough:
-        what goes on growing or flying that way needs a new grid the more rarely, the larger it is.
+        It has four more cells on each side, or an eighth of the length (if that is more) on sides where ``before`` was
+        too small. An object that keeps growing or moving in that direction then needs new grids less and less often.
 
         Args:
-            before: The grid so far.
+            before: The previous grid.
         """
         offset, resolution = [], []
         for a, n, b, m in zip(self.offset, self.resolution, before.offset, before.resolution, strict=True):
@@ -77,12 +77,12 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
         low: Smallest coordinates of the points [m], shape (3,).
         high: Largest coordinates of the points [m], shape (3,).
         dx: Grid spacing [m].
-        margin: Further cells on each side.
+        margin: Extra cells on each side.
 
     Returns:
         The grid.
     """
-    # numbers of Python, which do not overflow
+    # Python integers, which do not overflow
     first = [math.floor(x) - margin for x in (low.double() / dx - 0.5).tolist()]
     last = [math.floor(x) + 2 + margin for x in (high.double() / dx - 0.5).tolist()]
     size = [b - a + 1 for a, b in zip(first, last, strict=True)]
@@ -95,9 +95,9 @@ _FIELDS = ("mass", "volume", "youngs_modulus", "poisson_ratio")
 
 @dataclass(frozen=True, slots=True)
 class MaterialPoints:
-    """The material at rest: what the solver moves, and never changes itself.
+    """The material at rest, which the solver moves but never changes.
 
-    Leading batch dimensions stand for independent scenes. Use :meth:`create` to build one from scalars.
+    Leading batch dimensions are independent scenes. Use :meth:`create` to build one from scalars.
 
     Attributes:
         position: Rest position [m], shape (..., P, 3).
@@ -106,7 +106,7 @@ class MaterialPoints:
         youngs_modulus: Young's modulus E [Pa], shape (..., P).
         poisson_ratio: Poisson's ratio nu, shape (..., P).
         laws: The constitutive laws of the run.
-        law_index: Which of ``laws`` holds for each particle, int64, shape (..., P); None if there is only one.
+        law_index: Which of ``laws`` applies to each particle, int64, shape (..., P); None if there is only one.
     """
 
     position: Tensor
@@ -128,9 +128,9 @@ class MaterialPoints:
         check_finite("position", self.position)
         if (self.law_index is None) != (len(self.laws) == 1):
             raise ValueError(
-                f"Expected `law_index` to say which of the {len(self.laws)} `laws` holds for each particle."
+                f"Expected `law_index` to say which of the {len(self.laws)} `laws` applies to each particle."
                 if self.law_index is None
-                else f"Expected several `laws` beside `law_index`, but got {len(self.laws)}."
+                else f"Expected several `laws` with `law_index`, but got {len(self.laws)}."
             )
 
     @classmethod
@@ -145,7 +145,7 @@ class MaterialPoints:
         law: ConstitutiveLaw | Sequence[ConstitutiveLaw] | None = None,
         law_index: Tensor | None = None,
     ) -> MaterialPoints:
-        """Build the points from per-point tensors or numbers that hold for all of them.
+        """Build the points from per-point tensors or from numbers that apply to all points.
 
         Args:
             position: Rest position [m], shape (..., P, 3).
@@ -154,7 +154,7 @@ class MaterialPoints:
             youngs_modulus: Young's modulus [Pa].
             poisson_ratio: Poisson's ratio, in (-1, 0.5).
             law: Constitutive law, or several; fixed corotated elasticity if None.
-            law_index: With several laws, which of them holds for each particle, int64, shape (..., P).
+            law_index: With several laws, which of them applies to each particle, int64, shape (..., P).
 
         Returns:
             The points, every field expanded to shape (..., P).
@@ -186,12 +186,12 @@ class MaterialPoints:
         if law_index is not None:
             law_index = law_index.to(position.device, torch.long).expand(position.shape[:-1])
             if not bool(((law_index >= 0) & (law_index < len(laws))).all()):
-                raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the number of `law`s less one.")
+                raise ValueError(f"Expected `law_index` to lie in 0 to {len(laws) - 1}, the last index of `laws`.")
         return cls(position, rho * v, v, e, nu, laws, law_index)
 
     @classmethod
     def join(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
-        """Several bodies as one: the points of all, one after the other, each with its own law."""
+        """Join several bodies into one: their points one after the other, each with its own law."""
         laws: list[ConstitutiveLaw] = []
         index = []
         for part in parts:
@@ -209,7 +209,7 @@ class MaterialPoints:
         return self.position.shape[-2]
 
     def map(self, function: Callable[[Tensor], Tensor]) -> MaterialPoints:
-        """Apply a function to every tensor (``.detach``, indexing); the law of each particle stays an integer."""
+        """Apply a function to every tensor (``.detach``, indexing); law indices stay integers."""
         moved = {name: function(getattr(self, name)) for name in ("position", *_FIELDS)}
         index = None if self.law_index is None else function(self.law_index).long()
         return MaterialPoints(**moved, laws=self.laws, law_index=index)
@@ -217,10 +217,10 @@ class MaterialPoints:
 
 @dataclass(frozen=True, slots=True)
 class MPMState:
-    """Everything that varies. ``step`` takes one and returns a new one; nothing is changed in place.
+    """Everything that changes in a run. ``step`` takes a state and returns a new one; nothing is changed in place.
 
-    In the ``total`` formulation the nodal fields are the state and the particle fields are read from them; in the
-    ``updated`` formulation the nodal fields are None.
+    In the ``total`` formulation the nodal fields are the state and the particle fields are interpolated from them; in
+    the ``updated`` formulation the nodal fields are None.
 
     Attributes:
         position: Particle position [m], shape (..., P, 3).
@@ -236,7 +236,7 @@ class MPMState:
         node_velocity: Nodal velocity [m/s], shape (..., G, 3), or None.
         internal: The internal variable of each particle's plastic law (see its class), shape (..., P), or None if no
             law has one.
-        substep: Length of the substep that led here [s]; 0 at the start.
+        substep: Length of the last substep [s]; 0 at the start.
         work: Work of the external forces since the start [J], shape (...) over the batch, float64.
     """
 
@@ -259,7 +259,7 @@ class MPMState:
         return dataclasses.replace(self, **changes)
 
     def tensors(self) -> list[Tensor]:
-        """The fields that may ask for a gradient."""
+        """The fields that may require a gradient."""
         fields = [self.position, self.velocity, self.affine, self.F_elastic, self.F_total, self.internal]
         return [t for t in (*fields, self.node_displacement, self.node_velocity) if t is not None]
 

@@ -1,4 +1,4 @@
-r"""The substep: how long it may be, and how many make a frame.
+r"""The substep: how long it may be, and how many fit in a frame.
 
 For quadratic B-splines the sum :math:`\sum_i \nabla w_i \nabla w_i^T / w_i` of one particle is diagonal with entries
 between 4 and 6 over :math:`\Delta x^2`. With lumped masses this bounds the highest frequency of any arrangement of
@@ -34,7 +34,7 @@ def wave_speed(
         F: Elastic deformation gradient, shape (..., P, 3, 3); None for the rest state.
         internal: Internal variable of the law, shape (..., P), if any has one.
         spatial: Also account for the stretch of space (``updated`` formulation: waves cross a stretched cell sooner).
-        laws: The laws of ``points``, if they are at hand.
+        laws: The laws of ``points``, if already available.
 
     Returns:
         Shape (..., P).
@@ -58,7 +58,7 @@ def stable_limit(
     spatial: bool = False,
     laws: LawDispatch | None = None,
 ) -> Tensor:
-    r"""Longest substep [s] that is stable for every arrangement of particles (see the head of this file).
+    r"""Longest substep [s] that is stable for every arrangement of particles (see the module docstring).
 
     Args:
         points: Material, shapes (..., P).
@@ -67,7 +67,7 @@ def stable_limit(
             :math:`K = 2 \mu + 3 \lambda`.
         internal: Internal variable of the law, shape (..., P), if any has one.
         spatial: As in :func:`wave_speed`.
-        laws: The laws of ``points``, if they are at hand.
+        laws: The laws of ``points``, if already available.
 
     Returns:
         Shape (..., P).
@@ -107,7 +107,7 @@ def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
 
 
 def kick_time(state: MPMState, dt: float) -> float:
-    """How long forces act in a substep of ``dt`` [s] from a state on; see ``MPMSolver.step``."""
+    """How long forces act in a substep of ``dt`` [s] that starts at a state; see ``MPMSolver.step``."""
     return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
 

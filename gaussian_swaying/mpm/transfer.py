@@ -1,10 +1,10 @@
 r"""Particle-grid transfers with quadratic B-splines as batched gather and scatter.
 
-Both formulations of the solver go through :func:`scatter` and :func:`gather`; they differ only in the positions at
-which :func:`bspline_stencil` was built. This is the definition, on any device and differentiable.
+Both formulations of the solver use :func:`scatter` and :func:`gather`; they differ only in the positions for which
+:func:`bspline_stencil` was called. This is the reference implementation: it works on any device and is differentiable.
 
-A weight is a product of three, one for each axis, and so is what takes its place in a gradient or a moment. The sums
-over the 27 nodes are therefore taken axis by axis, in three layers of nine nodes with the same x.
+A weight is a product of three factors, one for each axis, and so are the terms of a gradient or a moment. The sums over
+the 27 nodes are therefore taken axis by axis, in three layers of nine nodes with the same x.
 """
 
 import math
@@ -27,14 +27,14 @@ class Stencil:
 
     Attributes:
         first: Flat index, over all scenes of the batch, of the lowest of the nodes, shape (N,), N particles in all.
-        shift: What to add to it for the 27 nodes, shape (3, 3, 3), x first.
-        factors: Along each axis and at each of its three nodes the weight, then as asked for the derivative of the
-            weight and ``w (x_i - x_p)``, shape (1 to 3, 3 axes, 3 nodes, N).
+        shift: Offsets from it to the 27 nodes, shape (3, 3, 3), x first.
+        factors: For each axis and each of its three nodes: the weight, then, if requested, the derivative of the weight
+            and ``w (x_i - x_p)``, shape (1 to 3, 3 axes, 3 nodes, N).
         inside: Particles whose 27 nodes all lie in the grid, shape (..., P). The others have no weight.
         batch: Leading batch shape.
         node_count: Nodes G of one scene.
-        order: Order of the entries of the three layers, joined, that sorts them, for sums that are the same in every
-            run, or None.
+        order: Permutation that sorts the joined entries of the three layers, for sums that are the same in every run,
+            or None.
         start: Where the entries of each node begin in that order, shape (all nodes + 1,), or None.
         matrices: ``basis`` as a sparse matrix from all nodes to the rows of all particles, and its transpose, for a
             stencil that is used many times, or None.
@@ -51,7 +51,7 @@ class Stencil:
     matrices: tuple[Tensor, Tensor] | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Stencil":
-        """Itself: nothing writes to a stencil, and PyTorch cannot copy a sparse matrix so."""
+        """Return itself: a stencil is never modified, and PyTorch cannot deep-copy a sparse matrix."""
         return self
 
     def layer(self, i: int) -> Tensor:
@@ -60,7 +60,7 @@ class Stencil:
 
     @property
     def rows(self) -> int:
-        """Rows of ``basis``: ``w``, then as asked for ``dw/dx, dw/dy, dw/dz`` and ``w (x_i - x_p)`` (3 rows)."""
+        """Rows of ``basis``: ``w``, then, if requested, ``dw/dx, dw/dy, dw/dz`` and ``w (x_i - x_p)`` (3 rows)."""
         return 3 * len(self.factors) - 2
 
     @property
@@ -70,7 +70,7 @@ class Stencil:
 
     @property
     def basis(self) -> Tensor:
-        """The products of the factors, shape (N, rows, 27); no transfer forms them."""
+        """The products of the factors, shape (N, rows, 27); transfers never compute them."""
         products = []
         for q, axis in [(0, 0), *((q, axis) for q in range(1, len(self.factors)) for axis in range(3))]:
             x, y, z = (self.factors[q if axis == other else 0, other] for other in range(3))
@@ -89,19 +89,20 @@ def bspline_stencil(
 ) -> Stencil:
     r"""Quadratic B-spline weights and their gradients (Jiang et al. 2016, "The material point method", eq. 123).
 
-    A particle whose support reaches out of the grid, or whose position is NaN or infinite, is never wrapped to the far
-    side: its weights are zero and ``inside`` says so.
+    A particle whose support reaches beyond the grid, or whose position is NaN or infinite, is never wrapped to the far
+    side: its weights are zero and ``inside`` is False.
 
     Args:
         position: Particle position [m], shape (..., P, 3).
         grid: The nodes.
         moments: Also keep ``w (x_i - x_p)``, which APIC needs.
         snap: A particle within ``snap * dx`` of a plane where a weight vanishes is moved onto it for this stencil, so
-            that no node hangs by a vanishing mass alone.
-        gradients: Also keep the gradients of the weights; MLS-MPM does without.
-        deterministic: Also sort the nodes, so that sums over particles take the same order in every run on a GPU.
+            that no node is left with only a vanishing mass.
+        gradients: Also keep the gradients of the weights; MLS-MPM does not need them.
+        deterministic: Also sort the nodes, so that sums over particles have the same order in every run on a GPU.
         fixed: The stencil will be used many times: on a CPU, and without a gradient in ``position``, also keep
-            ``matrices``: 432 bytes for each row of each particle in float32, and transfers of a third of the time.
+            ``matrices``. They take 432 bytes for each row of each particle in float32, and transfers then take a third
+            of the time.
 
     Returns:
         The support of each particle.
@@ -122,7 +123,7 @@ def bspline_stencil(
     f = lattice - base
     offset, limit, strides, shift = _grid_constants(grid, position.device)
     low = base.long() - offset
-    inside = ((low >= 0) & (low <= limit) & (f < 2)).all(0)  # NaN becomes any integer, and is not below anything
+    inside = ((low >= 0) & (low <= limit) & (f < 2)).all(0)  # NaN becomes an arbitrary integer; NaN < 2 is False
     f = torch.where(inside, f, 1.0)
     if snap > 0:
         f = torch.where(f - 0.5 < snap, 0.5, torch.where(1.5 - f < snap, 1.5, f))
@@ -150,20 +151,20 @@ def bspline_stencil(
 
 
 def _borders(ranked: Tensor, count: int) -> Tensor:
-    """Where each of ``count`` nodes begins among sorted ones, and their end; shape (count + 1,)."""
+    """Where each of ``count`` nodes begins in a sorted list, and the end of the list; shape (count + 1,)."""
     return torch.searchsorted(ranked, torch.arange(count + 1, device=ranked.device))
 
 
 def _sparse_products(factors: Tensor) -> bool:
-    """Whether the library's sparse products may serve: fast with indices of 32 bits, and constant in the gradient."""
-    few = 9 * factors.numel() < 2**31  # more than the entries
+    """Whether MKL's sparse products can be used: fast with 32-bit indices, and without a gradient of the matrix."""
+    few = 9 * factors.numel() < 2**31  # upper bound on the number of entries
     return factors.device.type == "cpu" and few and not factors.requires_grad and torch.backends.mkl.is_available()
 
 
 def _matrices(stencil: Stencil) -> tuple[Tensor, Tensor]:
     """See ``Stencil.matrices``."""
     rows, nodes = stencil.rows, math.prod(stencil.batch) * stencil.node_count
-    basis = stencil.basis.mT.reshape(-1, rows)  # an entry of ``node`` in a row
+    basis = stencil.basis.mT.reshape(-1, rows)  # one row per entry of ``node``
     ranked, order = torch.sort(stencil.node, stable=True)
     lines = len(stencil.first) * rows
     column = stencil.node.reshape(-1, 1, 27).expand(-1, rows, 27)
@@ -269,7 +270,7 @@ def gather(field: Tensor, stencil: Stencil) -> Tensor:
 
 
 def _products(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Tensor:
-    """Sum of products over the first dimension, one after the other: no product is kept."""
+    """Sum of products over the first dimension, added one by one, so that no product is stored."""
     total = a[0] * b[0]
     for k in range(1, len(a)):
         total = torch.addcmul(total, a[k], b[k])
@@ -277,7 +278,7 @@ def _products(a: Sequence[Tensor] | Tensor, b: Sequence[Tensor] | Tensor) -> Ten
 
 
 class _Product(torch.autograd.Function):
-    """Product of a constant sparse matrix, whose transpose is at hand, with a dense one."""
+    """Product of a constant sparse matrix, whose transpose is given, with a dense one."""
 
     @staticmethod
     def forward(ctx: Any, matrix: Tensor, transpose: Tensor, dense: Tensor) -> Tensor:
@@ -311,8 +312,8 @@ def scatter_momentum(
         impulse: External impulse [N s], shape (..., P, 3), or None.
         stress_impulse: Stress times rest volume times time [N m s], shape (..., P, 3, 3), or None.
         stencil: Support of each particle, with moments.
-        mls_scale: 4 / dx² [1/m²] for the stress term of MLS-MPM (Hu et al. 2018), which puts
-            :math:`w_{ip} (x_i - x_p)\, 4 / \Delta x^2` in the place of :math:`\nabla w_{ip}`; the stencil then needs no
+        mls_scale: 4 / dx² [1/m²] for the stress term of MLS-MPM (Hu et al. 2018), which uses
+            :math:`w_{ip} (x_i - x_p)\, 4 / \Delta x^2` instead of :math:`\nabla w_{ip}`; the stencil then needs no
             gradients. None for the gradient itself.
 
     Returns:
@@ -343,9 +344,8 @@ def scatter_momentum(
 def g2p(node_velocity: Tensor, stencil: Stencil, dx: float) -> tuple[Tensor, Tensor, Tensor]:
     r"""Gather velocity, affine velocity and velocity gradient from the grid.
 
-    :math:`C_p = \frac{4}{\Delta x^2} \sum_i w_{ip} v_i (x_i - x_p)^T` is the paper's
-    :math:`12 / (\Delta x^2 (b + 1))` for the degree b = 2. Where the stencil has no gradients, C_p is the velocity
-    gradient too (MLS-MPM).
+    :math:`C_p = \frac{4}{\Delta x^2} \sum_i w_{ip} v_i (x_i - x_p)^T` is the paper's :math:`12 / (\Delta x^2 (b + 1))`
+    for the degree b = 2. Where the stencil has no gradients, C_p is also the velocity gradient (MLS-MPM).
 
     Args:
         node_velocity: Node velocity [m/s], shape (..., G, 3).

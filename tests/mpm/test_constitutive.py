@@ -64,7 +64,7 @@ def test_crushed_and_inverted_elements_stay_finite():
 
 
 def test_inverted_element_is_pushed_back():
-    """Without the volume term too: a reflection costs energy, and the stress drives its flipped axis towards J > 0."""
+    """Also without the volume term: a reflection costs energy, and the stress drives its flipped axis towards J > 0."""
     F = torch.diag(torch.tensor([1.2, 1.1, -0.6], dtype=torch.float64))
     mu, lam = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
     stress = fixed_corotated_pk1(F, mu, lam)
@@ -96,7 +96,7 @@ def _call(function, F, name, mu=MU, lam=LAM):
 
 
 def _wide(count=60):
-    """Mild, strong and inverted deformation, clear of the jump where two stretches are opposite."""
+    """Mild, strong and inverted deformation, away from the jump where two stretches are opposite."""
     F = torch.cat([_gradients(count, spread) for spread in (0.02, 0.25, 0.6)])
     a = torch.linalg.svdvals(F)
     F = F[(a[:, 1] > 1.1 * a[:, 2]) & (a[:, 2] > 0.01)]
@@ -111,7 +111,7 @@ def _rotations(count):
 
 @pytest.mark.parametrize("name", list(LAWS))
 def test_every_stress_is_the_derivative_of_its_energy(name):
-    """Inverted elements included. Both sides are analytic: round-off times the condition number is left."""
+    """Inverted elements included. Both sides are analytic: only round-off times the condition number remains."""
     energy, pk1, _ = LAWS[name]
     F = _wide().requires_grad_()
     (expected,) = torch.autograd.grad(_call(energy, F, name).sum(), F)
@@ -161,7 +161,7 @@ def test_every_law_is_hooke_for_small_strain(name):
 
 @pytest.mark.parametrize("name", list(LAWS))
 def test_stress_gradients(name):
-    """Against differences: at rest, at repeated stretches, turned, and inverted."""
+    """Against differences: at rest, at repeated stretches, rotated, and inverted."""
     stretches = [[1.0, 1, 1], [0.7, 0.7, 0.7], [1.2, 1.2, 0.8], [1.3, 1.0, 0.6], [1.3, 1.0, -0.6]]
     Q = _rotations(2 * len(stretches)).reshape(2, -1, 3, 3)
     F = Q[0] @ torch.tensor(stretches, dtype=torch.float64).diag_embed() @ Q[1]
@@ -240,7 +240,7 @@ def test_uniaxial_closed_forms():
 
 
 def test_a_network_is_a_mean_over_springs():
-    """For Cauchy's solid, in which nothing else is, against the mean over many directions; and a lattice's tension."""
+    """For Cauchy's solid, which has no other terms, against the mean over many directions; and a lattice's tension."""
     direction = torch.nn.functional.normalize(torch.randn(400_000, 3, dtype=torch.float64), dim=-1)
     F = torch.diag(torch.tensor([1.25, 0.9, 1.05], dtype=torch.float64))
     mean = ((direction @ F.mT).norm(dim=-1) - 1).square().mean()

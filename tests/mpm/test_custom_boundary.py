@@ -56,7 +56,7 @@ class SpeedLimit(Boundary):
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Runs a flag of twelve by eight Gaussians: the class paths of its boundaries as it kept them, and positions."""
+    """Runs a flag of twelve by eight Gaussians: the class paths of its boundaries as saved, and the positions."""
     (tmp_path / "user_boundaries.py").write_text(BOUNDARIES_OF_A_USER)
     monkeypatch.syspath_prepend(str(tmp_path))
 

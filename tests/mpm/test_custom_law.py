@@ -104,7 +104,7 @@ def saint(tmp_path, monkeypatch):
 
 
 def _run(folder, law):
-    """Two frames of a flag of twelve by eight Gaussians held at its left edge."""
+    """Two frames of a flag of twelve by eight Gaussians, held at its left edge."""
     pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
     changes = {
         "material": {"law": law},
@@ -137,7 +137,7 @@ def test_a_custom_law_runs_from_a_yaml(tmp_path, saint):
 @pytest.mark.parametrize("case", ["total", "updated", "beside sand"])
 def test_its_twin_runs_in_the_kernels(kernel_device, case, saint):
     if fused is None:
-        pytest.skip("needs triton, which there is for Linux only")
+        pytest.skip("needs triton, which is available on Linux only")
     if kernel_device == "interpreted" and not fused.INTERPRETED:
         pytest.skip("on this machine the kernels are compiled")
     device = "cuda" if kernel_device == "cuda" else "cpu"
@@ -163,7 +163,7 @@ def test_its_twin_runs_in_the_kernels(kernel_device, case, saint):
 
 def test_a_law_without_a_twin_runs_in_torch(saint):
     class Stiffer(saint):
-        """It may be anything, so it does not inherit the twin."""
+        """It may do anything, so it does not inherit the twin."""
 
     assert Stiffer.twin is None
     assert saint.twin == "saint_twin"

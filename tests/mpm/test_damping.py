@@ -1,4 +1,4 @@
-"""Stiffness damping: what it damps, how much, what it leaves alone, and how far it shortens the substep."""
+"""Stiffness damping: what it damps and how much, what it does not damp, and how much it shortens the substep."""
 
 import math
 
@@ -51,7 +51,7 @@ def test_stress_is_the_rate_of_the_saint_venant_kirchhoff_stress():
 
 
 def test_kirchhoff_stress_is_symmetric():
-    """Else the damping would take angular momentum."""
+    """Otherwise the damping would remove angular momentum."""
     F, rate, mu, lam = _random()
     kirchhoff = kelvin_voigt_pk1(F, rate, mu, lam, 0.3) @ F.mT
     torch.testing.assert_close(kirchhoff, kirchhoff.mT, rtol=0, atol=1e-13)
@@ -59,20 +59,20 @@ def test_kirchhoff_stress_is_symmetric():
 
 
 def test_power_is_never_positive():
-    """Damping takes energy: P : dF/dt is the dissipation, at least zero for any deformation."""
+    """Damping removes energy: P : dF/dt is the dissipation, at least zero for any deformation."""
     F, rate, mu, lam = _random(200)
     assert bool(((kelvin_voigt_pk1(F, rate, mu, lam, 1.0) * rate).sum((-1, -2)) >= 0).all())
 
 
 def test_rigid_rotation_rate_gives_no_stress():
-    """Of whatever has been deformed before."""
+    """Also after any earlier deformation."""
     F, _, mu, lam = _random()
     rate = _skew(torch.tensor([0.3, -2.0, 1.0])) @ F
     torch.testing.assert_close(kelvin_voigt_pk1(F, rate, mu, lam, 1.0), torch.zeros_like(F), rtol=0, atol=1e-13)
 
 
 def test_stress_turns_with_the_body():
-    """Objectivity: seen from a frame that turns, F' = Q F and F'' = Q (F' + W F), the stress is Q P."""
+    """Objectivity: in a rotating frame, F' = Q F and F'' = Q (F' + W F), the stress is Q P."""
     F, rate, mu, lam = _random()
     turn = torch.linalg.matrix_exp(_skew(torch.tensor([0.4, 0.7, -1.1])))
     spin = _skew(torch.tensor([5.0, -3.0, 2.0]))
@@ -136,7 +136,7 @@ def _ring(formulation, beta, dt=1e-3, steps=560):
     velocity = torch.zeros_like(points.position)
     velocity[:, 0] = 1e-3 * shape
     state = solver.init_state(points, velocity)
-    if formulation == "updated":  # the affine part of the field, else the first substep smooths it
+    if formulation == "updated":  # the affine part of the field, otherwise the first substep smooths it
         affine = torch.zeros_like(state.affine)
         affine[:, 0, 0] = -1e-3 * math.pi / 0.8 * torch.sin(math.pi * points.position[:, 0] / 0.8)
         state = state.replace(affine=affine)
@@ -161,7 +161,7 @@ def _peaks(amplitude):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_first_mode_of_a_bar_decays_with_its_damping_ratio(formulation):
-    """Amplitude ~ exp(-zeta omega t) with zeta = beta omega / 2, less what the formulation dissipates by itself."""
+    """Amplitude ~ exp(-zeta omega t) with zeta = beta omega / 2, without the dissipation of the formulation itself."""
     dt, ratio = 1e-3, 0.05
     times, free = _peaks(_ring(formulation, 0.0, dt))
     omega = math.pi * (len(times) - 1) / float(times[-1] - times[0]) / dt
@@ -180,7 +180,7 @@ def test_first_mode_of_a_bar_decays_with_its_damping_ratio(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_damping_in_proportion_to_frequency(formulation):
-    """Twice the time, twice the decrement; and the energy that leaves is never won back."""
+    """Twice the time gives twice the decrement; and dissipated energy never comes back."""
     points = _bar((8, 2, 2), 0.05)
     velocity = torch.zeros_like(points.position)
     velocity[:, 0] = 0.05 * torch.cos(math.pi * points.position[:, 0] / 0.4)
@@ -207,7 +207,7 @@ def test_damping_in_proportion_to_frequency(formulation):
 
 @pytest.mark.parametrize("ratio", [0.05, 1.0, 30.0])
 def test_damped_limit_is_sharp_for_one_particle(ratio):
-    """As for the undamped one: attained in the mode v_i = grad(w_i) / w_i near a plane where a weight vanishes."""
+    """As without damping: the limit is sharp in the mode v_i = grad(w_i) / w_i near a plane where a weight vanishes."""
     position = torch.full((1, 3), 0.05001, dtype=torch.float64)
     points = MaterialPoints.create(position, volume=1e-6, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
     undamped = float(stable_limit(points, 0.1).amin())
@@ -248,7 +248,7 @@ def test_damped_substep_is_the_root_of_its_criterion():
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_solver_divides_a_frame_by_the_damped_substep(formulation):
-    """And its Courant number is that of the undamped substep that is as stable: `cfl` where the longest is taken."""
+    """Its Courant number is that of the equally stable undamped substep: `cfl` for the longest substep."""
     points = _bar((3, 3, 3), 0.1, nu=0.3)
     cells = float(cfl_number(1.0, 0.1, wave_speed(points), None))
     undamped = float(stable_limit(points, 0.1).amin())

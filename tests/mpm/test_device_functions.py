@@ -1,7 +1,7 @@
 """The decompositions and materials of the kernels, one function at a time, against float64.
 
-A test of many matrices at once, singular, inverted, tiny and with repeated stretches among them, costs next to nothing
-here, in the interpreter too.
+A test of many matrices at once (also singular, inverted, tiny, with repeated stretches) costs almost nothing here, even
+in the interpreter.
 """
 
 import math
@@ -9,7 +9,7 @@ import math
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="needs triton, which there is for Linux only")
+pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
 
 import triton
 import triton.language as tl
@@ -36,7 +36,7 @@ MU, LAM, DT = 4e3, 6e3, 1e-3
 
 @pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
 def kernel_device(request):
-    """Where the functions run."""
+    """The device on which the functions run."""
     if request.param == "interpreted" and not fused.INTERPRETED:
         pytest.skip("on this machine the kernels are compiled")
     return torch.device("cuda" if request.param == "cuda" else "cpu")
@@ -105,7 +105,7 @@ def _scalars(F_in, wave, energy, mu, lam, count, WAVE: tl.constexpr, ENERGY: tl.
 
 
 def _matrices(device, unique=False):
-    """Deformation gradients; with ``unique`` only those with one nearest rotation, well away from others."""
+    """Deformation gradients; with ``unique`` only those with a unique nearest rotation, far from others."""
     generator = torch.Generator().manual_seed(0)
     turns = torch.linalg.qr(torch.randn(2, 900, 3, 3, dtype=torch.float64, generator=generator))[0]
     turns = turns * torch.linalg.det(turns)[..., None, None]
@@ -162,7 +162,7 @@ def test_decomposition(kernel_device):
 
 
 def test_nearest_rotation(kernel_device):
-    """Five iterations serve stretches that differ by a factor of fifty; beyond, as in torch."""
+    """Five iterations are enough for stretches that differ by a factor of fifty; beyond that, as in torch."""
     F = _matrices(kernel_device, unique=True)
     rotation = _decomposed(F)[0]
     exact = linalg.polar_rotation(F.double()).float()
@@ -269,8 +269,9 @@ def _strained(device):
 def test_wave_modulus_and_energy(kernel_device, law, ratio):
     """Against float64, to what a hundred roundings (of 1.2e-7) change: roots and divisions of a GPU are of 2 ulp.
 
-    A modulus divides by the sum of two stretches, which is exact to the rounding of the largest. That of a corotated
-    body and of a network keeps but the root of the rounding where two eigenvalues in closed form are equal.
+    A modulus divides by the sum of two stretches, which is exact to the rounding of the largest. The modulus of a
+    corotated body and of a network is only exact to the root of the rounding if two eigenvalues in closed form are
+    equal.
     """
     mu, lam = LAME[ratio]
     F = _strained(kernel_device)
@@ -285,7 +286,7 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
         rounding = rounding.clamp(min=5e-4)
     error = (wave - expected).abs() / expected
     assert bool((error <= rounding).all()), f"{float((error / rounding).max()):.1e}"
-    if lam > 0 or isinstance(law, StVKHencky):  # or there is no network, and nothing stiffens
+    if lam > 0 or isinstance(law, StVKHencky):  # otherwise there is no network, and nothing stiffens
         assert int((expected > 1.01 * (2 * mu + lam)).sum()) > 500
     exact = law.energy(wide, *parameters)
     slope = (exact * expected).sqrt()
@@ -295,7 +296,7 @@ def test_wave_modulus_and_energy(kernel_device, law, ratio):
 
 @pytest.mark.parametrize("law", ENERGIES, ids=lambda law: type(law).__name__)
 def test_what_is_not_finite_has_no_modulus(kernel_device, law):
-    """Whichever entry of F it is; maxima would lose it unless told not to."""
+    """In any entry of F; maxima would drop it by default."""
     F = torch.eye(3, device=kernel_device).repeat(18, 1, 1)
     F.view(18, 9)[range(9), range(9)] = math.nan
     F.view(18, 9)[range(9, 18), range(9)] = math.inf
@@ -305,7 +306,7 @@ def test_what_is_not_finite_has_no_modulus(kernel_device, law):
 
 
 def test_which_energy_holds_for_a_body():
-    """One kernel per energy: all laws on Hencky's share it, whatever flows in them."""
+    """One kernel per energy: all laws based on Hencky's share it, with any plastic flow."""
     for name in ("energy", "wave"):
         corotated, network, hencky = (shared([law], name) for law in ENERGIES)
         assert None is not corotated is not network is not hencky is not corotated
@@ -319,11 +320,11 @@ def test_which_energy_holds_for_a_body():
 
 
 class OwnLaw(NeoHookean):
-    """It may have another stress than the law that it is made from."""
+    """It may have another stress than the law that it is derived from."""
 
 
 def test_every_twin_of_the_package_is_compared():
-    """Each is in the list of this file, which the tests above go through."""
+    """Each law is in the list of this file, which the tests above use."""
     assert {type(law) for law in LAWS} == {law for law in laws.LAWS.values() if law.twin is not None}
     for law in LAWS:
         assert (twin_of(law).flow is not None) == law.plastic
@@ -331,7 +332,7 @@ def test_every_twin_of_the_package_is_compared():
 
 
 def test_what_a_body_asks_of_a_kernel():
-    """No decomposition where none is needed, and what laws have in common once."""
+    """No decomposition if none is needed, and shared parts of laws only once."""
     direct = BodyLaws([FixedCorotated(), NeoHookean()])
     assert (direct.spectral, len(direct.principals), len(direct.matrices), len(direct.flows)) == (False, 0, 2, 0)
     assert [row[:2] for row in direct.table] == [[0, -1], [1, -1]]

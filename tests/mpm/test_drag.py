@@ -1,4 +1,4 @@
-"""Drag at the end of the substep: unconditionally stable, and nothing changed where nothing moves."""
+"""Drag at the end of the substep: unconditionally stable, and without effect if nothing moves."""
 
 import pytest
 import torch
@@ -41,7 +41,7 @@ def _run(solver, state, wind, dt, steps, aero=AERO):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("dt", [1e-4, 1e-2, 0.1])
 def test_one_step_is_the_implicit_one(formulation, dt):
-    """v+ = (v + k u) / (1 + k), k = dt rho A C v_r / 2m, for a free sheet in a wind that is far too strong for it."""
+    """v+ = (v + k u) / (1 + k), k = dt rho A C v_r / 2m, for a free sheet in a wind too strong for explicit steps."""
     points = _sheet(0.02)
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
     velocity = torch.tensor([0.0, -10.0, 0.0], dtype=torch.float64).expand_as(points.position)
@@ -64,7 +64,7 @@ def test_a_free_sheet_never_overtakes_the_wind(formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_what_hangs_still_feels_all_of_its_weight_and_wind(formulation):
-    """In equilibrium nothing moves, so the drag is the explicit one whatever the substep: the same sag, with weight."""
+    """In equilibrium nothing moves, so the drag equals the explicit one for any substep: the same sag, with weight."""
     places = []
     for dt in (1e-4, 5e-4):
         points = _sheet(0.02, e=3e4)

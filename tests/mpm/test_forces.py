@@ -1,6 +1,6 @@
-"""Forces as a list: what they may be, that they add up, their work and their gradients; the examples of docs/forces.md.
+"""Lists of forces: valid types, sums, work and gradients; the examples of docs/forces.md.
 
-That the fused substep does the same is asked in ``test_fused``.
+``test_fused`` tests the same for the fused substep.
 """
 
 import ast
@@ -25,7 +25,7 @@ FORMULATIONS = ["total", "updated"]
 
 
 class Spring(Force):
-    """Pulls every particle to a place, with a drag if asked."""
+    """Pulls every particle to a place, with a drag if requested."""
 
     recordable = True
 
@@ -62,7 +62,7 @@ def _push(state):
 @pytest.mark.parametrize("batch", [(), (2,)])
 @torch.no_grad()
 def test_forces_add_up(formulation, batch):
-    """A rollout with several is the one with the sum of what they give; so is a single step."""
+    """A rollout with several forces equals a rollout with their sum; so does a single step."""
     solver, start, wind = _setting(formulation, batch)
     forces = [wind, Spring(2.0, 0.4), _push, Spring()]
     state = start
@@ -80,7 +80,7 @@ def test_forces_add_up(formulation, batch):
     for other in (several, watched, stepped):
         torch.testing.assert_close(other.position, state.position, rtol=0, atol=1e-12)
         torch.testing.assert_close(other.work, state.work)
-    for k in range(len(forces)):  # each of them counts
+    for k in range(len(forces)):  # each of them has an effect
         fewer = solver.rollout(start, DT, 4, forces[:k] + forces[k + 1 :])
         assert float((fewer.velocity - state.velocity).abs().max()) > 1e-5
 
@@ -108,7 +108,7 @@ def test_a_force_that_is_given_to_a_step_is_added_to_the_others():
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @torch.no_grad()
 def test_work_is_that_of_all_forces(formulation):
-    """What a free body that is too soft to store anything gains in kinetic energy."""
+    """The gain in kinetic energy of a free body that is too soft to store energy."""
     solver, start, wind = _setting(formulation, gravity=(0, 0, 0))
     points = start.position.shape[0]
     soft = MaterialPoints.create(start.position, volume=1e-4, density=50.0, youngs_modulus=1e-9, poisson_ratio=0.3)
@@ -221,7 +221,7 @@ class Shear(SpatialWind):
 
 
 class Everywhere(SpatialWind):
-    """The same everywhere, said with places."""
+    """The same everywhere, but given as a field."""
 
     def forward(self, time, position):
         return torch.tensor([4.0, 0.0, 1.0], dtype=position.dtype)
@@ -292,7 +292,7 @@ def test_example_prints_what_the_page_shows(example, output, capsys):
 
 
 def test_mpm_imports_nothing_that_is_built_on_it():
-    """Of the package only itself, geometry, and what lies below all rooms."""
+    """From the package it imports only itself, geometry, and the modules below all rooms."""
     allowed = ("gaussian_swaying.mpm", "gaussian_swaying._", "gaussian_swaying.geometry")
     modules = sorted((ROOT / "gaussian_swaying" / "mpm").rglob("*.py"))
     assert len(modules) > 15

@@ -1,4 +1,4 @@
-"""The two formulations against each other, with every law, and what each of them refuses or leaves out."""
+"""The two formulations against each other, with every law, and what each of them does not support."""
 
 import pytest
 import torch
@@ -50,7 +50,7 @@ def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
 
 
 def _bar():
-    """Hung by its top, let go: stretches by a few per cent."""
+    """Hung by its top and released: stretches by a few per cent."""
     return _points((0.05, 0.05, 0.7), 0.025, e=3e4), Box([None, None, 0.6], [None, None, None]), (0, 0, -9.8)
 
 
@@ -76,14 +76,14 @@ def _move(points, region, gravity, formulation, dx, seconds):
 
 @pytest.mark.parametrize(("make", "dxs"), [(_bar, (0.1, 0.05)), (_cantilever, (0.1, 0.05)), (_sheet, (0.1, 0.05))])
 def test_formulations_agree_within_their_discretisation_error(make, dxs):
-    """While neither tears. Each error is taken as the grid convergence index of two grids at order one (a pin's), which
-    is three times the change from dx to dx / 2 (Roache 1994).
+    """As long as neither tears. Each error is estimated by the grid convergence index of two grids at order one (that
+    of a pin), which is three times the change from dx to dx / 2 (Roache 1994).
 
     The border of each pin lies on a plane of nodes of both grids: the error depends on where it lies in its cell.
     """
     points, region, gravity = make()
 
-    def size(move):  # root mean square: the layer of cells next to the pin differs however fine the grid
+    def size(move):  # root mean square: the layer of cells next to the pin differs on any grid, however fine
         return float(move.square().sum(-1).mean().sqrt())
 
     move = {(f, dx): _move(points, region, gravity, f, dx, 0.16) for f in FORMULATIONS for dx in dxs}
@@ -114,7 +114,7 @@ def test_every_elastic_law_vibrates_alike_at_small_strain(law, formulation, devi
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("law", [NeoHookean, StVKHencky])
 def test_an_elastic_law_is_its_own_at_large_strain(law, formulation):
-    """The law that was asked for is the one that is used: at a strain of 0.3 the stresses part."""
+    """The selected law is really used: at a strain of 0.3 the stresses differ."""
     ends = []
     for kind in (FixedCorotated, law):
         points = _points((0.2, 0.2, 0.4), 0.05, kind)
@@ -135,7 +135,7 @@ def test_what_flows_is_refused_by_total(law):
 
 @pytest.mark.parametrize("law", PLASTIC, ids=PLASTIC_NAMES)
 def test_what_flows_forgets_its_shape(law, device):
-    """A block pulled and sheared beyond yield: the elastic part stays small, the total deformation goes on."""
+    """A block pulled and sheared beyond yield: the elastic part stays small, the total deformation grows."""
     points = _points((0.3, 0.3, 0.3), 0.05, law).map(lambda t: t.to(device))
     rate = torch.tensor([[3.0, 9.0, 0.0], [0.0, -3.0, 0.0], [0.0, 0.0, -1.5]], dtype=torch.float64, device=device)
     solver = MPMSolver(0.1, "updated", (0, 0, 0))
@@ -166,7 +166,7 @@ def test_several_laws_in_one_run():
         solver = MPMSolver(0.1, "updated", (0, 0, 0))
         ends.append(solver.rollout(solver.init_state(part, velocity), 5e-4, 60))
     joined = MaterialPoints.join(parts)
-    # in an order that mixes them
+    # in a mixed order
     order = torch.randperm(joined.count, generator=torch.Generator().manual_seed(1))
     mixed = joined.map(lambda t: t[order])
     solver = MPMSolver(0.1, "updated", (0, 0, 0))
@@ -193,7 +193,7 @@ def test_laws_and_indices_that_do_not_fit_are_refused():
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean])
 def test_an_elastic_run_computes_no_svd_and_no_return_map(law, formulation, monkeypatch):
-    """Model only what a scene needs."""
+    """State fields exist only if a scene needs them."""
 
     def forbidden(*_, **__):
         raise AssertionError("not needed in an elastic run")
@@ -231,7 +231,7 @@ def test_total_keeps_a_soft_flag_whole_for_ten_seconds(dx, density):
 
 
 def _whole(dx, density, frames, device):
-    """Whether a flag ends without a torn, lost or inverted particle and none pulled to a thread."""
+    """Whether a flag ends without torn, lost, inverted or extremely stretched particles."""
     settings = Settings(dtype=torch.float32, device=device)
     result, _ = flag(
         dx,
@@ -258,11 +258,11 @@ def test_deterministic_runs_give_the_same_bits_on_a_gpu(formulation):
         assert torch.equal(getattr(ends[0], name), getattr(ends[1], name)), name
 
 
-# ---- what another one takes
+# ---- a custom formulation
 
 
 class Loose(Formulation):
-    """Particles that do not feel each other."""
+    """Particles that do not interact."""
 
     name = "loose"
     neighbours_fixed = False
@@ -289,7 +289,7 @@ class Loose(Formulation):
 
 
 def test_a_third_formulation_is_one_class(monkeypatch):
-    """The solver runs it as it does its own: forces and their work, energies, substeps and grid."""
+    """The solver runs it like its own formulations: forces and their work, energies, substeps and grid."""
     with pytest.raises(ValueError, match="`formulation` to be one of total, updated, but got 'loose'"):
         MPMSolver(formulation="loose")
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
@@ -316,13 +316,13 @@ def test_a_third_formulation_is_one_class(monkeypatch):
 def test_a_formulation_without_kernels_says_so(monkeypatch):
     monkeypatch.setitem(known.FORMULATIONS, "loose", Loose)
     points = _points((0.2, 0.2, 0.2), 0.05)
-    with pytest.raises(ValueError, match="as the loose formulation has no kernels: set it to auto or torch"):
+    with pytest.raises(ValueError, match="because the loose formulation has no kernels: set it to auto or torch"):
         MPMSolver(0.1, "loose", transfer="triton").init_state(points)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_what_is_bound_does_not_change(formulation):
-    """Settings are those of the formulation too, so they are not to be set on the solver alone."""
+    """The formulation has the same settings, so they cannot be set on the solver alone."""
     solver = MPMSolver(0.1, formulation)
     with pytest.raises(AttributeError):
         solver.stiffness_damping = 1.0

@@ -1,7 +1,7 @@
-"""The fused substep against the one in torch, which is the definition.
+"""The fused substep against the torch substep, which is the reference.
 
 Without a GPU the kernels run in Triton's interpreter, one operation after the other in numpy: slow, so the bodies are
-small there. On a GPU what takes time is compiling, so bodies share their options, and some cases are left to the
+small there. On a GPU, compiling takes most of the time, so bodies share their options, and some cases run only in the
 interpreter.
 """
 
@@ -50,8 +50,8 @@ except ImportError:
     fused = None
 
 TOLERANCE = 2e-5
-"""Of the largest value of a field. A substep rounds some hundred times (half of 1.2e-7 each): the decomposition, and
-stresses that are differences of stretches near one; the same things are added in another order."""
+"""Relative to the largest value of a field. A substep rounds some hundred times (half of 1.2e-7 each): in the
+decomposition, and in stresses that are differences of stretches near one; sums also have another order."""
 
 DX, DT = 0.1, 1e-3
 FORMULATIONS = ["total", "updated"]
@@ -82,7 +82,7 @@ def kernel_device(request):
         pytest.importorskip("triton")
         return torch.device("cuda")
     if fused is None:
-        pytest.skip("needs triton, which there is for Linux only")
+        pytest.skip("needs triton, which is available on Linux only")
     if not fused.INTERPRETED:
         pytest.skip("on this machine the kernels are compiled")
     return torch.device("cpu")
@@ -96,7 +96,7 @@ def _one_width(monkeypatch):
 
 
 def _on(*everywhere, interpreted=()):
-    """Cases for ``kernel_device``; some of them only where nothing is compiled."""
+    """Cases for ``kernel_device``; some of them run only if nothing is compiled."""
     gpu = [pytest.param("cuda", case, marks=pytest.mark.gpu) for case in everywhere]
     return [pytest.param("interpreted", case) for case in (*everywhere, *interpreted)] + gpu
 
@@ -106,7 +106,7 @@ def _random(seed, *shape):
 
 
 def _points(device, law=None, count=24, batch=(), **more):
-    """A body of two cells to each side."""
+    """A body of two cells per side."""
     place = torch.rand(*batch, count, 3, generator=torch.Generator().manual_seed(0))
     return _body((0.06 + 0.18 * place).to(device), law, **more)
 
@@ -157,7 +157,7 @@ def _solver(transfer, formulation="updated", **options):
 
 
 def _both(points, run, formulation="updated", start=_start, **options):
-    """What a function of solver and state gives with the torch and with the fused substep."""
+    """The results of a function of solver and state with the torch substep and with the fused one."""
     found = []
     for transfer in ("torch", "triton"):
         solver = _solver(transfer, formulation, **options)
@@ -167,14 +167,14 @@ def _both(points, run, formulation="updated", start=_start, **options):
 
 
 def _agree(ends, tolerance=TOLERANCE, names=FIELDS):
-    """The same state, and not the one that it began with."""
+    """Both states are equal, and not the initial one."""
     for expected, found in zip(*(end if isinstance(end, list) else [end] for end in ends), strict=True):
         assert torch.equal(found.lost, expected.lost)
         assert found.grid == expected.grid
         assert found.substep == expected.substep
         torch.testing.assert_close(found.time, expected.time)
         assert found.work.dtype == torch.float64
-        # a sum over particles of both signs: its terms are some sqrt(P) larger together than it is
+        # a sum over particles with both signs: the sum of its absolute terms is some sqrt(P) larger
         scale = max(float(expected.work.abs().max()), 1e-9) * math.sqrt(expected.position.shape[-2])
         torch.testing.assert_close(found.work, expected.work, rtol=0, atol=tolerance * scale, msg=lambda m: "work " + m)
         for name in names:
@@ -206,7 +206,7 @@ def test_elastic_laws_in_total(kernel_device, law):
     indirect=["kernel_device"],
 )
 def test_laws_in_updated(kernel_device, law):
-    """Two substeps: the first scatters what it was given, the second what the return map has left."""
+    """Two substeps: the first scatters the given values, the second the result of the return map."""
     law = (ELASTIC | PLASTIC)[law]
     ends = _wind_case(_points(kernel_device, law), "updated", steps=2)
     _agree(ends)
@@ -241,7 +241,7 @@ def test_several_laws_in_total(kernel_device, names):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_crushed_and_inverted_particles(kernel_device, formulation):
-    """Where the nearest rotation is not unique, as at a reflection of a ball, there is nothing to compare."""
+    """If the nearest rotation is not unique, as for a reflected ball, there is nothing to compare."""
 
     def start(solver, points):
         if solver.neighbours_fixed:
@@ -294,7 +294,7 @@ def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.parametrize("lanes", [32, 128])
 def test_every_number_of_lanes(lanes, monkeypatch):
-    """The others are used elsewhere."""
+    """The others are used in other tests."""
     pytest.importorskip("triton")
     monkeypatch.setattr(fused_total, "_lanes", lambda sizes: lanes)
     _agree(_wind_case(_points("cuda", count=300), "total"))
@@ -302,7 +302,7 @@ def test_every_number_of_lanes(lanes, monkeypatch):
 
 @pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
 def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypatch):
-    """200 particles in a cell and 10 in the next, by 32 lanes."""
+    """200 particles in a cell and 10 in the next, with 32 lanes."""
     monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 32)
     generator = torch.Generator().manual_seed(2)
     place = 0.52 + 0.96 * torch.rand(210, 3, generator=generator)
@@ -316,7 +316,7 @@ def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypat
 
 def test_the_number_of_lanes_suits_the_cells(monkeypatch):
     if fused is None:
-        pytest.skip("needs triton, which there is for Linux only")
+        pytest.skip("needs triton, which is available on Linux only")
     monkeypatch.undo()
     few, many = (fused_total._lanes(torch.full((100,), size)) for size in (3, 300))
     assert few < many
@@ -331,7 +331,7 @@ def test_particles_on_the_borders_of_cells(kernel_device, formulation):
 
 
 def test_what_leaves_the_grid_is_lost(kernel_device):
-    """It has no weight, touches nobody at the far side, and keeps its place; what comes too near the edge goes too."""
+    """It has no weight, does not affect the far side, and keeps its place; particles too near the edge are lost too."""
     points = _points(kernel_device)
     outside = torch.tensor([[0.13, 0.14, 0.5], [0.5, 0.1, 0.1], [0.13, -0.4, 0.1], [0.15, 0.12, 0.349], [90.0, 0, 0]])
     count = len(outside)
@@ -415,7 +415,7 @@ def test_every_kind_of_wind(kernel_device, formulation, settings):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_the_cap_on_the_area_acts(kernel_device, formulation):
-    """And it is taken anew in each rollout, where a recorded graph holds what it reads and not its value."""
+    """It is also read again in each rollout: a recorded graph stores the address that it reads, not the value."""
     points = _points(kernel_device)
     free, capped = _load(points), _load(points, max_area_ratio=0.5)
     solver = _solver("triton", formulation)
@@ -447,7 +447,7 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_wind_along_the_normal(kernel_device, formulation):
-    """Nothing of it is tangential, and the direction of nothing is nothing."""
+    """Nothing of it is tangential, and the direction of a zero vector is zero."""
     points = _points(kernel_device)
     up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
     wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
@@ -500,7 +500,7 @@ def test_a_force_function_is_called_each_substep(kernel_device, formulation):
 
 
 class _Pull(Force):
-    """Pulls particles to a place that moves, the more so the more they are sheared; with a resistance if asked."""
+    """Pulls particles to a moving place, more strongly if they are sheared; with a resistance if requested."""
 
     recordable = True
 
@@ -545,7 +545,7 @@ FORCES = {
 )
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, monkeypatch):
-    """Over a part that ends, particles that are sorted anew, and a batch; all forces and their work."""
+    """Across the end of a part, with particles sorted again, and with a batch; all forces and their work."""
     name, resistance = case
     monkeypatch.setattr(fused, "MAX_STEPS", 3)
     monkeypatch.setattr(fused_updated, "RESORT", 2)
@@ -574,7 +574,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     ids=str,
 )
 def test_forces_in_torch_with_boundaries_looks_and_flow(kernel_device, case):
-    """The time that forces and boundaries are told advances once a substep; the internal variable is passed on."""
+    """The time passed to forces and boundaries advances once per substep; the internal variable is passed too."""
     formulation, law = case
     points = _points(kernel_device, (ELASTIC | PLASTIC)[law], count=12)
     forces = [_Pull(kernel_device, 1.0), _load(points)]
@@ -591,7 +591,7 @@ def test_forces_in_torch_with_boundaries_looks_and_flow(kernel_device, case):
 @pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, formulation):
-    """And with it the others, which run in torch then."""
+    """The other forces then run in torch as well."""
     points = _points(kernel_device, count=12)
 
     class Waiting(_Pull):
@@ -626,7 +626,7 @@ if fused is not None:
 
     @triton.jit
     def _toward(F, velocity, values, vector, numbers, OPTIONS: tl.constexpr):
-        """Pulls along a vector by a share of each particle; resists if it was compiled so."""
+        """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
         scale = values[0] * tl.load(numbers) * F[0]
         resistance = values[0] * 0
         if OPTIONS[0]:
@@ -676,7 +676,7 @@ class _Toward(Force):
 @pytest.mark.parametrize("resists", [False, True])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_twin_from_outside(kernel_device, formulation, resists):
-    """Before a wind, so the wind is the one that is left to torch; and the kernels can be told of another twin."""
+    """It comes before a wind, so the wind runs in torch; and the kernels can be given another twin."""
     points = _points(kernel_device, count=12)
     own = _Toward(points, resists)
 
@@ -695,7 +695,7 @@ def test_a_twin_from_outside(kernel_device, formulation, resists):
 @pytest.mark.gpu
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_forces_in_torch_are_replayed_from_graphs(formulation):
-    """Python is left after the recording; what changes in place is seen, and a number that changes is recorded anew."""
+    """Python is not called after recording; changes in place take effect, and a changed number is recorded again."""
     pytest.importorskip("triton")
     points = _points(torch.device("cuda"), count=60)
     pulls = [_Pull("cuda", 1.0) for _ in range(2)]
@@ -733,7 +733,7 @@ def test_forces_in_torch_are_replayed_from_graphs(formulation):
     ids=str,
 )
 def test_gravity_damping_and_viscosity(kernel_device, case):
-    """And MLS-MPM."""
+    """Also with MLS-MPM."""
     formulation, mls = case
     options = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
     _agree(_wind_case(_points(kernel_device), formulation, steps=2, mls=mls, **options))
@@ -746,7 +746,7 @@ def test_mls(kernel_device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_without_any_load(kernel_device, formulation):
-    """And without damping."""
+    """Also without damping."""
     points = _points(kernel_device)
     ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2), formulation, damping=0.0)
     _agree(ends)
@@ -771,7 +771,7 @@ def test_a_substep_that_changes(kernel_device, formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
-    """Longer than the schedule or the order of the particles lasts; the wind goes on, and so does the work."""
+    """Longer than the schedule and the sorting of the particles; the wind and the work continue."""
     monkeypatch.setattr(fused, "MAX_STEPS", 4)
     monkeypatch.setattr(fused_updated, "RESORT", 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
@@ -797,14 +797,14 @@ def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     ids=lambda value: value if isinstance(value, str) else ", ".join(value),
 )
 def test_looks_on_the_way(kernel_device, case, monkeypatch):
-    """The largest Courant number seen, and the same motion; some looks fall between two sorts of the particles."""
+    """The largest Courant number seen, and the same motion; some checks fall between two sorts of the particles."""
     monkeypatch.setattr(fused_updated, "RESORT", 2)
     law, formulation = case
     points = _points(kernel_device, (ELASTIC | PLASTIC)[law])
 
     def run(solver, state):
         if solver.transfer == "triton":
-            monkeypatch.setattr(solver.laws, "moduli", None)  # what it looks at stays in the kernels
+            monkeypatch.setattr(solver.laws, "moduli", None)  # the measured values stay in the kernels
         return solver.watched_rollout(state, DT, 3, _load(points), 3)
 
     found = _both(points, run, formulation)
@@ -814,7 +814,7 @@ def test_looks_on_the_way(kernel_device, case, monkeypatch):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_looks_at_other_laws(kernel_device, formulation):
-    """Several energies, and one that no look knows, are left to torch, in between the substeps of the kernels."""
+    """With several energies, or with one that has no kernel, the checks run in torch, between the kernels' substeps."""
     index = torch.arange(24) % 2
     for laws, more in (([*ELASTIC.values()][2:], {"law_index": index}), (ELASTIC["neo-hookean"], {})):
         points = _points(kernel_device, laws, **more)
@@ -865,7 +865,7 @@ BOUNDARIES = {
 )
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_boundaries(kernel_device, formulation, name):
-    """Over three substeps, of which the first and the last lie beside the window."""
+    """Over three substeps, of which the first and the last lie outside the window."""
     points = _points(kernel_device, count=12)
     load = _load(points)
 
@@ -882,7 +882,7 @@ def test_boundaries(kernel_device, formulation, name):
 
 
 def test_nodes_without_mass_are_let_go(kernel_device):
-    """They lie at the origin, as far as a boundary is told, and so in a region around it."""
+    """Boundaries see them at the origin, and so inside a region around it."""
     points = _points(kernel_device, count=12)
     boundaries = [VelocityBox(Box([-0.1] * 3, [0.1] * 3), [0.0, 1.0, 0.0], end=0.5 * DT)]
     _agree(_both(points, lambda solver, state: solver.rollout(state, DT, 3), "total", boundaries=boundaries))
@@ -920,7 +920,7 @@ def test_momentum(kernel_device, formulation):
     indirect=["kernel_device"],
 )
 def test_the_work_is_what_the_energy_grows_by(kernel_device, drag_step):
-    """In a body that is too soft to store any, and without the energies being computed by what counted the work."""
+    """In a body that is too soft to store any; the energies are computed separately from the work."""
     points = _points(kernel_device)
     points = dataclasses.replace(points, youngs_modulus=torch.full_like(points.mass, 1e-6))
     solver = _solver("triton", "total", gravity=(0, 0, 0), damping=0.0)
@@ -956,7 +956,7 @@ def test_total_gives_the_same_bits_twice():
 def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary):
     """Rollouts of the same kind share a recorded graph: the wind, its coefficients, patches, substep and time are new.
 
-    The second of a kind is recorded, the third replayed. Where nothing is compiled there are no graphs, but buffers.
+    The second of a kind is recorded, the third is replayed. If nothing is compiled there are buffers but no graphs.
     """
     count = 23 if kernel_device.type == "cuda" else 1
     points = _points(kernel_device, count=12)
@@ -986,7 +986,7 @@ def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary
 
 
 def test_a_grid_that_comes_back(kernel_device):
-    """A graph recorded for a grid finds the places of its nodes again, though another grid lay between."""
+    """A graph recorded for a grid finds its node positions again, even after another grid was used."""
     points = _points(kernel_device)
     count = 4 if kernel_device.type == "cuda" else 1
     boundaries = [Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
@@ -996,7 +996,7 @@ def test_a_grid_that_comes_back(kernel_device):
     load = _load(points)
     near, far = GridSpec(DX, (-2, -2, -2), (8, 8, 8)), GridSpec(DX, (-4, -3, -2), (8, 8, 7))
     for grid in (near, near, far, far, near, far) if kernel_device.type == "cuda" else (near, far):
-        filler = [torch.full((512, 3), 1e3, device=kernel_device) for _ in range(20)]  # over what was freed
+        filler = [torch.full((512, 3), 1e3, device=kernel_device) for _ in range(20)]  # over the freed memory
         expected, found = (solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers)
         _agree([expected, found])
         del filler
@@ -1006,7 +1006,7 @@ def test_a_grid_that_comes_back(kernel_device):
 
 
 class _Played:
-    """A recorded work that can be played back without a GPU."""
+    """Recorded work that can be replayed without a GPU."""
 
     def __init__(self, work):
         self.replay = work
@@ -1020,7 +1020,7 @@ class _Played:
 
 @pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
 def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
-    """Over a hundred grids, of substeps that do nothing but count themselves."""
+    """Over a hundred grids, with substeps that only count themselves."""
     alive, substeps = weakref.WeakSet(), []
 
     def record(device, work, pool, stream):
@@ -1059,8 +1059,8 @@ def _cloud(count, seed=8):
 def test_grids_that_grow_take_the_memory_of_the_largest():
     """Two hundred grids of up to 2.7 million nodes, each with graphs of its own.
 
-    At most there are the buffers and the graphs' memory of the largest, the same of the grid before, and the
-    temporaries of the substeps that were not recorded: three times what the largest takes alone.
+    The most memory in use is the buffers and graphs of the largest grid, those of the grid before, and the temporaries
+    of the substeps that were not recorded: three times the memory of the largest grid alone.
     """
     pytest.importorskip("triton")
     points = _cloud(500)
@@ -1083,14 +1083,14 @@ def test_grids_that_grow_take_the_memory_of_the_largest():
     before = torch.cuda.memory_reserved()
     alone = most_reserved([140]) - before
     torch.cuda.empty_cache()
-    assert alone > 2.7e6 * 60  # bytes; or there is nothing to be seen
+    assert alone > 2.7e6 * 60  # bytes; otherwise the test would show nothing
     assert most_reserved([*range(60, 140), *range(140, 60, -1), *range(101, 141)]) - before < 3 * alone
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("flight", ["drifts", "expands"])
 def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
-    """Its grid moves or grows over a hundred frames, far less often than once a frame."""
+    """Its grid moves or grows over a hundred frames, but much less often than once per frame."""
     pytest.importorskip("triton")
     points = _cloud(500)
     solver = MPMSolver(
@@ -1121,7 +1121,7 @@ BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
 @pytest.mark.parametrize(("name", "value"), BROKEN)
 @pytest.mark.parametrize("transfer", ["torch", "triton"])
 def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
-    """Within recorded substeps too, and the device goes on to serve."""
+    """Also within recorded substeps, and the device stays usable."""
     points, steps = _points(kernel_device), 9 if kernel_device.type == "cuda" else 2
     solver = _solver(transfer, boundaries=[Plane([0.0, 0.0, -0.1], [0.0, 0.0, 1.0])])
     start = solver.fit_grid(_start(solver, points, strain=0.02), 0.04)
@@ -1133,13 +1133,13 @@ def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, tr
             end = solver.rollout(start.replace(**{name: broken}), DT, steps)
     with pytest.raises(SimulationDiverged, match=r"particle .* (NaN or infinite|left the grid|object sizes)") as found:
         check_state(solver, end)
-    if name == "position":  # it has touched nobody
+    if name == "position":  # it has affected no other particle
         assert found.value.particle == 5
         assert end.lost.tolist() == [k == 5 for k in range(24)]
         assert bool(torch.isfinite(end.velocity).all())
     with pytest.raises((FloatingPointError, ValueError)):
         solver.fit_grid(end, 0.04)
-    again = solver.rollout(start, DT, steps)  # nothing is left over
+    again = solver.rollout(start, DT, steps)  # nothing remains
     _agree([good, again], tolerance=1e-4 if kernel_device.type == "cuda" else TOLERANCE)
 
 
@@ -1149,7 +1149,7 @@ def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, tr
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("law", ["corotated", "springs", "hencky"])
 def test_courant_number(kernel_device, formulation, law):
-    """Against float64; the closed form of the eigenvalues loses digits where two are equal, unless care is taken."""
+    """Against float64; without care, the closed form of the eigenvalues loses digits if two are equal."""
     points = _points(kernel_device, ELASTIC[law], count=48)
     state = _start(_solver("torch", formulation), points)
     eye = torch.eye(3)
@@ -1191,7 +1191,7 @@ def _bound(solver, points):
 
 @pytest.mark.parametrize("law", ["corotated", "springs", "sand"])
 def test_elastic_energy(kernel_device, law):
-    """Of a batch, against float64, and from the kernel."""
+    """For a batch, against float64, and from the kernel."""
     points = _points(kernel_device, (ELASTIC | PLASTIC)[law], batch=(2,))
     solver = _solver("triton")
     state = _start(solver, points)
@@ -1228,7 +1228,7 @@ def test_one_solver_within_inference_mode_and_without(kernel_device, formulation
 
 
 def test_nothing_is_recorded_that_has_not_run(kernel_device):
-    """A single substep of ``updated`` has no kernel that ends one and starts another; recording would compile it."""
+    """A single substep of ``updated`` uses no kernel that ends one and starts another; recording would compile it."""
     points = _points(kernel_device, count=12)
     solver = _solver("triton")
     state = solver.rollout(_start(solver, points), DT, 1)
@@ -1250,7 +1250,7 @@ def test_patches_that_change_in_place(kernel_device, formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_boundaries_that_change(kernel_device, formulation):
-    """Another window, another buffer and another object in it, without ``init_state``."""
+    """A different window, a different buffer and a different object in it, without ``init_state``."""
     points = _points(kernel_device, count=12)
     ends = []
     for transfer in ("torch", "triton"):
@@ -1283,7 +1283,7 @@ def test_laws_that_change(kernel_device):
 
 
 def test_a_pin_that_opens(kernel_device):
-    """Alone it is held by the kernels themselves, as long as it has no window."""
+    """A single pin is applied in the kernels themselves, as long as it has no window."""
     ends = []
     for transfer in ("torch", "triton"):
         pin = PinnedRegion(LEFT)
@@ -1296,7 +1296,7 @@ def test_a_pin_that_opens(kernel_device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_buffers_end_with_their_solver(kernel_device, formulation):
-    """At once: a GPU may need their memory for the next one before Python looks for cycles."""
+    """Immediately: a GPU may need their memory for the next one before Python collects cycles."""
     points = _points(kernel_device, count=12)
     solver = _solver("triton", formulation)
     solver.rollout(_start(solver, points), DT, 1)
@@ -1353,20 +1353,20 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
 
 
 class OwnLaw(FixedCorotated):
-    """A law of a user's own, which may be anything."""
+    """A custom law, which may do anything."""
 
 
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda points: (points.map(torch.Tensor.double), {}), "computes in float32, and the material is float64"),
-        (lambda points: (dataclasses.replace(points, laws=(OwnLaw(),)), {}), "the law OwnLaw has no fused form"),
+        (lambda points: (points.map(torch.Tensor.double), {}), "computes in float32, but the material is float64"),
+        (lambda points: (dataclasses.replace(points, laws=(OwnLaw(),)), {}), "the law OwnLaw has no Triton twin"),
         (lambda points: (points, {"formulation": "updated", "deterministic": True}), "sums have no fixed order"),
     ],
     ids=["float64", "custom law", "deterministic"],
 )
 def test_what_the_kernels_cannot_do(kernel_device, change, reason):
-    """``auto`` does it in torch, ``triton`` says why not."""
+    """``auto`` uses torch, ``triton`` raises an error with the reason."""
     points, options = change(_points(kernel_device))
     solver = MPMSolver(dx=DX, transfer="auto", **options)
     state = solver.init_state(points)
@@ -1415,7 +1415,7 @@ def test_triton_without_a_gpu_says_so():
 
 
 class _Waiting(Boundary):
-    """A condition of a user's own, which makes the host wait: it cannot be recorded."""
+    """A custom condition that makes the host wait: it cannot be recorded."""
 
     def forward(self, velocity, nodes):
         return velocity * (0.5 if float(nodes.time) > 2.5 * DT else 1.0)

@@ -1,4 +1,4 @@
-"""Gradients through whole substeps: every input against finite differences, and what long rollouts keep in memory."""
+"""Gradients through whole substeps: every input against finite differences, and the memory of long rollouts."""
 
 import math
 import weakref
@@ -38,7 +38,7 @@ def _rest():
 
 REST, VELOCITY = _rest()
 HELD = REST[:, 2] > 0.35
-INPUTS = {  # what each is divided by, so that a derivative says what a relative change does
+INPUTS = {  # the scale of each input, so that a derivative gives the effect of a relative change
     "position": (REST, DX),
     "velocity": (VELOCITY, 1.0),
     "youngs_modulus": (4e3, 4e3),
@@ -63,7 +63,7 @@ def _patches():
 
 
 def _start(values, law, **settings):
-    """The solver, its state at rest and the force of the wind, all from tensors that may want gradients."""
+    """The solver, its state at rest and the force of the wind, all from tensors that may require gradients."""
     points = MaterialPoints.create(
         values["position"],
         volume=0.09**2 * 0.01,
@@ -94,7 +94,7 @@ def _values(name=None, leaf=None):
 
 
 def _check(name, law, **settings):
-    """Five substeps against central differences, and a gradient that is there at all."""
+    """Five substeps against central differences, and the gradient must not vanish."""
     generator = torch.Generator().manual_seed(5)
     weights = torch.randn(4, 12 * COUNT, generator=generator, dtype=torch.float64)
 
@@ -104,12 +104,12 @@ def _check(name, law, **settings):
         return torch.cat([state.position, state.F_total.flatten(-2)], dim=-1).flatten()
 
     leaf = _leaf(name)
-    # in full for a few numbers and four mixtures of the outputs, else along one random direction
+    # in full for a few numbers and four mixtures of the outputs, otherwise along one random direction
     few = leaf.numel() <= 3
     checked = (lambda leaf: weights @ run(leaf)) if few else run
     assert torch.autograd.gradcheck(checked, leaf, eps=1e-6, atol=1e-8, rtol=1e-5, fast_mode=not few)
     gradient = torch.autograd.grad(weights @ run(leaf), leaf, torch.ones(4, dtype=torch.float64))[0]
-    # the tolerance above would let a detached path pass whose gradient is this small
+    # the tolerance above would accept a detached path if its gradient is this small
     assert float(gradient.abs().max()) > 1e-4, f"The gradient by {name} vanishes: {gradient}"
     if name in ("position", "velocity"):
         assert bool((gradient.abs().amax(-1) > 1e-6)[~HELD].all())
@@ -131,7 +131,7 @@ def test_gradient_with_damping_and_two_laws(name, setting):
 
 
 def _gradients(values, outputs):
-    """Of the summed squares of the outputs, by every input that wants one; a name for each."""
+    """Gradients of the summed squares of the outputs by every input that requires one, by name."""
     loss = sum(output.square().sum() for output in outputs)
     wanted = {name: value for name, value in values.items() if value.requires_grad}
     found = torch.autograd.grad(loss, list(wanted.values()))
@@ -151,7 +151,7 @@ def test_gradients_are_finite_at_rest(setting, law):
     gradients = _gradients(values, (state.position, state.F_total))
     for name, gradient in gradients.items():
         assert bool(torch.isfinite(gradient).all()), name
-    # the state stays where it is whatever the material, and goes where it is put
+    # the state at rest does not depend on the material, and follows the given position
     assert float(gradients["position"].abs().min()) > 0
     for name in ("youngs_modulus", "poisson_ratio", "density", "C_D", "C_F", "C_L"):
         assert float(gradients[name].abs().max()) < 1e-12, name
@@ -182,7 +182,7 @@ def test_gradients_are_finite_for_an_inverted_element(setting, law, shape):
 
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_gradients_are_finite_beside_a_node_of_vanishing_mass(setting):
-    """In float32 the square of 1 / mass overflows below 5e-20 kg; a particle near a plane gives a node less."""
+    """In float32 the square of 1 / mass overflows below 5e-20 kg; near a plane a node gets even less mass."""
     values = {name: value.float() for name, value in _values().items()}
     position = values["position"].clone()
     position[0] = torch.tensor([0.075, 0.075, 0.075]) - 1e-3 * DX  # its farthest node has half the cube of 1e-6
@@ -203,7 +203,7 @@ def test_gradients_are_finite_beside_a_node_of_vanishing_mass(setting):
 
 @pytest.mark.parametrize("checkpoint", [0, 4, 30])
 def test_checkpoints_find_what_is_used_late(checkpoint):
-    """A force of two parts, the second of which acts only after the first substeps."""
+    """A force of two parts, of which the second acts only after the first substeps."""
     points = MaterialPoints.create(
         torch.rand(8, 3, dtype=torch.float64), volume=0.1, density=10.0, youngs_modulus=1e3, poisson_ratio=0.3
     )
@@ -226,7 +226,7 @@ def test_checkpoints_find_what_is_used_late(checkpoint):
 
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_checkpoints_leave_gradients_as_they_are(setting):
-    """To round-off, as the segments' shares of a gradient are added in another order; 20 is no multiple of 7."""
+    """To round-off, because the gradients of the segments are added in another order; 20 is not a multiple of 7."""
     found = []
     for checkpoint in (0, 7):
         values = {name: value.clone().requires_grad_() for name, value in _values().items()}
@@ -240,7 +240,7 @@ def test_checkpoints_leave_gradients_as_they_are(setting):
 
 
 class _Held(TorchDispatchMode):
-    """Counts the bytes of all storages made under it: those alive now and the most there ever were."""
+    """Counts the bytes of all storages created inside it: those alive now, and the largest number so far."""
 
     def __init__(self):
         super().__init__()
@@ -280,7 +280,7 @@ def _memory(steps, checkpoint):
 
 
 def test_checkpoints_keep_a_long_rollout_small():
-    """Everything of N substeps is N a bytes; with every k-th state s kept, N / k s + k a: least at the square root."""
+    """N substeps kept in full take N a bytes; with every k-th state s kept, N / k s + k a: least at the square root."""
     short, short_peak, _, state = _memory(50, 0)
     twice, _, _, _ = _memory(100, 0)
     each = (twice - short) / 50

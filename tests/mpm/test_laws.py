@@ -1,4 +1,4 @@
-"""Materials as modules: what they call, return maps on deformation gradients, bounds on the stiffness."""
+"""Laws as modules: the functions they call, return maps on deformation gradients, bounds on the stiffness."""
 
 import math
 import re
@@ -63,7 +63,7 @@ def test_attributes():
 
 
 def test_a_law_is_one_file():
-    """Each file of the folder but those that all share has one law, and no file of device functions is left over."""
+    """Each file of the folder has one law, except the shared files, and no file of device functions is unused."""
     files = {found.name for found in iter_modules(laws.__path__) if not found.ispkg} - {"law", "shared"}
     assert {law.__module__.rsplit(".", 1)[1] for law in laws.LAWS.values()} == files
     assert len(laws.LAWS) == len(files)
@@ -95,7 +95,7 @@ def test_stress_is_the_derivative_of_the_energy(name):
 
 
 def test_elastic_laws_need_no_eigenvectors(monkeypatch):
-    """FixedCorotated and NeoHookean are to stay cheap."""
+    """FixedCorotated and NeoHookean must stay cheap."""
 
     def fail(*args, **kwargs):
         raise AssertionError("called")
@@ -117,7 +117,7 @@ def test_elastic_laws_need_no_eigenvectors(monkeypatch):
 
 @pytest.mark.parametrize("name", PLASTIC)
 def test_return_map_keeps_axes_and_rotation(name):
-    """F = U diag(a) V^T becomes U diag(z) V^T, from either side the same."""
+    """F = U diag(a) V^T becomes U diag(z) V^T, with the same result from either side."""
     law = LAWS[name]
     F = _gradients()
     mu, lam = _lame(50)
@@ -136,7 +136,7 @@ def test_return_map_keeps_axes_and_rotation(name):
 
 @pytest.mark.parametrize("name", PLASTIC)
 def test_gradients_of_return_maps(name):
-    """Flowing and elastic states, repeated stretches, at rest; clear of kinks, which differences would straddle."""
+    """Plastic and elastic states, repeated stretches, at rest; away from kinks, which differences would cross."""
     law = LAWS[name]
     stretches = [[1.0, 0.8, 0.7], [1.3, 1.1, 1.05], [0.9, 0.9, 0.6], [0.96, 0.6, 0.6], [1.0, 1.0, 1.0]]
     if name in ("sand", "corrected sand"):
@@ -174,7 +174,7 @@ def test_gradients_through_a_substep_are_finite(name, dtype, device):
 
 @pytest.mark.parametrize("name", ["sand", "metal", "foam", "plasticine", "snow", "fluid"])
 def test_inverted_elements_recover(name):
-    """Steps along -P with the return map after each, as a solver would take them, end upright."""
+    """Steps along -P with a return map after each, as in a solver, end with a positive determinant."""
     law = LAWS[name]
     F = torch.diag(torch.tensor([1.1, 0.9, -0.3], dtype=torch.float64))[None]
     mu, lam = _lame(1)
@@ -199,7 +199,7 @@ def _hessian(law, F, mu, lam, internal):
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
 @pytest.mark.parametrize("name", ["fixed corotated", "neo-Hookean", "Hencky", "fluid"])
 def test_moduli_bound_the_hessian(name, nu):
-    """The largest eigenvalue, and the acoustic tensor over many directions; neither bound is far off in mild states."""
+    """The largest eigenvalue, and the acoustic tensor over many directions; both bounds are tight in mild states."""
     law = LAWS[name]
     mild = 150
     F = torch.cat([_gradients(mild, 0.05), _gradients(150, 0.3), _gradients(100, 0.8)])

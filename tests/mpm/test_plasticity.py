@@ -1,4 +1,4 @@
-"""Return maps: where they end, what they keep, and their gradients."""
+"""Return maps: where they end, what they conserve, and their gradients."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_return_maps_are_idempotent(name):
 
 @pytest.mark.parametrize("name", ["sand", "metal", "plasticine", "foam", "snow"])
 def test_states_inside_are_unchanged(name):
-    """Bit by bit: a round trip through the logarithm in every substep would drift."""
+    """To the bit: a round trip through the logarithm in every substep would drift."""
     trial = 0.99 + 1e-3 * torch.rand(50, 3, dtype=torch.float64)
     new, internal = _map(name, trial)
     assert bool((new == trial).all())
@@ -140,7 +140,7 @@ def test_volume_correction_returns_what_tension_gained():
 
 
 def test_volume_correction_conserves_the_sum():
-    """log det F + v_c changes by nothing but the deformation."""
+    """log det F + v_c changes only by the deformation."""
     trial, before = _stretches(), 0.1 * torch.rand(200, dtype=torch.float64)
     new, after = drucker_prager(trial, MU.expand(200), LAM.expand(200), before, 30.0)
     torch.testing.assert_close(new.log().sum(-1) + after, trial.log().sum(-1) + before, rtol=0, atol=TOL)
@@ -212,7 +212,7 @@ def test_fluid_keeps_only_the_volume():
 
 @pytest.mark.parametrize("name", list(MAPS))
 def test_crushed_inverted_and_resting_states(name, dtype, device):
-    """Finite, with finite gradients, in both precisions; where they flow they come back upright."""
+    """Finite, with finite gradients, in both precisions; if they flow, they come back with positive stretches."""
     states = [
         [1, 1, 1],
         [0, 0, 0],
@@ -237,7 +237,7 @@ def test_crushed_inverted_and_resting_states(name, dtype, device):
 
 @pytest.mark.parametrize("name", list(MAPS))
 def test_gradients_of_the_flow(name):
-    """Against differences, at states that stay clear of the kinks, for the material parameters too."""
+    """Against differences, at states away from the kinks, also for the material parameters."""
     trial = torch.tensor([[1.0, 0.8, 0.7], [0.97, 0.95, 0.93], [1.3, 1.1, 1.05], [0.9, 0.9, 0.6]], dtype=torch.float64)
     internal = torch.full((4,), 0.02, dtype=torch.float64)
     mu, lam = (x.expand(4).clone().requires_grad_() for x in (MU, LAM))

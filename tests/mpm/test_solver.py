@@ -1,4 +1,4 @@
-"""Whole steps of both formulations against exact laws of motion."""
+"""Whole steps of both formulations against exact solutions."""
 
 import dataclasses
 
@@ -142,7 +142,7 @@ def test_batch_equals_scenes_alone(formulation, device):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_each_particle_has_its_own_material(formulation):
-    """Two blocks far apart in one run, of different E, nu and density, move as each does alone."""
+    """Two blocks far apart in one run, with different E, nu and density, move as each does alone."""
     parts, ends = [], []
     for shift, e, nu, density in ((0.0, 1e4, 0.2, 50.0), (2.0, 4e4, 0.45, 200.0)):
         position = _block(count=60).position + torch.tensor([shift, 0.0, 0.0], dtype=torch.float64)
@@ -194,7 +194,7 @@ def test_flag_hung_by_one_row_does_not_slide_off(formulation):
 
 
 def test_total_moves_with_particles_on_half_cell_planes():
-    """A layer exactly on a half-cell plane gives nodes of zero mass; an unguarded division gives NaN."""
+    """A layer exactly on a half-cell plane creates nodes of zero mass; an unguarded division gives NaN."""
     x = torch.arange(8, dtype=torch.float64) * 0.05 + 0.05
     position = torch.stack(torch.meshgrid(x, torch.tensor([0.05], dtype=torch.float64), x, indexing="ij"), -1)
     points = MaterialPoints.create(
@@ -245,7 +245,7 @@ def test_room_lies_where_a_grid_was_outgrown():
 
 
 def test_what_flies_on_needs_a_new_grid_the_more_rarely_the_farther_it_is():
-    """One side moves by 5 cells a frame, from 50 cells to 2050, or 41 times as many, which is 1.125 to the power 32."""
+    """One side moves by 5 cells a frame, from 50 to 2050 cells: a factor of 41, or 1.125 to the power 32."""
     grid, grids = GridSpec(0.1, (0, 0, 0), (50, 20, 20)), set()
     for frame in range(401):
         needed = GridSpec(0.1, (0, 0, 0), (50 + 5 * frame, 20, 20))
@@ -282,7 +282,7 @@ def test_no_grid_for_what_is_not_finite_or_too_far(device, name, value, kind, ma
 
 @pytest.mark.gpu
 def test_a_grid_on_a_gpu_stays_while_it_serves():
-    """CUDA graphs are recorded for one grid: a body that drifts slowly needs a new one now and then only."""
+    """CUDA graphs are recorded for one grid: a body that drifts slowly needs a new one only from time to time."""
     points = _block(dtype=torch.float32, device="cuda")
     solver = MPMSolver(dx=0.05, formulation="updated", gravity=(0, 0, 0))
     state = solver.init_state(points, torch.full_like(points.position, 0.2))
@@ -315,7 +315,7 @@ def test_watched_rollout_is_a_rollout_that_saw_the_largest_courant_number(formul
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_work_is_what_the_force_adds_to_the_energy(formulation):
-    """A constant force on a body that does not deform: work is force times way, and its kinetic energy."""
+    """A constant force on a body that does not deform: work is force times distance, and equals its kinetic energy."""
     points = _block(2)
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
     pull = torch.tensor([[[3.0, 0.0, 0.0]], [[0.0, 6.0, 0.0]]], dtype=torch.float64)

@@ -42,7 +42,7 @@ def _growth(solver, points, dt, steps=150):
 
 
 def test_limit_is_sharp_for_one_particle():
-    """The bound is attained as a particle nears a plane where a weight vanishes, in the mode v_i = grad(w_i) / w_i."""
+    """The bound is reached as a particle nears a plane where a weight vanishes, in the mode v_i = grad(w_i) / w_i."""
     position = torch.full((1, 3), 0.05001, dtype=torch.float64)
     points = _points(position, nu=0.3)
     solver = MPMSolver(dx=0.1, gravity=(0, 0, 0))

@@ -101,7 +101,7 @@ def test_gradient_rows_match_autograd():
 
 
 def test_moved_grid_gives_the_same_weights():
-    """Every grid is a window of one lattice, so a grid that follows the object changes nothing."""
+    """Every grid is a window of the same lattice, so a grid that follows the object changes nothing."""
     position = _particles("cpu", torch.float32)[0]
     a, b = bspline_stencil(position, GRID), bspline_stencil(position, GridSpec(DX, (-3, -1, -2), (20, 15, 17)))
     assert torch.equal(a.basis, b.basis)
@@ -145,7 +145,7 @@ def test_bounding_grid_holds_every_stencil():
 @pytest.mark.parametrize("offset", [(-3, -3, -3), (5, 5, 5)], ids=["around the origin", "beside it"])
 @pytest.mark.parametrize("moments", [False, True])
 def test_what_is_not_finite_or_far_away_indexes_nothing_and_weighs_nothing(device, dtype, offset, moments):
-    """NaN and infinity become any integer, perhaps that of a node; nothing of them may reach one."""
+    """NaN and infinity become arbitrary integers, perhaps that of a node; they must not affect any node."""
     grid = GridSpec(0.1, offset, (8, 9, 10))
     start = torch.tensor(offset, dtype=dtype, device=device)
     good = 0.1 * (start + 2 + 4 * torch.rand(20, 3, dtype=dtype, device=device))
@@ -182,7 +182,7 @@ def test_p2g_rejects_wrong_shape(name, shape):
 
 @pytest.mark.parametrize("batch", [(), (2,), (2, 3)])
 def test_deterministic_sums_equal_the_plain_ones(device, dtype, batch):
-    """Also with particles outside the grid and with nodes that none touches."""
+    """Also with particles outside the grid and with nodes without particles."""
     position, mass, velocity, affine = _particles(device, dtype, *batch, count=200)
     position[..., 0, :] = 5.0
     position[..., 7, 2] = -1.0
@@ -216,7 +216,7 @@ def test_deterministic_sums_have_the_same_bits_every_time(device):
 
 
 def test_deterministic_sums_follow_the_order_of_the_particles(device):
-    """The sum at a node is that of its particles one after the other, not of the order in which threads arrive."""
+    """The sum at a node adds its particles one after the other, not in the order in which threads arrive."""
     position = torch.full((3, 3), 0.5, device=device)
     stencil = bspline_stencil(position, GRID, deterministic=True)
     node = torch.cat([stencil.layer(i) for i in range(3)]).reshape(27, 3)
@@ -227,7 +227,7 @@ def test_deterministic_sums_follow_the_order_of_the_particles(device):
 
 
 def test_deterministic_scatter_gradcheck(device):
-    """Of a sum with particles inside, at one place, and outside the grid, in a batch of two."""
+    """For a sum with particles inside, at one place, and outside the grid, in a batch of two."""
     position, mass, velocity, affine = _particles(device, torch.float64, 2, count=4)
     position[:, 1] = position[:, 0]
     position[:, 3] = 3.0
@@ -301,7 +301,7 @@ def test_second_derivatives_through_the_positions():
 
 
 def test_transfers_keep_fewer_than_27_values_of_each_particle_at_a_time():
-    """Nine nodes at a time: the largest tensor of a scatter or gather, less what it is given and gives."""
+    """Nine nodes at a time: the largest tensor of a scatter or gather, except for its inputs and outputs."""
     count, columns = 5000, 3
     position = _particles("cpu", torch.float32, count=count)[0]
     stencil = bspline_stencil(position, GRID)
@@ -344,7 +344,7 @@ def test_stencil_without_gradients_keeps_value_and_moments(device, dtype):
 def test_scatter_momentum_is_the_sum_that_it_says(mls):
     """Written out with loops: sum over p of w (m (v + C d) + j) - S grad(w), in MLS-MPM with w d 4/dx² for grad(w)."""
     position, mass, velocity, affine = _particles("cpu", torch.float64, count=6)
-    impulse, stress = torch.randn(6, 3).double(), torch.randn(6, 3, 3).double()  # not symmetric: a transpose shows
+    impulse, stress = torch.randn(6, 3).double(), torch.randn(6, 3, 3).double()  # not symmetric, to notice transposes
     stencil = bspline_stencil(position, GRID, gradients=not mls)
     found = scatter_momentum(mass, velocity, affine, impulse, stress, stencil, 4 / DX**2 if mls else None)
 
@@ -420,7 +420,7 @@ def test_mls_free_fall_and_affine_motion_are_exact():
 
 
 def test_mls_is_another_discretisation_of_the_same_body():
-    """Near the plain one where the motion is smooth, and not the same."""
+    """Close to the plain one if the motion is smooth, but not the same."""
     points = _body(400)
     velocity = torch.zeros_like(points.position)
     velocity[:, 0] = -torch.cos(torch.pi * points.position[:, 0] / 0.4)

@@ -1,7 +1,7 @@
 """Boundary conditions, one file each.
 
-Every file of this folder is imported with it, so a condition is known by its name (``class_path: Plane``) as soon as
-its file is here. ``BOUNDARIES`` lists the classes by name.
+Every file in this folder is imported automatically, so a condition can be used by its name (``class_path: Plane``) as
+soon as its file is here. ``BOUNDARIES`` lists the classes by name.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What a boundary condition is: it holds, stops or drives grid nodes within a window of time.
+"""Base class of the boundary conditions: they hold, stop or drive grid nodes within a time window.
 
-A condition changes nodal velocities after the momentum update. Where a node "is" depends on the formulation: a lattice
-point in ``updated``, the centre of the mass that it carries in ``total``.
+A condition changes nodal velocities after the momentum update. The position of a node depends on the formulation: the
+lattice point in ``updated``, the centre of the mass that it carries in ``total``.
 
-A condition that holds particles holds the nodes that carry them: in ``updated`` all that they touch, in ``total`` those
-in which they have more than a share of the mass.
+A condition that holds particles holds the nodes that carry them: in ``updated`` all nodes that they touch, in ``total``
+those where they have more than a given share of the mass.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
 
-CLOCK = 1e-9  # round-off of a time that many substeps were added to [s]
+CLOCK = 1e-9  # round-off of a time after many additions of a substep [s]
 _Kind = TypeVar("_Kind", bound="Boundary")
 
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """What a boundary may know about the grid nodes besides their velocity.
+    """Data about the grid nodes that a boundary gets besides their velocity.
 
     Attributes:
         time: Time at the start of the substep [s], scalar float64 tensor.
         dt: Substep [s], a number or a scalar float64 tensor.
-        position: Where the nodes are [m], shape (..., G, 3), for a boundary with ``needs_position``.
-        lattice: Where the lattice points are [m], shape (..., G, 3), for one with ``needs_lattice``: in ``total`` they
-            have moved with the material, and a velocity that is affine in them moves it rigidly up to its border.
+        position: Positions of the nodes [m], shape (..., G, 3), for a boundary with ``needs_position``.
+        lattice: Positions of the lattice points [m], shape (..., G, 3), for one with ``needs_lattice``: in ``total``
+            they move with the material, and a velocity that is affine in them moves it rigidly up to its border.
         share: Share of each node's mass that belongs to the particles of the boundary, shape (..., G), if it has any.
         threshold: Share above which such a node is held.
         held_mass: Mass of those particles [kg], shape (...).
@@ -56,15 +56,15 @@ class Nodes:
 
 
 class Boundary(Recordable, nn.Module, ABC):
-    """Base of all conditions.
+    """Base class of all boundary conditions.
 
     Args:
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
 
     Attributes:
-        needs_position: Whether :meth:`forward` looks at where nodes are.
-        needs_lattice: Whether it looks at where lattice points are.
+        needs_position: Whether :meth:`forward` uses the positions of nodes.
+        needs_lattice: Whether it uses the positions of lattice points.
         held_share: Share of a node's mass above which the particles of :meth:`particle_mask` hold it in ``total``; None
             if the condition acts on particles without holding nodes.
     """
@@ -81,11 +81,11 @@ class Boundary(Recordable, nn.Module, ABC):
             raise ValueError(f"Expected `end` to be later than `start` ({self.start} s), but got {self.end} s.")
 
     def in_frame(self, frame: SimFrame) -> Boundary:
-        """The same condition with its geometry brought from scene units to metres, z up."""
+        """The same condition with its geometry converted from scene units to metres, z up."""
         return self
 
     def copy_in(self: _Kind, frame: SimFrame, **tensors: Tensor) -> _Kind:
-        """A copy whose ``region``, if it has one, is asked in metres, and that has other tensors of its own."""
+        """A copy with its ``region``, if it has one, evaluated in metres, and with some tensors replaced."""
         moved = copy.copy(self)
         moved._buffers = {**self._buffers, **tensors}
         if "region" in vars(self):
@@ -97,11 +97,11 @@ class Boundary(Recordable, nn.Module, ABC):
         return None
 
     def release_time(self, rest_position: Tensor) -> Tensor | None:
-        """Time at which each particle is let go [s], shape (..., P); None if only ``end`` counts."""
+        """Time at which each particle is released [s], shape (..., P); None if only ``end`` counts."""
         return None
 
     def active(self, time: Tensor) -> Tensor:
-        """Whether the condition acts at a time [s]; scalar bool tensor, so that no GPU has to wait."""
+        """Whether the condition acts at a time [s]; scalar bool tensor, so that no GPU synchronisation is needed."""
         now = time + CLOCK
         return (now >= self.start) & (now < self.end)
 
@@ -111,5 +111,5 @@ class Boundary(Recordable, nn.Module, ABC):
 
         Args:
             velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
-            nodes: What else is known about them.
+            nodes: Other data about them.
         """

@@ -1,4 +1,4 @@
-"""A box that nothing leaves."""
+"""A box that nothing can leave."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class EnclosingBox(Boundary):
         super().__init__(start, end)
         low, high = check_vector("min", min), check_vector("max", max)
         if any(a >= b for a, b in zip(low, high, strict=True)):
-            raise ValueError(f"Expected `min` of the box below `max` on every axis, but got {low} and {high}.")
+            raise ValueError(f"Expected `min` of the box to be below `max` on every axis, but got {low} and {high}.")
         planes = []
         for axis in range(3):
             direction = [0.0, 0.0, 0.0]

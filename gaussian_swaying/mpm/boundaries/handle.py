@@ -1,4 +1,4 @@
-"""A part of the material that is moved and turned."""
+"""A part of the material that is moved and rotated."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 class Handle(PinnedRegion):
     """Moves the particles of a region as a rigid body: a pin that travels and turns.
 
-    Each substep takes the held nodes to exactly where the rigid motion has them at its end, so a handle that turns for
-    minutes neither grows nor drifts. Once the window closes it lets go.
+    Each substep moves the held nodes exactly to their place in the rigid motion, so a handle that turns for minutes
+    neither grows nor drifts. It releases the nodes when its time window ends.
 
     Args:
-        region: Where the held particles rest, in scene units.
+        region: Region of the held particles at rest, in scene units.
         velocity: Velocity [m/s], z up.
         angular_velocity: Axis of the rotation times its rate [rad/s], z up.
         pivot: Point about which it turns, in scene units at time ``start``; it travels with ``velocity``.
@@ -62,7 +62,7 @@ class Handle(PinnedRegion):
         return self.copy_in(frame, pivot=frame.point_to_sim(self.pivot))
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Take the held nodes along."""
+        """Give the held nodes the velocity of the rigid motion."""
         assert nodes.lattice is not None
         driven = self.velocity.to(velocity).expand_as(velocity)
         if self.rate > 0:

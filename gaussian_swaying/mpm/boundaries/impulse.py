@@ -15,16 +15,17 @@ from gaussian_swaying.mpm.boundaries.particle_boundary import ParticleBoundary
 
 
 class Impulse(ParticleBoundary):
-    """Pushes the particles of a region: a knock, or a force for some time.
+    """Pushes the particles of a region: a short hit, or a force for some time.
 
-    The impulse is spread evenly over the window and over the mass of the region; it arrives whole whatever the substep.
+    The impulse is spread evenly over the window and over the mass of the region; the total does not depend on the
+    substep.
 
     Args:
-        region: Where the pushed particles rest, in scene units.
+        region: Region of the pushed particles at rest, in scene units.
         impulse: Impulse on the region as a whole [N s], z up.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s].
-        per_particle: Whether ``impulse`` is that on each particle, so that the whole grows with their number.
+        per_particle: Whether ``impulse`` acts on each particle, so that the total grows with their number.
     """
 
     recordable = True
@@ -43,24 +44,24 @@ class Impulse(ParticleBoundary):
         self.register_buffer("impulse", torch.tensor(check_vector("impulse", impulse), dtype=torch.float64))
         self.impulse: Tensor
         self.per_particle = bool(per_particle)
-        # particles of each scene of the batch, once they are known
+        # number of particles in each scene of the batch, once known
         self.register_buffer("count", torch.ones((), dtype=torch.float64), persistent=False)
         self.count: Tensor
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:
-        """Particles inside the region at rest, which are counted too; ValueError if there are none."""
+        """Particles inside the region at rest, which are also counted; ValueError if there are none."""
         mask = super().particle_mask(rest_position)
         if self.per_particle:
             self.count = mask.sum(-1).to(self.impulse)
         return mask
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Add the part of the impulse that falls into the substep."""
+        """Add the part of the impulse that belongs to the substep."""
         assert nodes.share is not None
         assert nodes.held_mass is not None
         overlap = (nodes.time + nodes.dt).clamp(max=self.end) - nodes.time.clamp(min=self.start)
         part = (overlap.clamp(min=0) / (self.end - self.start)).to(velocity)
-        # a scene of the batch without any such particle has no share to push
+        # in a scene of the batch without such particles all shares are zero
         per_mass = nodes.share / nodes.held_mass.clamp(min=torch.finfo(velocity.dtype).tiny)[..., None]
         whole = self.impulse if not self.per_particle else self.count[..., None, None] * self.impulse
         return velocity + per_mass[..., None] * (part * whole.to(velocity))

@@ -1,4 +1,4 @@
-"""Base of the conditions that act on the particles of a region."""
+"""Base class of the conditions that act on the particles of a region."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from gaussian_swaying.mpm.boundaries.boundary import Boundary
 
 
 class ParticleBoundary(Boundary):
-    """Base of the conditions that act on the particles of a region, wherever they go."""
+    """Base class of the conditions that act on the particles of a region, wherever they go."""
 
     def __init__(self, region: Region, start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
         self.region = region
 
     def in_frame(self, frame: SimFrame) -> Boundary:
-        """The condition with its region asked in metres."""
+        """The condition with its region evaluated in metres."""
         return self.copy_in(frame)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:

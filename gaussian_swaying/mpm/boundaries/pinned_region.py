@@ -1,4 +1,4 @@
-"""A part of the material that is held where it is."""
+"""A part of the material that is held in place."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class PinnedRegion(ParticleBoundary):
     """Holds the grid nodes of the particles whose rest position lies in a region.
 
     A pin that only reset its particles would let a sheet slide off, since their neighbours keep moving the shared
-    nodes. So the nodes are held: in ``updated`` all that the particles touch, in ``total`` those in which they hold
-    more than ``held_share`` of the mass. Where the material seems to be held is so known to a part of a cell: in
-    ``total`` between 0.4 cells too far out and 0.4 too far in, as the particles lie to the grid, on average right with
-    the default share; in ``updated`` about 0.7 too far in.
+    nodes. So the nodes are held: in ``updated`` all nodes that the particles touch, in ``total`` those where they have
+    more than ``held_share`` of the mass. The effective edge of the pin is therefore accurate to a fraction of a cell:
+    in ``total`` it lies between 0.4 cells too far out and 0.4 cells too far in, depending on how the particles lie on
+    the grid, and is right on average with the default share; in ``updated`` it lies about 0.7 cells too far in.
 
     Args:
-        region: Where the pinned particles rest, in scene units.
+        region: Region of the pinned particles at rest, in scene units.
         held_share: Share of the nodal mass in ``total``, between 0 and 1.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.

@@ -1,4 +1,4 @@
-"""A half space that nothing enters."""
+"""A half space that nothing can enter."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
     Args:
         velocity: Node velocity [m/s], shape (..., 3).
         normal: Unit normal, pointing to the free side, shape (3,).
-        kind: ``sticky`` (no motion), ``slip`` (no motion along the normal), ``separate`` (only none into the plane).
+        kind: ``sticky`` (no motion), ``slip`` (no motion along the normal), ``separate`` (no motion into the plane).
         friction: Coulomb coefficient: the tangential speed falls by at most ``friction`` times the normal speed that
-            the contact takes away.
+            the contact removes.
 
     Returns:
         Shape (..., 3).

@@ -1,4 +1,4 @@
-"""A part of the material that is held and let go bit by bit."""
+"""A part of the material that is held and released gradually."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 
 
 class SequentialRelease(PinnedRegion):
-    """Holds the particles of a region and lets them go one after the other, as a front passes over them.
+    """Holds the particles of a region and releases them one after the other, as a front passes over them.
 
     Args:
-        region: Where the held particles rest, in scene units.
+        region: Region of the held particles at rest, in scene units.
         direction: Direction in which the front travels, in scene axes.
-        start: Time at which the front meets the first particle [s]; before it all are held.
+        start: Time at which the front meets the first particle [s]; before that, all are held.
         end: Time at which it passes the last one [s].
         held_share: Share of the nodal mass in ``total``, between 0 and 1.
-        first: Point that the front meets at ``start``, in scene units, in place of the first particle.
-        last: Point that it passes at ``end``, likewise; given together with ``first``, and farther along ``direction``.
+        first: Point that the front meets at ``start``, in scene units, instead of the first particle.
+        last: Point that it passes at ``end``, in scene units, instead of the last particle; must be given together with
+            ``first`` and lie farther along ``direction``.
     """
 
     recordable = True
@@ -54,7 +55,7 @@ class SequentialRelease(PinnedRegion):
             ends = torch.tensor([check_vector("first", first), check_vector("last", last)], dtype=torch.float64)
             if not float((ends[1] - ends[0]) @ self.direction) > 0:
                 raise ValueError(
-                    f"Expected `last` of the SequentialRelease farther along `direction` than `first`, but got "
+                    f"Expected `last` of the SequentialRelease to be farther along `direction` than `first`, but got "
                     f"{list(last)} and {list(first)}."
                 )
         self.register_buffer("ends", ends)  # first and last, shape (2, 3)
@@ -80,5 +81,5 @@ class SequentialRelease(PinnedRegion):
         return self.start + part * (self.end - self.start)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Hold the nodes of those not yet released."""
+        """Hold the nodes of the particles not yet released."""
         return torch.where(nodes.held[..., None], torch.zeros_like(velocity), velocity)

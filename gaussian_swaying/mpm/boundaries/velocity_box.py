@@ -1,4 +1,4 @@
-"""A part of space in which the velocity is given."""
+"""A region of space with a prescribed velocity."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class VelocityBox(Boundary):
     """Gives the nodes inside a region a prescribed velocity.
 
     Args:
-        region: Where the nodes are driven, in scene units.
+        region: Region in which the nodes are driven, in scene units.
         velocity: Velocity [m/s], z up.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
@@ -40,7 +40,7 @@ class VelocityBox(Boundary):
         self.velocity: Tensor
 
     def in_frame(self, frame: SimFrame) -> VelocityBox:
-        """The box with its region asked in metres."""
+        """The box with its region evaluated in metres."""
         return self.copy_in(frame)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:

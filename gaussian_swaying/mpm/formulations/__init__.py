@@ -1,7 +1,7 @@
 """The formulations of the substep, one file each.
 
-Every file of this folder is imported with it, so a formulation is known by its name (``solver.formulation: total``) as
-soon as its file is here. ``FORMULATIONS`` lists the classes by name.
+Every file in this folder is imported automatically, so a formulation can be used by its name (``solver.formulation:
+total``) as soon as its file is here. ``FORMULATIONS`` lists the classes by name.
 """
 
 from __future__ import annotations

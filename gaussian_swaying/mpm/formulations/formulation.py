@@ -1,4 +1,4 @@
-"""What a formulation of the substep is: the material of a run on a grid, and how it moves."""
+"""Base class of the formulations: the material of a run on a grid, and how it moves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a formulation is told of the solver; ``MPMSolver`` explains the fields."""
+    """The solver settings that a formulation needs; ``MPMSolver`` explains the fields."""
 
     dx: float
     gravity: tuple[float, ...]
@@ -38,21 +38,21 @@ class Settings:
 
 
 class Formulation(ABC):
-    """A body bound to a grid: its first state, its substep in torch, and what it asks of substep and grid.
+    """A body bound to a grid: its first state, its substep in torch, and its limits on substep and grid.
 
-    Everything that a substep needs besides state and forces is computed once, here. Nothing of it changes: another
-    material, device or precision makes another object.
+    Everything that a substep needs besides state and forces is computed once, here, and never changes: a different
+    material, device or precision needs a new object.
 
     Args:
         body: The material with its laws and boundaries.
         settings: Numbers and switches of the solver.
 
     Attributes:
-        name: What it is called in a configuration.
-        neighbours_fixed: Whether particles keep the neighbours that they have at rest, as the stencils stay where they
-            are: such a body cannot tear, flow or leave its grid, and moving costs it no Courant number.
-        viscous_power: With which power of the largest squared stretch the viscous stress grows stiffer.
-        held: As that of the body, with what never changes on this grid.
+        name: Its name in a configuration.
+        neighbours_fixed: Whether particles keep their neighbours from the rest state, because the stencils do not move:
+            such a body cannot tear, flow or leave its grid, and its velocity does not count in the Courant number.
+        viscous_power: Power of the largest squared stretch with which the viscous stress stiffens.
+        held: As in the body, with the parts that are constant on this grid.
     """
 
     name: ClassVar[str]
@@ -69,25 +69,25 @@ class Formulation(ABC):
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
-        """Raise ValueError if the formulation does not know a setting."""
+        """Raise ValueError if the formulation does not support a setting."""
         return
 
     def twin(self) -> type[Fused] | None:
-        """The class that runs this substep in Triton kernels, or None; ImportError where there is no Triton."""
+        """The class that runs this substep in Triton kernels, or None; ImportError without Triton."""
         return None
 
     # ---- state and grid
 
     @abstractmethod
     def first_grid(self, margin: int) -> GridSpec:
-        """The grid of the body at rest, with so many further cells to each side where it may move."""
+        """The grid of the body at rest, with ``margin`` extra cells on each side if the body moves through the grid."""
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
         """The state at time zero.
 
         Args:
             velocity: Initial velocity [m/s], shape (..., P, 3).
-            margin: Cells around the object in the first grid, where it may move.
+            margin: Cells around the object in the first grid, if it moves through the grid.
         """
         position = self.body.points.position
         identity = torch.eye(3, dtype=position.dtype, device=position.device).repeat(*position.shape[:-1], 1, 1)
@@ -113,8 +113,8 @@ class Formulation(ABC):
 
         Args:
             position: Particle position [m], shape (..., P, 3).
-            margin: Further cells on each side.
-            speed: Largest speed [m/s], for the message if that is too much.
+            margin: Extra cells on each side.
+            speed: Largest speed [m/s], for the error message.
 
         Raises:
             FloatingPointError: If a position is NaN or infinite.
@@ -130,7 +130,7 @@ class Formulation(ABC):
             size = [round(v, 3) for v in (high - low).tolist()]
             what = f"The particles span {size} m"
             if 2 * margin * dx > max(size):
-                what = f"The particles may fly {margin * dx:.3g} m to any side within a frame, at {speed:.3g} m/s"
+                what = f"The particles may fly {margin * dx:.3g} m in any direction within a frame, at {speed:.3g} m/s"
             raise ValueError(
                 f"{what}, which takes {grid.node_count:,} grid nodes at dx = {dx:g} m, more "
                 f"than `max_nodes` = {most:,}: select a smaller region, coarsen `dx` or raise `max_nodes`."
@@ -159,7 +159,7 @@ class Formulation(ABC):
         """
 
     def decay(self, velocity: Tensor, time: float) -> Tensor:
-        """A velocity after the damping of so many seconds."""
+        """A velocity after ``time`` seconds of damping."""
         return velocity * math.exp(-self.settings.damping * time) if self.settings.damping > 0 else velocity
 
     def constrain(
@@ -175,9 +175,9 @@ class Formulation(ABC):
 
         Args:
             velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
-            share_of: The share of the nodal mass that held particles have now, shape (..., G).
-            position: Where the nodes are [m], shape (..., G, 3), if a boundary asks for it.
-            lattice: Where the lattice points are [m], shape (..., G, 3), if a boundary asks for it.
+            share_of: Returns the share of the nodal mass that held particles have now, shape (..., G).
+            position: Positions of the nodes [m], shape (..., G, 3), if a boundary needs them.
+            lattice: Positions of the lattice points [m], shape (..., G, 3), if a boundary needs them.
             time: Time at the start of the substep [s], scalar float64 tensor.
             dt: Substep [s], a number or a scalar float64 tensor.
 
@@ -185,7 +185,7 @@ class Formulation(ABC):
             Shape (..., G, 3).
         """
         pairs = zip(self.body.boundaries, self.held, strict=True)
-        # what pushes comes before what holds, in whatever order they were given
+        # impulses come before conditions that hold nodes, in whatever order they were given
         for boundary, held in sorted(pairs, key=lambda pair: not isinstance(pair[0], Impulse)):
             if held is None:
                 nodes = Nodes(time, dt, position, lattice)
@@ -195,7 +195,7 @@ class Formulation(ABC):
             velocity = boundary(velocity, nodes)
         return velocity
 
-    # ---- what a state has
+    # ---- measures of a state
 
     @abstractmethod
     def kinetic(self, state: MPMState) -> Tensor:
@@ -215,13 +215,13 @@ class Formulation(ABC):
         return damped_substep(float(limit.detach().amin()), self.viscous_time(state))
 
     def cells_per_second(self, state: MPMState) -> Tensor:
-        """How many cells the fastest wave crosses in a second, a scalar tensor."""
+        """How many cells the fastest wave crosses per second, a scalar tensor."""
         body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
         speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
         return cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach()
 
     def viscous_time(self, state: MPMState | None) -> float:
-        """The stiffness damping [s], grown by as much as the viscous stress of a stretched material is stiffer."""
+        """The stiffness damping [s], times the factor by which stretch stiffens the viscous stress."""
         time = self.settings.stiffness_damping
         if time == 0 or state is None:
             return time
@@ -236,19 +236,19 @@ def held_share(held: Held, stencil: Stencil, inverse_mass: Tensor, time: Tensor)
     Args:
         held: The particles.
         stencil: Support of all particles.
-        inverse_mass: One over the mass of each node [1/kg], 0 without any, shape (..., G).
+        inverse_mass: Inverse mass of each node [1/kg], 0 for a node without mass, shape (..., G).
         time: When [s], scalar float64 tensor.
     """
     return scatter(stencil, held.mass_at(time)[..., None, None])[..., 0] * inverse_mass
 
 
 def safe_inverse(mass: Tensor) -> Tensor:
-    """1 / mass where there is any, else 0; its derivative, 1 / mass², stays finite too."""
+    """1 / mass where there is mass, else 0; its derivative, 1 / mass², also stays finite."""
     floor = torch.finfo(mass.dtype).tiny ** 0.5
     return torch.where(mass > floor, 1 / mass.clamp(min=floor), 0.0)
 
 
 def not_finite(name: str, values: Tensor) -> FloatingPointError:
-    """The error that names the first particle of which a value (P, ·) is NaN or infinite."""
+    """The error that names the first particle with a NaN or infinite value, in ``values`` (P, ·)."""
     first = int((~torch.isfinite(values)).any(-1).int().argmax())
     return FloatingPointError(f"The {name} of particle {first} is NaN or infinite.")

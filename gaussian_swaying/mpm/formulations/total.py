@@ -31,12 +31,12 @@ class Total(Formulation):
         grid: The nodes.
         stencil: Support of the particles at rest.
         node_mass: Mass of each node [kg], shape (..., G).
-        node_inverse_mass: One over it [1/kg], 0 without any, shape (..., G).
-        node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary asks where
-            nodes are.
+        node_inverse_mass: Its inverse [1/kg], 0 for a node without mass, shape (..., G).
+        node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary needs node
+            positions.
 
     Raises:
-        ValueError: If a law flows, a pin holds nothing or the grid is too large.
+        ValueError: If a law is plastic, a pin holds nothing or the grid is too large.
     """
 
     name = "total"
@@ -48,7 +48,7 @@ class Total(Formulation):
         points, position = body.points, body.points.position
         if body.laws.plastic:
             raise ValueError(
-                f"The law {body.laws.plastic_names[0]} flows, which the total formulation cannot follow: set "
+                f"The law {body.laws.plastic_names[0]} flows, which the total formulation does not support: set "
                 "`solver.formulation` to updated, or choose an elastic law."
             )
         self.grid = self.bounding_grid(position, margin=0)
@@ -66,22 +66,22 @@ class Total(Formulation):
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
-        """MLS-MPM is another substep."""
+        """Raise ValueError for ``mls``, which is not supported."""
         if settings.mls:
             raise ValueError(
                 "`mls` is a variant of the updated formulation: set `formulation` to updated, or `mls` to false."
             )
 
     def _on_nodes(self, k: int, held: Held) -> Held:
-        """What the ``k``-th boundary holds, with its share of the nodes, which stay where they are."""
+        """What the ``k``-th boundary holds, with its constant share of each node."""
         boundary = self.body.boundaries[k]
         share = scatter(self.stencil, held.mass[..., None, None])[..., 0] * self.node_inverse_mass
         threshold = boundary.held_share
         if threshold is not None and not bool((share > threshold).any()):
             count = int((held.mass > 0).sum())
             raise ValueError(
-                f"The pin {k} holds {count} particles but no grid node: none of them has more than "
-                f"{threshold:g} of the mass of a node; enlarge `region` of the {type(boundary).__name__} or lower "
+                f"The pin {k} holds {count} particles but no grid node: they do not have more than "
+                f"{threshold:g} of the mass of any node; enlarge `region` of the {type(boundary).__name__} or lower "
                 "its `held_share`."
             )
         return replace(held, share=share if held.release is None else None, threshold=threshold or 0.0)
@@ -93,22 +93,22 @@ class Total(Formulation):
         return FusedTotal
 
     def first_grid(self, margin: int) -> GridSpec:
-        """That of the stencils."""
+        """The grid of the stencils."""
         return self.grid
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
-        """The state at time zero, its velocity as the nodes have it."""
+        """The state at time zero, with velocities interpolated from the nodes."""
         state = super().first_state(velocity, margin)
         momentum = scatter(self.stencil, (self.body.points.mass[..., None] * velocity)[..., None, :])
         node_velocity = momentum * self.node_inverse_mass[..., None]
         return self.read_particles(state, torch.zeros_like(node_velocity), node_velocity)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
-        """The state as it is: the grid rests."""
+        """The unchanged state: the grid does not move."""
         return state
 
     def step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
-        """One substep: forces to the nodes, their new velocity and displacement, and the particles read from them."""
+        """One substep: forces to the nodes, their new velocity and displacement, then the particles from them."""
         displacement = state.node_displacement
         assert displacement is not None
         assert state.node_velocity is not None
@@ -138,7 +138,7 @@ class Total(Formulation):
         return self.read_particles(state, displacement + dt * velocity, velocity)
 
     def share_at(self, time: Tensor) -> partial[Tensor]:
-        """What gives the share of the nodal mass that held particles have at a time, as ``constrain`` asks for it."""
+        """The function for ``constrain`` that returns the share of the nodal mass of held particles at a time."""
         return partial(held_share, stencil=self.stencil, inverse_mass=self.node_inverse_mass, time=time)
 
     def _accelerate(self, velocity: Tensor, acceleration: Tensor, kick: float, yielding: Tensor | None) -> Tensor:
@@ -166,12 +166,12 @@ class Total(Formulation):
         )
 
     def kinetic(self, state: MPMState) -> Tensor:
-        """Of the nodes."""
+        """Kinetic energy of the nodes."""
         assert state.node_velocity is not None
         return 0.5 * (self.node_mass * state.node_velocity.square().sum(-1)).sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        """Of the nodes."""
+        """Momenta of the nodes."""
         assert state.node_velocity is not None
         assert state.node_displacement is not None
         momentum = self.node_mass[..., None] * state.node_velocity

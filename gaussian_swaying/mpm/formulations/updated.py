@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Updated(Formulation):
-    """The paper's: APIC (Jiang et al. 2015), and MLS-MPM (Hu et al. 2018) as a variant, on a grid that follows.
+    """The paper's formulation: APIC (Jiang et al. 2015), with MLS-MPM (Hu et al. 2018) as a variant, on a moving grid.
 
     Args:
         body: The material with its laws and boundaries.
@@ -39,7 +39,7 @@ class Updated(Formulation):
         return FusedUpdated
 
     def first_grid(self, margin: int) -> GridSpec:
-        """Around the body at rest; ValueError where rounding would swallow the way of a substep."""
+        """The grid around the body at rest; ValueError if rounding would lose the motion of a substep."""
         position, dx = self.body.points.position, self.settings.dx
         farthest = float(position.detach().abs().amax()) if position.numel() else 0.0
         limit = 1e-3 * dx / torch.finfo(position.dtype).eps
@@ -47,12 +47,12 @@ class Updated(Formulation):
             raise ValueError(
                 f"Expected `position` within {limit:.3g} m of the origin, but got {farthest:.3g} m, where "
                 f"{position.dtype} rounds by more than a thousandth of a cell: shift the scene to the origin (SimFrame "
-                "does so), or use float64."
+                "does this), or use float64."
             )
         return self.bounding_grid(position, margin)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
-        """The state with a grid that serves for ``horizon`` seconds, at twice the present speeds and in gravity."""
+        """The state with a grid large enough for ``horizon`` seconds at twice the current speeds, with gravity."""
         dx, gravity = self.settings.dx, self.settings.gravity
         speed = float(torch.linalg.vector_norm(state.velocity.detach(), dim=-1).amax())
         if not math.isfinite(speed):
@@ -62,10 +62,10 @@ class Updated(Formulation):
         grid = self.bounding_grid(state.position, cells, speed)
         if not state.position.is_cuda:
             return state.replace(grid=grid)
-        # CUDA graphs are recorded for one grid, so it stays as long as it serves
+        # CUDA graphs are recorded for one grid, so keep it as long as it is large enough
         roomy = grid.with_room(state.grid)
         serves = state.grid.holds(grid) and state.grid.node_count <= 3 * roomy.node_count
-        if serves and not margin:  # a margin is asked for where the grid did not serve
+        if serves and not margin:  # callers give a margin if the grid was too small
             return state
         return state.replace(grid=roomy if roomy.node_count <= self.settings.max_nodes else grid)
 
@@ -84,7 +84,7 @@ class Updated(Formulation):
             stress = stress + matmul3(viscous, F.mT)
         kick = kick_time(state, dt)
         impulse = None if force is None else kick * force
-        if any(settings.gravity):  # here, and not on the nodes, of which most may be empty
+        if any(settings.gravity):  # here and not on the nodes, because most nodes may be empty
             weight = kick * points.mass[..., None] * self.gravity.to(F)
             impulse = weight if impulse is None else impulse + weight
         if drag is not None:
@@ -130,15 +130,15 @@ class Updated(Formulation):
         )
 
     def kinetic(self, state: MPMState) -> Tensor:
-        """Of the particles: the affine part carries D = dx²/4 of each (lumped APIC energy; Jiang et al. 2015)."""
+        """Energy of the particles; the affine part adds dx²/4 of its square (lumped APIC energy; Jiang et al. 2015)."""
         spread = 0.25 * self.settings.dx**2 * state.affine.square().sum((-1, -2))
         return 0.5 * (self.body.points.mass * (state.velocity.square().sum(-1) + spread)).sum(-1)
 
     def momenta(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        """Of the particles."""
+        """Momenta of the particles."""
         mass = self.body.points.mass
         momentum = mass[..., None] * state.velocity
-        # what the affine velocity adds: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)
+        # contribution of the affine velocity: the antisymmetric part of m C dx²/4 (Jiang et al. 2015)
         spin = state.affine * (mass * self.settings.dx**2 / 4)[..., None, None]
         own = torch.stack([spin[..., i, j] - spin[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
         angular = torch.linalg.cross(state.position, momentum, dim=-1) + own

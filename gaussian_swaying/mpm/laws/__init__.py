@@ -1,7 +1,7 @@
 """Constitutive laws, one file each.
 
-Every file of this folder is imported with it, so a law is known by its name (``class_path: Sand``) as soon as its file
-is here. ``LAWS`` lists the classes by name.
+Every file in this folder is imported automatically, so a law can be used by its name (``class_path: Sand``) as soon as
+its file is here. ``LAWS`` lists the classes by name.
 """
 
 from __future__ import annotations

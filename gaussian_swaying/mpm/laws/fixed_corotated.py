@@ -29,7 +29,7 @@ def fixed_corotated_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
 def fixed_corotated_pk1(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
     r"""First Piola-Kirchhoff stress :math:`2 \mu (F - R) + \lambda (J - 1) \operatorname{cof} F` [Pa].
 
-    The cofactor form needs no inverse, so it is finite for a crushed element too.
+    The cofactor form needs no inverse, so it is also finite for a crushed element.
 
     Args:
         F: Deformation gradient, shape (..., 3, 3).
@@ -49,7 +49,7 @@ def fixed_corotated_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, 
 
     See :mod:`~gaussian_swaying.mpm.laws.shared` for what they bound.
 
-    The term in mu adds at most :math:`2 \mu`, that in lambda is
+    The term in mu adds at most :math:`2 \mu`, the term in lambda is
     :math:`\lambda (\operatorname{cof} F \otimes \operatorname{cof} F + (J - 1) M)`.
 
     Args:

@@ -10,7 +10,7 @@ from gaussian_swaying.mpm.laws.law import PlasticLaw
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT, volumetric_moduli
 
 FLUID_LIMIT = 0.5
-"""Volume ratio below which the pressure of a fluid goes on as its tangent."""
+"""Volume ratio below which the pressure of a fluid is continued by its tangent."""
 
 
 def bulk_modulus(mu: Tensor, lam: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def fluid_pressure(det: Tensor, mu: Tensor, lam: Tensor, gamma: float = 7.0) -> 
 
     Args:
         det: Volume ratio J, shape (...).
-        mu: Shear modulus [Pa], shape (...); it only enters the bulk modulus.
+        mu: Shear modulus [Pa], shape (...); used only for the bulk modulus.
         lam: First Lamé parameter [Pa], shape (...).
         gamma: Exponent, above one.
 
@@ -86,13 +86,13 @@ def fluid_flow(
     internal: Tensor | None,
     dt: float | Tensor = 0.0,
 ) -> tuple[Tensor, Tensor | None]:
-    """Fluid: keeps the volume ratio J, at least 0.05, and forgets the shape.
+    """Fluid: keeps the volume ratio J, at least 0.05, and discards the change of shape.
 
     Args:
         stretch: Trial principal stretches, shape (..., 3).
         mu: Shear modulus [Pa], shape (...); not used.
         lam: First Lamé parameter [Pa], shape (...); not used.
-        internal: Passed on.
+        internal: Returned unchanged.
         dt: Substep [s]; not used.
 
     Returns:
@@ -103,10 +103,10 @@ def fluid_flow(
 
 
 class Fluid(PlasticLaw):
-    """Weakly compressible fluid without viscosity; only the bulk modulus lambda + 2/3 mu of the particles counts.
+    """Weakly compressible fluid without viscosity; it uses only the bulk modulus lambda + 2/3 mu of the particles.
 
     Args:
-        gamma: Exponent of the pressure in the density, above 1; 7 for water.
+        gamma: Exponent of the density in the pressure, above 1; 7 for water.
     """
 
     twin = "gaussian_swaying.mpm.laws.triton.fluid"
@@ -114,11 +114,11 @@ class Fluid(PlasticLaw):
     def __init__(self, gamma: float = 7.0) -> None:
         super().__init__()
         if not 1 < gamma < float("inf"):
-            raise ValueError(f"Expected `gamma` to be finite and above 1, but got {gamma}; water has 7.")
+            raise ValueError(f"Expected `gamma` to be finite and above 1, but got {gamma}; use 7 for water.")
         self.gamma = float(gamma)
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets."""
+        """The numbers of this law that are passed to its twin."""
         return (self.gamma,)
 
     def energy(self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None = None) -> Tensor:

@@ -24,13 +24,13 @@ def viscoplastic(
 
     Perzyna 1966, "Fundamental problems in viscoplasticity", with the linear overstress function (Simo & Hughes 1998,
     section 2.7): the overstress :math:`y = |\operatorname{dev} \tau| - \sqrt{2/3} \, \sigma_y` obeys
-    :math:`\dot y = -2 \mu y / \eta`, which is integrated exactly: two half substeps give what one does.
+    :math:`\dot y = -2 \mu y / \eta`, which is integrated exactly, so two half substeps equal a full one.
 
     Args:
         stretch: Trial principal stretches, shape (..., 3).
         mu: Shear modulus [Pa], shape (...).
         lam: First Lamé parameter [Pa], shape (...); not used.
-        internal: Passed on.
+        internal: Returned unchanged.
         yield_stress: Yield stress in uniaxial tension [Pa].
         viscosity: Viscosity eta [Pa s]; zero for plastic flow without delay.
         dt: Substep [s].
@@ -40,7 +40,7 @@ def viscoplastic(
     """
     trace, deviator, norm, direction = split_strain(continued_log(stretch))
     over = 2 * mu * norm - ROOT * yield_stress
-    # one minus the factor that is left, without loss of digits for a short substep
+    # one minus the remaining factor, without loss of digits for a short substep
     relaxed = -torch.expm1(-2 * mu * dt / viscosity) if viscosity > 0 else torch.ones_like(mu)
     flow = over.clamp(min=0) * relaxed / (2 * mu)
     strain = deviator - flow[..., None] * direction + trace[..., None] / 3
@@ -64,7 +64,7 @@ class Foam(PlasticLaw, StVKHencky):
         self.yield_stress, self.viscosity = float(yield_stress), float(viscosity)
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets."""
+        """The numbers of this law that are passed to its twin."""
         return (self.yield_stress, self.viscosity)
 
     def flow(

@@ -78,7 +78,7 @@ def stvk_hencky_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tens
 class StVKHencky(ConstitutiveLaw):
     """Elastic solid with an energy quadratic in the logarithmic stretches, the base of the plastic solids.
 
-    It softens in tension beyond a stretch of about e, so it is no choice for rubber.
+    It softens in tension beyond a stretch of about e, so do not use it for rubber.
     """
 
     twin = "gaussian_swaying.mpm.laws.triton.hencky"

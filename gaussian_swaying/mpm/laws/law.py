@@ -1,4 +1,4 @@
-"""What a law is: a stress, its energy, the stiffness that limits the time step and, if it flows, a return map."""
+"""Base classes of the laws: stress, energy, the stiffness that limits the time step and, if plastic, a return map."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from gaussian_swaying.geometry.linalg import from_principal, matmul3, spectrum
 
 
 class ConstitutiveLaw(nn.Module, ABC):
-    """Base of all laws.
+    """Base class of all laws.
 
-    A law is a subclass with :meth:`energy`, :meth:`pk1` and :meth:`moduli`; one that flows is a subclass of
+    A law is a subclass with :meth:`energy`, :meth:`pk1` and :meth:`moduli`; a plastic law is a subclass of
     :class:`PlasticLaw` with ``flow``. That is all that the torch substep needs. To run in the Triton kernels too, a law
-    names its ``twin``. Elastic stiffness belongs to the particles (Lamé parameters); what a law adds of its own are the
+    names its ``twin``. Elastic stiffness belongs to the particles (Lamé parameters); all other parameters of a law are
     arguments of its constructor.
 
     Attributes:
         plastic: Whether there is a return map. The deformation gradient is then only the elastic part of the
             deformation since rest, which needs the ``updated`` formulation.
         internal: Initial value of the one internal variable of each particle, or None if there is none.
-        twin: Module with the law's device functions, a :class:`~gaussian_swaying.mpm.laws.twin.LawTwin` named ``TWIN``,
-            which is imported where kernels run; None for a law that runs in torch only. A subclass does not inherit it,
-            as it may change the law.
+        twin: Module with the law's device functions, a :class:`~gaussian_swaying.mpm.laws.triton.twin.LawTwin` named
+            ``TWIN``, which is imported only if kernels run; None for a law that runs in torch only. A subclass does not
+            inherit it, because it may change the law.
     """
 
     plastic: bool = False
@@ -37,7 +37,7 @@ class ConstitutiveLaw(nn.Module, ABC):
         cls.twin = vars(cls).get("twin")
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets, at most four."""
+        """The numbers of this law that are passed to its twin, at most four."""
         return ()
 
     @abstractmethod
@@ -97,7 +97,7 @@ class ConstitutiveLaw(nn.Module, ABC):
 
 
 class PlasticLaw(ConstitutiveLaw):
-    """A law whose return map acts on the principal stretches and leaves the principal axes."""
+    """A law whose return map acts on the principal stretches and keeps the principal axes."""
 
     plastic = True
 
@@ -110,7 +110,7 @@ class PlasticLaw(ConstitutiveLaw):
     def return_map(
         self, F: Tensor, mu: Tensor, lam: Tensor, internal: Tensor | None, dt: float | Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """The return map of the base class, with the trial's rotation and axes."""
+        """The return map on principal stretches; the rotation and axes of the trial are kept."""
         if internal is None and self.internal is not None:
             internal = torch.full_like(mu, self.internal)
         parts = spectrum(F)

@@ -15,7 +15,7 @@ class Metal(PlasticLaw, StVKHencky):
 
     Args:
         yield_stress: Yield stress in uniaxial tension [Pa].
-        hardening: Its growth with the accumulated plastic strain [Pa].
+        hardening: Increase of the yield stress with the accumulated plastic strain [Pa].
     """
 
     twin = "gaussian_swaying.mpm.laws.triton.metal"
@@ -32,7 +32,7 @@ class Metal(PlasticLaw, StVKHencky):
         self.yield_stress, self.hardening = float(yield_stress), float(hardening)
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets."""
+        """The numbers of this law that are passed to its twin."""
         return (self.yield_stress, self.hardening, 0.0)
 
     def flow(

@@ -55,7 +55,7 @@ def neo_hookean_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tens
 
 
 class NeoHookean(ConstitutiveLaw):
-    """Elastic solid that resists crushing without limit, and the cheapest: it needs no polar decomposition."""
+    """Elastic solid that resists crushing without limit. It is the cheapest law: it needs no polar decomposition."""
 
     twin = "gaussian_swaying.mpm.laws.triton.neo_hookean"
 

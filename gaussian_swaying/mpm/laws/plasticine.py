@@ -15,8 +15,8 @@ class Plasticine(PlasticLaw, StVKHencky):
 
     Args:
         yield_stress: Yield stress in uniaxial tension before any flow [Pa].
-        softening: Its fall with the accumulated plastic strain [Pa].
-        residual: Yield stress at which the fall ends [Pa].
+        softening: Decrease of the yield stress with the accumulated plastic strain [Pa].
+        residual: Lowest yield stress [Pa].
     """
 
     twin = "gaussian_swaying.mpm.laws.triton.metal"
@@ -34,7 +34,7 @@ class Plasticine(PlasticLaw, StVKHencky):
         self.yield_stress, self.softening, self.residual = float(yield_stress), float(softening), float(residual)
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets."""
+        """The numbers of this law that are passed to its twin."""
         return (self.yield_stress, -self.softening, self.residual)
 
     def flow(

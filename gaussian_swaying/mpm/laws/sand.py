@@ -16,7 +16,7 @@ def cone_slope(friction_angle: float) -> float:
     r"""Slope :math:`\alpha = \sqrt{2/3} \, 2 \sin \phi / (3 - \sin \phi)` of the Drucker-Prager cone.
 
     It meets the Mohr-Coulomb pyramid of the friction angle in triaxial compression (Klar et al. 2016); in simple shear
-    the material stands at a steeper angle, 34.7 degrees for 30.
+    the material holds a steeper angle, 34.7 degrees for 30.
 
     Args:
         friction_angle: Angle phi [degrees].
@@ -37,9 +37,9 @@ def drucker_prager(
 
     Klar et al. 2016, "Drucker-Prager elastoplasticity for sand animation", section 7.3 of the technical report: tension
     leaves no stress, shear flows without a change of volume. The internal variable, if there is one, is the volume
-    :math:`v_c` [logarithm of a ratio] that the particle gained by the former; :math:`v_c / 3` is added to the strains,
-    so that the sand must lose it before it carries load again (Tampubolon et al. 2017, "Multi-species simulation of
-    porous sand and water mixtures").
+    :math:`v_c` [logarithm of a ratio] that the particle gained in tension; :math:`v_c / 3` is added to the strains, so
+    the sand must lose it before it carries load again (Tampubolon et al. 2017, "Multi-species simulation of porous sand
+    and water mixtures").
 
     Args:
         stretch: Trial principal stretches, shape (..., 3).
@@ -59,7 +59,7 @@ def drucker_prager(
     kept = stretch if internal is None else stretch * (internal / 3).exp()[..., None]
     flowed = stretch_of_log(strain - excess.clamp(min=0)[..., None] * direction)
     new = torch.where((excess <= 0)[..., None], kept, flowed)
-    # at rest, the tip of the cone, "kept" lets gradients pass
+    # at rest (the tip of the cone) ``kept`` passes gradients
     new = torch.where((trace > 0)[..., None], torch.ones_like(new), new)
     if internal is None:
         return new, None
@@ -70,8 +70,9 @@ class Sand(PlasticLaw, StVKHencky):
     """Dry granular material without cohesion: Hencky elasticity in a Drucker-Prager cone.
 
     Args:
-        friction_angle: Friction angle in triaxial compression [degrees]; a slope stands at a steeper one, 34.7 for 30.
-        volume_correction: Take back the volume that sand gains where it is pulled apart, before it carries load again.
+        friction_angle: Friction angle in triaxial compression [degrees]; a slope can be steeper, 34.7 for 30.
+        volume_correction: Whether sand that was pulled apart must lose the volume it gained before it carries load
+            again.
     """
 
     twin = "gaussian_swaying.mpm.laws.triton.sand"
@@ -80,13 +81,13 @@ class Sand(PlasticLaw, StVKHencky):
         super().__init__()
         if not 0 < friction_angle < 90:
             raise ValueError(
-                f"Expected `friction_angle` between 0 and 90 degrees, but got {friction_angle}; dry sand has about 30."
+                f"Expected `friction_angle` between 0 and 90 degrees, but got {friction_angle}; use 30 for dry sand."
             )
         self.friction_angle = float(friction_angle)
         self.internal = 0.0 if volume_correction else None
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets."""
+        """The numbers of this law that are passed to its twin."""
         return (cone_slope(self.friction_angle), 0.0 if self.internal is None else 1.0)
 
     def flow(

@@ -1,6 +1,6 @@
-r"""What several laws are made of: Lamé parameters, the continued logarithm, bounds on the stiffness, return maps.
+r"""Building blocks of the laws: Lamé parameters, the continued logarithm, bounds on the stiffness, return maps.
 
-Each law is defined for crushed and inverted elements too, with finite stress that pushes them back.
+Each law is also defined for crushed and inverted elements: a finite stress pushes them back.
 
 The stiffness functions return two bounds [Pa] on the Hessian :math:`\partial^2 \Psi / \partial F^2`: ``wave``, on
 :math:`m \otimes N : H : m \otimes N` for unit vectors m and N, which is density times the square of the speed of the
@@ -25,14 +25,14 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg import determinant, divided_differences, matmul3, symmetric_eigenvalues
 
 LOG_LIMIT = 0.05
-"""Stretch, or volume ratio, below which logarithms go on as their tangent."""
+"""Stretch, or volume ratio, below which logarithms are continued by their tangent."""
 
 ROOT = math.sqrt(2 / 3)
-"""Norm of the deviator of a stress of one in uniaxial tension."""
+"""Norm of the deviator of a unit stress in uniaxial tension."""
 
 
 def continued_log(x: Tensor) -> Tensor:
-    """Logarithm, below 0.05 continued by its tangent: defined for every number, and so is its gradient."""
+    """Logarithm, below 0.05 continued by its tangent: it and its gradient are defined for every number."""
     inside = x.clamp(min=LOG_LIMIT)
     return inside.log() + (x - inside) / LOG_LIMIT
 
@@ -98,8 +98,8 @@ def split_strain(strain: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def stretch_of_log(strain: Tensor) -> Tensor:
     """Stretches from logarithmic ones, at least 0.05.
 
-    Further below the Kirchhoff stress fades, and a particle would stay crushed. The limit draws strains together, so it
-    never leads out of a von Mises cylinder.
+    Below that, the Kirchhoff stress fades and a particle would stay crushed. The limit brings strains closer together,
+    so it never leads out of a von Mises cylinder.
     """
     return strain.clamp(min=math.log(LOG_LIMIT)).exp()
 
@@ -138,7 +138,7 @@ def von_mises(
     trial = 2 * mu * norm
     line = yield_stress + hardening * internal
     stiffness = 2 * mu + 2 / 3 * hardening
-    # both branches of the yield stress ask for a flow; the larger yield stress, hence the smaller flow, counts
+    # each branch of the yield stress gives a flow; the larger yield stress, hence the smaller flow, applies
     floor_flow = (trial - ROOT * residual) / (2 * mu)
     line_flow = (trial - ROOT * line) / torch.where(stiffness > 0, stiffness, 1.0)
     flow = torch.where(stiffness > 0, torch.minimum(line_flow, floor_flow), floor_flow)

@@ -1,4 +1,4 @@
-"""Snow: fixed corotated elasticity within bounds of the stretches."""
+"""Snow: fixed corotated elasticity with bounded stretches."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def snow_lame(mu: Tensor, lam: Tensor, plastic_volume: Tensor, hardening: float)
     Args:
         mu: Shear modulus [Pa], shape (...).
         lam: First Lamé parameter [Pa], shape (...).
-        plastic_volume: Plastic volume ratio J_p, shape (...); it counts as at least 0.6.
+        plastic_volume: Plastic volume ratio J_p, shape (...); values below 0.6 count as 0.6.
         hardening: Hardening xi.
 
     Returns:
@@ -43,7 +43,7 @@ def snow_plasticity(
     critical_stretch: float,
     dt: float | Tensor = 0.0,
 ) -> tuple[Tensor, Tensor]:
-    r"""Snow: stretches stay in :math:`[1 - \theta_c, 1 + \theta_s]`, what they lose goes to the plastic volume ratio.
+    r"""Snow: stretches stay in :math:`[1 - \theta_c, 1 + \theta_s]`, the rest goes into the plastic volume ratio.
 
     Stomakhin et al. 2013, "A material point method for snow simulation", section 7.
 
@@ -65,7 +65,7 @@ def snow_plasticity(
 
 
 class Snow(PlasticLaw):
-    """Snow: fixed corotated within bounds of the stretches, stiffer when packed and softer when pulled apart.
+    """Snow: fixed corotated elasticity with bounded stretches, stiffer when packed and softer when pulled apart.
 
     Its internal variable is the plastic volume ratio. The defaults are those of Stomakhin et al. 2013.
 
@@ -92,7 +92,7 @@ class Snow(PlasticLaw):
         self.hardening = float(hardening)
 
     def coefficients(self) -> tuple[float, ...]:
-        """The numbers of this law that its twin gets."""
+        """The numbers of this law that are passed to its twin."""
         return (self.critical_compression, self.critical_stretch, self.hardening)
 
     def _lame(self, mu: Tensor, lam: Tensor, internal: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -19,11 +19,12 @@ def spring_network_energy(F: Tensor, mu: Tensor, lam: Tensor) -> Tensor:
         \Psi = \tfrac{K}{2} \langle (\lvert F e \rvert - 1)^2 \rangle_e
         + (\mu - m) \lVert S - I \rVert^2 + \tfrac{\lambda - m}{2} (\operatorname{tr} S - 3)^2 .
 
-    The mean over all directions e is that of the 26 of Lebedev's rule of degree 7, laid along the principal axes: the
-    axes, the diagonals of their planes and those of space, with weights 2/21, 16/105 and 9/35 for each axis, plane and
-    for the four together. For small strain it is Hooke's law with equal Lamé parameters, Cauchy's solid, and the other
-    terms bring it to those given. It stiffens in tension as a lattice of springs does, which is what most cloth
-    solvers move; fixed corotated elasticity softens. Lengths of diagonals below 0.05 go on as their tangent.
+    The mean over all directions e is the mean over the 26 directions of Lebedev's rule of degree 7, aligned with the
+    principal axes: the axes, the diagonals of their planes and the space diagonals, with weights 2/21, 16/105 and 9/35
+    for each axis, for each plane and for the four space diagonals together. For small strain it is Hooke's law with
+    equal Lamé parameters (Cauchy's solid); the other terms add what is missing from the given parameters. It stiffens
+    in tension like a lattice of springs, the model of most cloth solvers; fixed corotated elasticity softens. Lengths
+    of diagonals below 0.05 are continued by their tangent.
 
     Args:
         F: Deformation gradient, shape (..., 3, 3).
@@ -47,7 +48,7 @@ def _network_parts(mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _network_squares(a: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared lengths of the diagonals of each plane (..., 3), named by the axis across it, and of space (..., 1)."""
+    """Squared lengths of the diagonals of each plane (..., 3), named by its normal axis, and of space (..., 1)."""
     squares = a.square()
     total = squares.sum(-1, keepdim=True)
     return 0.5 * (total - squares), total / 3
@@ -101,7 +102,7 @@ def spring_network_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, T
         others, turns = (x.sum(-1, keepdim=True) - x for x in (pull, turn))
         common = 3 / 35 * (whole + spread / 3 * a.square())
         own = 15 * least * (2 / 21 + 8 / 105 * (others + 0.5 * turns * a.square()) + common) + 2 * shear + bulk
-        i, j, k = (0, 0, 1), (1, 2, 2), (2, 1, 0)  # a pair of axes, and the one across their plane
+        i, j, k = (0, 0, 1), (1, 2, 2), (2, 1, 0)  # a pair of axes, and the normal of their plane
         pairs = a[..., i] * a[..., j] * (4 / 105 * turn[..., k] + spread / 35)
         mixed = torch.zeros_like(F)
         mixed[..., i, j] = mixed[..., j, i] = 15 * least * pairs + bulk
@@ -110,9 +111,10 @@ def spring_network_moduli(F: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, T
 
 
 class SpringNetwork(ConstitutiveLaw):
-    """Elastic solid of springs that are linear in their length: cloth, as solvers of springs move it.
+    """Elastic solid of springs that are linear in their length: cloth, as in mass-spring solvers.
 
-    It stiffens in tension, where fixed corotated elasticity softens: a tenth and more apart at a stretch of 1.2.
+    It stiffens in tension, where fixed corotated elasticity softens: they differ by a tenth and more at a stretch of
+    1.2.
     """
 
     twin = "gaussian_swaying.mpm.laws.triton.spring_network"

@@ -1,5 +1,5 @@
-"""The substeps as Triton kernels, and what runs them; only imported where they are used.
+"""The substeps as Triton kernels, and the code that runs them; imported only where they are used.
 
-For each formulation a file of kernels and a file that prepares the buffers and launches them, a subclass of
-:class:`~gaussian_swaying.mpm.triton.fused.Fused`.
+Each formulation has a file of kernels, and a file with a subclass of :class:`~gaussian_swaying.mpm.triton.fused.Fused`
+that prepares the buffers and launches the kernels.
 """

@@ -1,7 +1,7 @@
-"""Damping in proportion to stiffness as a Triton function; the definition is :mod:`~gaussian_swaying.mpm.damping`."""
+"""Stiffness-proportional damping as a Triton function; the reference is :mod:`~gaussian_swaying.mpm.damping`."""
 
 import triton
-import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
+import triton.language as tl  # noqa: F401  (Triton's interpreter needs it)
 
 from gaussian_swaying.geometry.linalg_triton import matmul, scale9, transpose
 

@@ -1,7 +1,7 @@
 """Runs substeps with the Triton kernels: buffers, forces, CUDA graphs.
 
-Used by ``MPMSolver`` in place of the torch substep of a formulation where no gradient is asked for; the torch substep
-is the definition. Each formulation has a subclass of :class:`Fused`.
+``MPMSolver`` uses it instead of the torch substep of a formulation if no gradient is needed; the torch substep is the
+reference. Each formulation has a subclass of :class:`Fused`.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.triton.shared import SCHEDULE
 
 MAX_STEPS = MOST_STEPS
-"""Substeps whose schedule the buffers hold; longer rollouts are run in parts."""
+"""Number of substeps whose schedule fits in the buffers; longer rollouts are run in parts."""
 
 MAX_INDEX = 2**31
-"""Entries that the kernels, which count with 32 bits, can reach in a buffer."""
+"""Number of entries of a buffer that the kernels can address, with 32-bit indices."""
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
@@ -39,10 +39,10 @@ class Fused(ABC):
     """Substeps of a formulation bound to its material.
 
     Args:
-        bound: The formulation, which does not know this; see :meth:`unsupported`.
+        bound: The formulation; it must be supported, see :meth:`unsupported`.
 
     Attributes:
-        fixed_order: Whether sums take the same order in every run.
+        fixed_order: Whether sums have the same order in every run.
     """
 
     fixed_order: ClassVar[bool]
@@ -67,14 +67,14 @@ class Fused(ABC):
         self.force_in = torch.zeros(0, 4, device=self.device)
         self.wave = shared(points.laws, "wave")
         self.watches = self.wave is not None
-        """Whether rollouts can look at the speed of waves."""
+        """Whether rollouts can measure the wave speed."""
         self.speed = torch.zeros(1, device=self.device)
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in bound.settings.gravity]
         self._values_of: list[tuple[Tensor, int | None]] = []
         self.asked: tuple[Force, ...] = ()
-        """The forces of the present rollout that are asked in torch, in every substep."""
+        """The forces of the current rollout that are computed in torch, in every substep."""
         self._resist: tuple[object, bool] = ((), False)
         self._seen: dict[str, Tensor] = {}
         self.repeater = Repeater(self.device)
@@ -91,20 +91,20 @@ class Fused(ABC):
         if not (points.position.is_cuda or (INTERPRETED and interpret)):
             return "it needs a CUDA device"
         if points.position.dtype != torch.float32:
-            return f"it computes in float32, and the material is {points.position.dtype}".replace("torch.", "")
+            return f"it computes in float32, but the material is {points.position.dtype}".replace("torch.", "")
         if bound.settings.deterministic and not cls.fixed_order:
-            return f"in the {bound.name} formulation its sums have no fixed order, as `deterministic` asks for"
+            return f"its sums have no fixed order in the {bound.name} formulation, but `deterministic` is set"
         for law in points.laws:
             if twin_of(law) is None:
-                return f"the law {type(law).__name__} has no fused form"
+                return f"the law {type(law).__name__} has no Triton twin"
         return None
 
     def holds(self) -> bool:
-        """Whether buffers and graphs still serve: nothing that they were made from was replaced."""
+        """Whether buffers and graphs are still valid: nothing that they were made from was replaced."""
         return self._made_from == _made_from(self.body)
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
-        """Nothing to copy or pickle: a solver makes its buffers and graphs anew."""
+        """Nothing to copy or pickle: a solver builds its buffers and graphs again."""
         return _nothing, ()
 
     def rollout(
@@ -118,20 +118,20 @@ class Fused(ABC):
         looks: Sequence[int] = (),
         watch: Callable[[int], None] | None = None,
     ) -> tuple[MPMState, Tensor]:
-        """Advance by ``steps`` substeps of ``dt`` [s], with some forces or one that stays (see ``MPMSolver.step``).
+        """Advance by ``steps`` substeps of ``dt`` [s], with forces or with one constant force (see ``MPMSolver.step``).
 
         Args:
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            forces: Forces of which all but the first with a twin are recordable.
+            forces: Forces; all but the first one with a twin must be recordable.
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
-            looks: After which substeps to look at the speed of waves, if ``watches``.
-            watch: Told how many substeps have been handed to the GPU, each time the buffers are full.
+            looks: Numbers of the substeps after which the wave speed is measured, if ``watches``.
+            watch: Called with the number of substeps passed to the GPU so far, after each part of the rollout.
 
         Returns:
-            The state, and how many cells the fastest wave crosses in a second at any look [1/s] (zero without looks).
+            The state, and the most cells that a wave crosses per second at any of the ``looks`` [1/s] (zero without).
         """
         with _at_home(self.speed):
             self.speed.zero_()
@@ -149,7 +149,7 @@ class Fused(ABC):
                 "IMPLICIT": drag is not None or (twin is not None and twin.implicit) or self._resists(state),
             }
             if options["FORCE"]:
-                if len(self.force_in) < self.count:  # the first time that it is needed
+                if len(self.force_in) < self.count:  # needed for the first time
                     self.force_in = torch.zeros(self.count, 4, device=self.device)
                 self.force_in.zero_()
                 self._fill(force, drag)
@@ -158,7 +158,7 @@ class Fused(ABC):
                 marks = [look - first for look in looks if first < look <= first + part]
                 before = state.work
                 state = self._advance(state, dt, part, twin, options, marks)
-                if force is None and not forces:  # a drag alone does no work that counts
+                if force is None and not forces:  # the work of a drag alone is not counted
                     state = state.replace(work=before)
                 if watch is not None:
                     watch(first + part)
@@ -167,7 +167,7 @@ class Fused(ABC):
     def _advance(
         self, state: MPMState, dt: float, steps: int, twin: ForceTwin | None, options: dict[str, Any], looks: list[int]
     ) -> MPMState:
-        """As many substeps as the buffers hold."""
+        """Run a part of a rollout whose schedule fits in the buffers."""
         kick = kick_time(state, dt)
         decay = [math.exp(-self.settings.damping * t) for t in (kick, dt)]
         rows = [[0.0, dt, 1.0, 0.0], [kick, dt, decay[0], 0.0], *[[dt, dt, decay[1], 0.0]] * steps]
@@ -187,7 +187,7 @@ class Fused(ABC):
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
     def _take_twin(self, twin: ForceTwin) -> None:
-        """Take the numbers of a twin, and its values of the particles where they are other ones."""
+        """Copy the numbers of a twin to the buffers, and its particle values if they have changed."""
         self.numbers[: len(twin.numbers)].copy_(twin.numbers)
         sources = [(t, None if t.is_inference() else t._version) for t in twin.sources]
         known = zip(self._values_of, sources, strict=False)
@@ -207,26 +207,26 @@ class Fused(ABC):
             self.force_in[:, 3].copy_(drag.expand_as(points.mass).reshape(-1))
 
     def _ask(self, state: MPMState) -> tuple[Tensor | None, Tensor | None]:
-        """The sum of the forces in torch and that of their resistances."""
+        """The sum of the forces in torch and the sum of their resistances."""
         return added([split(force(state), force, state) for force in self.asked])
 
     def _asked_key(self) -> tuple[object, ...]:
-        """What recorded forces rest on; the forces themselves are in it, so that nothing else takes their place."""
+        """What recorded forces depend on; it holds the forces themselves, so that no other object takes their place."""
         return (self.asked, fingerprint(self.asked)) if self.asked else ()
 
     def _resists(self, state: MPMState) -> bool:
-        """Whether a force in torch gives a resistance, from asking each once."""
+        """Whether a force in torch returns a resistance; calls each force once."""
         key = self._asked_key()
         if key != self._resist[0]:
             self._resist = key, self._ask(state)[1] is not None
         return self._resist[1]
 
     def _push(self) -> None:
-        """Let the forces in torch look at the particles as they are in the buffers now, and fill theirs."""
+        """Compute the forces in torch from the particles in the buffers, and fill the force buffer."""
         self._fill(*self._ask(self._look_at()))
 
     def _room(self, name: str, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        """A buffer for a field of the particles, which stays where it is: graphs write to it and read from it."""
+        """A buffer for a particle field. Its address stays the same, because graphs write to it and read from it."""
         if name not in self._seen:
             self._seen[name] = torch.zeros(shape, dtype=dtype, device=self.device)
         return self._seen[name]
@@ -237,21 +237,21 @@ class Fused(ABC):
 
     @abstractmethod
     def _take_values(self, values: Tensor) -> None:
-        """Take the values of a twin, shape (N, n)."""
+        """Copy the values of a twin, shape (N, n), to the buffers."""
 
     @abstractmethod
     def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
-        """Take the state into the buffers, run the substeps, and give the fields of the state after them."""
+        """Copy the state to the buffers, run the substeps, and return the fields of the new state."""
 
     @abstractmethod
     def _work(self) -> Tensor:
         """Work of the load in each scene [J], shape (scenes,), float64."""
 
     def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
-        """Run ``body(offset)``, one substep, for each offset, from graphs where there are any.
+        """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.
 
-        The first time a key is seen the substeps run as they are, which compiles what is not yet compiled; the second
-        time they are recorded.
+        The first time a key is seen, the substeps run without a graph, which compiles what is not yet compiled; the
+        second time, they are recorded.
         """
 
         def several(count: int) -> None:
@@ -265,22 +265,22 @@ class Fused(ABC):
 
 @contextmanager
 def _at_home(buffer: Tensor) -> Iterator[None]:
-    """The device of a buffer, where Triton is to launch, and ordinary tensors, which may be written in any mode."""
+    """Launch Triton on the device of a buffer, and create ordinary tensors, which can be written in any mode."""
     with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
         yield
 
 
 def check_indices(entries: int) -> None:
-    """Raise ValueError if a buffer has more entries than the kernels can reach."""
+    """Raise ValueError if a buffer has more entries than the kernels can address."""
     if entries > MAX_INDEX:
         raise ValueError(
-            f"The Triton kernels reach {MAX_INDEX:,} entries of a buffer, and this body or grid takes {entries:,}: set "
-            "`solver.transfer` to torch."
+            f"The Triton kernels can use {MAX_INDEX:,} entries of a buffer, but this body or grid needs {entries:,}: "
+            "set `solver.transfer` to torch."
         )
 
 
 def _nothing() -> None:
-    """What stands for a Fused in a copy."""
+    """The placeholder for a Fused in a copy."""
 
 
 def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
@@ -290,5 +290,5 @@ def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
 
 
 def _made_from(body: Body) -> tuple[object, ...]:
-    """What the buffers and graphs of a body rest on besides its points: they hold as long as it is the same."""
+    """What the buffers and graphs of a body depend on besides its points; if it changes, they are invalid."""
     return fingerprint([*body.boundaries, *body.points.laws])

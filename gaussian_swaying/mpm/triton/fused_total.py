@@ -16,13 +16,13 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, check_indices
 
-# time of a particle with so many lanes to a cell, relative to 32, on an H200
+# time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
 _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 
-# pieces into which `total` cuts particles at least, where its cells are too few: about the warps that an H200 holds
+# least number of pieces that `total` cuts its cells into: about the number of warps that an H200 holds
 _PROGRAMS = 2048
 
-# more warps at once are worth the spilled registers
+# spilling registers is worth it, because more warps run at once
 _REGISTERS = {64: {"maxnreg": 128}}
 
 
@@ -49,7 +49,7 @@ class FusedTotal(Fused):
         self.cell_node = cells.int()
         self.cell_scene = (cells // grid.node_count).int()
         self.particle_cell = torch.repeat_interleave(torch.arange(self.cells, device=self.device), sizes).int()
-        # the place in the cell, from the slope of the first weight, (f - 1.5) / dx
+        # the position in the cell, from the slope of the first weight, (f - 1.5) / dx
         self.fraction = (1.5 + stencil.factors[1, :, 0] * grid.dx)[:, order].contiguous()
         rows = [points.volume, body.laws.mu, body.laws.lam, points.mass]
         self.material = torch.stack([row.reshape(-1) for row in rows])[:, order].contiguous()
@@ -85,7 +85,7 @@ class FusedTotal(Fused):
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
 
     def _cut(self, sizes: Tensor) -> None:
-        """Cut crowded cells into pieces: a body of few cells would else have too few programs to fill a GPU."""
+        """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU."""
         most = self.lanes * max(1, -(-self.count // (self.lanes * _PROGRAMS)))
         counts = -(-sizes // most)
         first = counts.cumsum(0) - counts
@@ -100,7 +100,7 @@ class FusedTotal(Fused):
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
     def _sums(self, rows: int, width: int) -> Tensor:
-        """Buffer of the sums of each cell or piece of one, with a row of zeros behind the last."""
+        """Buffer for the sums of each cell or piece of a cell, with a row of zeros at the end."""
         if (rows, width) not in self._partial:
             self._partial[rows, width] = torch.zeros(27, rows + 1, width, device=self.device)
         return self._partial[rows, width]
@@ -161,10 +161,10 @@ class FusedTotal(Fused):
             self.time.add_(self.dt)
 
     def _constrain(self) -> None:
-        """Boundary conditions that the kernels do not know, and the displacements after them."""
+        """Apply the boundary conditions that the kernels do not support, and update the displacements."""
         bound, inverse = self.bound, self.bound.node_inverse_mass
         shape = (*inverse.shape, 3)
-        # nodes without mass forget what a boundary gave them
+        # nodes without mass keep no velocity from a boundary
         velocity = torch.where(inverse[..., None] > 0, self.velocity[:, :3].reshape(shape), 0.0)
         position = lattice = None
         if bound.node_rest is not None:
@@ -195,7 +195,7 @@ class FusedTotal(Fused):
     def _read_into(
         self, position: Tensor, velocity: Tensor, affine: Tensor, F: Tensor, row: Tensor, work: bool, implicit: bool
     ) -> None:
-        """Particle fields from the nodes, and the end of the work of the substep of a row of the schedule."""
+        """Compute the particle fields from the nodes, and complete the work of the substep in schedule row ``row``."""
         _, ny, nz = self.grid.resolution
         block = 128
         kernels.total_read[(-(-self.count // block),)](
@@ -219,7 +219,7 @@ class FusedTotal(Fused):
 
 
 def _lanes(sizes: Tensor) -> int:
-    """Lanes per cell for which all cells have the least to do, full lanes or not (one synchronisation)."""
+    """Lanes per cell that give the least total work, with empty lanes included (one synchronisation)."""
     lanes = list(_LANE_COST)
     work = torch.stack([(-(-sizes // n)).sum() * n for n in lanes]).tolist()
     return min(zip(lanes, work, strict=True), key=lambda pair: pair[1] * _LANE_COST[pair[0]])[0]

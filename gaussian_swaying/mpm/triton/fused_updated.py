@@ -50,14 +50,14 @@ class FusedUpdated(Fused):
         self.constants[:, 5 : 5 + values.shape[1]] = values
 
     def _take_grid(self, grid: GridSpec, width: int) -> None:
-        """Make room for a grid, and forget the graphs of another one."""
+        """Allocate buffers for a grid, and drop the graphs of another one."""
         nodes = grid.node_count * self.scenes
         check_indices(nodes * width)
         if nodes > len(self.velocity) or width != self.momentum.shape[1]:
             room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
             held = room if len(self.body.boundaries) else 0
-            self.repeater.forget()  # before there is need of their memory
-            with torch.inference_mode(False):  # they may be written within inference mode and without
+            self.repeater.forget()  # free their memory before allocating more
+            with torch.inference_mode(False):  # they can be written inside and outside inference mode
                 self.momentum = torch.zeros(room, width, device=self.device)
                 self.velocity = torch.zeros(room, 4, device=self.device)
                 self.inverse_mass, self.weight = (torch.zeros(held, device=self.device) for _ in range(2))
@@ -91,8 +91,8 @@ class FusedUpdated(Fused):
         return fields
 
     def _load(self, state: MPMState) -> None:
-        """Sort the particles by cell and take their fields."""
-        self.momentum.zero_()  # whatever a part that was broken off has left
+        """Sort the particles by cell and copy their fields to the buffers."""
+        self.momentum.zero_()  # an interrupted part may have left values
         grid = state.grid
         place = (state.position.reshape(-1, 3) / grid.dx - 0.5).floor_().int()
         (ox, oy, oz), (nx, ny, nz) = grid.offset, grid.resolution
@@ -115,7 +115,7 @@ class FusedUpdated(Fused):
         )  # fmt: skip
 
     def _several(self, steps: int, options: dict[str, Any]) -> None:
-        """Substeps from the start of one to the start of another."""
+        """Run substeps, from the start of one to the start of a later one."""
         self._repeat(steps, (*options.values(), self.grid), lambda offset: self._substep(offset, options))
 
     def _look(self) -> None:
@@ -126,7 +126,7 @@ class FusedUpdated(Fused):
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
         self._nodes(offset, options)
-        if self.asked:  # the forces look at the end of a substep before the next one starts
+        if self.asked:  # the forces need the end of a substep before the next one starts
             self._particles(offset + 1, options, gather=True, scatter=False)
             self._push()
             self._particles(offset + 1, options, gather=False, scatter=True)
@@ -229,5 +229,5 @@ class FusedUpdated(Fused):
         return MPMState(**fields, time=self.time, grid=self.grid)
 
     def _work(self) -> Tensor:
-        # whatever the order within a scene, the particles are sorted by scene
+        # the particles are always sorted by scene, in any order within a scene
         return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Kernels that look at a state as it is: energy, and the speed of waves."""
+"""Kernels that measure a state: energy and wave speed."""
 
 import triton
 import triton.language as tl

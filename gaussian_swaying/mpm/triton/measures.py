@@ -1,4 +1,4 @@
-"""What a state is measured by in one kernel, without the buffers of a substep."""
+"""Measures of a state, in one kernel each, without the buffers of a substep."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gaussian_swaying.mpm.triton import measure_kernels as kernels
 
 
 def largest_speed(bound: Formulation, state: MPMState) -> Tensor | None:
-    """Cells per second as ``Formulation.cells_per_second``, in one kernel; None for laws that share no wave speed."""
+    """Cells per second as ``Formulation.cells_per_second``, in one kernel; None for laws with no common wave speed."""
     points, laws, spatial = bound.body.points, bound.body.laws, not bound.neighbours_fixed
     wave = shared(points.laws, "wave")
     if wave is None:
@@ -30,7 +30,7 @@ def largest_speed(bound: Formulation, state: MPMState) -> Tensor | None:
 
 
 def elastic_energy(body: Body, F: Tensor) -> Tensor | None:
-    """Energy density [J/m³] in one kernel, shape (..., P); None for laws that share no energy."""
+    """Energy density [J/m³] in one kernel, shape (..., P); None for laws without a common energy."""
     energy = shared(body.points.laws, "energy")
     if energy is None:
         return None

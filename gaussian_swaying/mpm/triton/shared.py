@@ -1,8 +1,8 @@
-"""What the kernels of the formulations have in common: weights, loads and stores, forces and their work.
+"""Functions shared by the kernels of the formulations: weights, loads and stores, forces and their work.
 
-The definitions are :mod:`~gaussian_swaying.mpm.transfer`, :mod:`~gaussian_swaying.mpm.timestep` and the torch substeps
+The references are :mod:`~gaussian_swaying.mpm.transfer`, :mod:`~gaussian_swaying.mpm.timestep` and the torch substeps
 of :mod:`~gaussian_swaying.mpm.formulations`; the kernels follow them and are tested against them. Loops over i and j
-stay loops in Triton's intermediate code: unrolled, its passes take minutes.
+stay loops in Triton's intermediate code: if they are unrolled, its passes take minutes.
 """
 
 import triton
@@ -13,8 +13,8 @@ from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue,
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities."""
 
-# Numbers that differ from body to body and from grid to grid. Triton would compile a kernel again for each of them that
-# becomes one or a multiple of 16, in the middle of a run, and even while a graph is recorded.
+# Numbers that differ between bodies and between grids, and are not specialised. Otherwise Triton would compile a kernel
+# again whenever one of them becomes one or a multiple of 16, in the middle of a run, even while a graph is recorded.
 VARIES = (
     "count", "cells", "pieces", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
     "nx", "ny", "nz",
@@ -60,7 +60,7 @@ def add_given(force, resistance, force_in, where, mask):
 
 @triton.jit
 def account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, load, count, index, mask):
-    """Work of the external force: what ended with this velocity is added, what begins with it is kept.
+    """Work of the external force: adds the part that ends with this velocity, stores the part that starts with it.
 
     ``load`` has the rows work, force (with implicit drag force + D v, D and v, eight rows in all).
     """
@@ -93,6 +93,6 @@ def wave_speed(F, density, mu, lam, WAVE: tl.constexpr, SPATIAL: tl.constexpr):
 
 @triton.jit
 def keep_largest(out, speed, mask):
-    """The largest value into ``out``; infinity for NaN, which an atomic maximum would lose."""
+    """Write the largest value to ``out``; infinity for NaN, which an atomic maximum would drop."""
     speed = tl.where(mask, tl.where(speed == speed, speed, float("inf")), 0.0)
     tl.atomic_max(out, tl.max(speed))

@@ -1,11 +1,11 @@
-"""Kernels of the ``total`` substep; the definition is :mod:`~gaussian_swaying.mpm.formulations.total`.
+"""Kernels of the ``total`` substep; the reference is :mod:`~gaussian_swaying.mpm.formulations.total`.
 
-Stencils rest, so particles are sorted by cell once. A program takes some cells with up to ``LANES`` particles at a
-time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of its 27
-cells. No atomics: the result is the same in every run.
+Stencils do not move, so particles are sorted by cell once. A program handles some cells with up to ``LANES`` particles
+at a time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of its
+27 cells. No atomics: the result is the same in every run.
 
-Rows of node arrays: displacement and velocity, each in four columns of eight, a sector of memory. What is summed has
-four columns, or eight where boundaries ask for positions.
+Rows of node arrays: displacement and velocity, each in four columns of eight, a sector of memory. The sums have four
+columns, or eight if boundaries need positions.
 """
 
 import triton
@@ -87,8 +87,8 @@ def total_particles(
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
-    Lanes without a particle have no volume, values of a twin or mass, so they add nothing. A step of index zero of a
-    rollout takes what came before it from row 0 of the schedule.
+    Lanes without a particle have no volume, values of a twin or mass, so they add nothing. The first step of a rollout
+    takes the previous substep from row 0 of the schedule.
     """
     LOADED: tl.constexpr = (TWIN is not None) or FORCE
     step = tl.load(first_step) + step_offset
@@ -106,7 +106,7 @@ def total_particles(
     for chunk in range(0, longest, LANES):
         index = start[:, None] + chunk + lane
         mask = index < end[:, None]
-        # a lane without a particle stands in the middle of the cell: outside it F might be inverted, which takes long
+        # a lane without a particle is put in the middle of the cell: outside it F might be inverted, which is slow
         f = (
             tl.load(fraction + index, mask, 1.0),
             tl.load(fraction + count + index, mask, 1.0),

@@ -1,11 +1,11 @@
-"""Kernels of the ``updated`` substep; the definition is :mod:`~gaussian_swaying.mpm.formulations.updated`.
+"""Kernels of the ``updated`` substep; the reference is :mod:`~gaussian_swaying.mpm.formulations.updated`.
 
 One kernel gathers the end of a substep and scatters the start of the next, so a particle is read and written once.
-Particles are sorted by cell now and then; neighbours in that order that share a cell are summed by a segmented scan,
-and only the last of each segment goes to the grid, atomically.
+Particles are sorted by cell from time to time; neighbours in that order that share a cell are summed by a segmented
+scan, and only the last one of each segment is added to the grid, atomically.
 
-Rows of node arrays: velocity, or momentum and mass, in four columns. What is summed has four too, or eight with
-implicit drag.
+Rows of node arrays: velocity, or momentum and mass, in four columns. The sums also have four, or eight with implicit
+drag.
 """
 
 import triton
@@ -102,12 +102,12 @@ def _sum_segments(a, l1, l2, l4, l8, l16, s1, s2, s4, s8, s16):
 
 @triton.jit
 def _locate(x, dx, o, n):
-    """First node of the stencil on one axis within the grid, the place in it, and whether the stencil fits."""
+    """First node of the stencil on one axis of the grid, the position in it, and whether the stencil fits."""
     lattice = tl.div_rn(x, dx + x * 0)
     base = tl.floor(lattice - 0.5)
     first = base.to(tl.int32) - o
     f = lattice - base
-    fits = (first >= 0) & (first <= n - 3) & (f < 2)  # NaN becomes any integer, and is not below anything
+    fits = (first >= 0) & (first <= n - 3) & (f < 2)  # NaN becomes an arbitrary integer; NaN < 2 is False
     return first, tl.where(fits, f, 1.0), fits
 
 
@@ -221,7 +221,7 @@ def updated_particles(
             )
         else:
             value = (mass * v[0] + kick * force[0], mass * v[1] + kick * force[1], mass * v[2] + kick * force[2], mass)
-        # what multiplies w (x_i - x_p), and what multiplies the gradient of w
+        # factor of w (x_i - x_p), and factor of the gradient of w
         if MLS:
             moment = axpy9(mass, C, 4 * inverse_dx * inverse_dx * pull, stress)
             slope = moment
@@ -301,7 +301,7 @@ def updated_nodes(
     mask = k < nodes
     row = momentum + k * WIDTH
     mass = tl.load(row + 3, mask, 0.0)
-    some = mass > 1.0842022e-19  # the square root of the smallest normal number, as in the definition
+    some = mass > 1.0842022e-19  # the square root of the smallest normal number, as in the reference
     inverse = tl.where(some, 1.0 / tl.maximum(mass, 1.0842022e-19), 0.0)
     push = tl.where(some, kick, 0.0)
     share = inverse
@@ -364,7 +364,7 @@ def updated_read(
 
 @triton.jit(do_not_specialize=VARIES)
 def pin_mass(moving, order, pinned, weight, count, ox, oy, oz, nx, ny, nz, dx, scene_size, BLOCK: tl.constexpr):
-    """``updated``: mass that the particles of a boundary bring to each node."""
+    """``updated``: mass of the particles of a boundary at each node."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     where = tl.load(order + index, mask, 0)

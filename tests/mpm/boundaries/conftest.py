@@ -32,14 +32,14 @@ def _run_for(formulation, boundaries, points, seconds, velocity=None, gravity=(0
 
 
 def _lone(places, **material):
-    """Particles without neighbours: no stencil meets another."""
+    """Particles without neighbours: stencils do not overlap."""
     position = torch.tensor(places, dtype=torch.float64)
     given = {"volume": 1e-3, "density": 100.0, "youngs_modulus": 1e3, "poisson_ratio": 0.3}
     return MaterialPoints.create(position, **(given | material))
 
 
 def _march(solver, points, dt, steps, velocity=None, frame=None):
-    """All states from the first to the last, on a grid that has room."""
+    """All states from the first to the last, on a grid that is large enough."""
     states = [solver.init_state(points, velocity, margin=12, frame=frame)]
     for _ in range(steps):
         states.append(solver.step(states[-1], dt))

@@ -1,4 +1,4 @@
-"""Each boundary acts where and when it says, and nowhere else."""
+"""Each boundary acts only where and when it should."""
 
 import copy
 import dataclasses
@@ -44,7 +44,7 @@ REGIONS = {
     "union": Union([Sphere([0.1, 0.1, 0.1], 0.15), Box([0.2, 0.2, 0.2], [0.4, 0.4, 0.4])]),
     "not": Not(Cylinder([0.2, 0.2, 0.2], [0.0, 0.0, 1.0], 0.15, 0.3)),
 }
-# every condition, and the one that asks for a region in each substep over each kind of region
+# every condition, and the one that evaluates its region in each substep with each kind of region
 ACTING = CONDITIONS | {
     f"velocity-{name}": lambda _, region=region: VelocityBox(region, [0.1, 0.2, 0.3], end=0.5)
     for name, region in REGIONS.items()
@@ -71,7 +71,7 @@ def _acting(name, device, dtype=torch.float64):
 
 
 def test_a_boundary_is_one_file():
-    """Each file of the folder but those that all share has one, and each is tested here."""
+    """Each file of the folder has one, except the shared files, and each is tested here."""
     files = {found.name for found in iter_modules(boundaries.__path__)} - {"boundary", "particle_boundary"}
     found = boundaries.BOUNDARIES
     assert {kind.__module__.rsplit(".", 1)[1] for kind in found.values()} == files
@@ -102,7 +102,7 @@ def test_the_documented_boundaries_are_those_that_there_are():
     ids=["pin", "handle", "sticky", "slip", "friction", "velocity", "box-sticky", "box-slip", "box-separate"],
 )
 def test_time_windows(formulation, make, block, run_for):
-    """Each of these stops everything: so the block falls only while the window is closed."""
+    """Each of these stops everything, so the block falls only outside the time window."""
     points = block()
     assert float(run_for(formulation, [make(0.0, 0.1)], points, 0.1).velocity.abs().max()) == 0.0
     falling = torch.full((216,), -0.98, dtype=torch.float64)
@@ -147,7 +147,7 @@ def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, make
     slip = run("slip")
     assert float(slip[:, 2].mean()) < 0.8
     assert float(slip[:, 0].mean()) == pytest.approx(0.3, rel=1e-9)
-    assert float(run("slip", 0.8)[:, 0].mean()) < 0.29  # what it takes away along the normal, it rubs with
+    assert float(run("slip", 0.8)[:, 0].mean()) < 0.29  # friction follows the removed normal velocity
     assert float(run("sticky").mean(0)[0]) < 0.29
 
 
@@ -160,7 +160,7 @@ def test_a_substep_may_be_a_tensor(name, dtype):
     assert found.dtype == dtype
     torch.testing.assert_close(found, known, rtol=1e-12 if dtype == torch.float64 else 1e-6, atol=0)
     assert not torch.equal(found, velocity)
-    if name in ("handle", "impulse", "impulse-each"):  # what depends on the substep
+    if name in ("handle", "impulse", "impulse-each"):  # values that depend on the substep
         longer = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(0.3, dtype=torch.float64)))
         assert float((longer - known).abs().max()) > 1e-3
 
@@ -207,13 +207,13 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
         torch.testing.assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=1e-7)
         seen.append(recorded.clone())
     assert not torch.equal(seen[0], velocity)
-    if name not in ("release", "front"):  # which the solver, not the condition, lets go
+    if name not in ("release", "front"):  # released by the solver, not by the condition
         assert torch.equal(seen[3], velocity)
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_in_frame_leaves_the_original_alone(name, block):
-    """Nor is the one in metres changed by a second frame, or by its original moving to another type."""
+    """A second frame, or a dtype change of the original, does not change the copy in metres either."""
     scene = block().position
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=3.0)
     region = Box([None, None, 0.23], [None] * 3)
@@ -243,7 +243,7 @@ def test_in_frame_leaves_the_original_alone(name, block):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_conditions_can_be_copied_saved_and_narrowed(name, formulation, block, march):
-    """A deep copy and one that loads the state dict do the same, bit for bit; float32 the same to round-off."""
+    """A deep copy and a copy from the state dict give the same bits; float32 gives the same to round-off."""
     points = block(per_side=5)
     region = Box([None, None, 0.23], [None] * 3)
     boundary = CONDITIONS[name](region)
@@ -296,7 +296,7 @@ def test_share_that_no_node_reaches_names_its_condition(kind, block):
         (lambda: Plane([0, 0], [0, 0, 1]), "`point` to have 3 numbers"),
         (lambda: Plane([0, 0, 0], [0, 0, 1], friction=-1), "`friction` to not be negative"),
         (lambda: Plane([0, 0, 0], [0, 0, 1], start=2.0, end=1.0), "`end` to be later than `start`"),
-        (lambda: EnclosingBox([0, 0, 0], [1, 0, 1]), "`min` of the box below `max`"),
+        (lambda: EnclosingBox([0, 0, 0], [1, 0, 1]), "`min` of the box to be below `max`"),
         (lambda: VelocityBox(Sphere([0, 0, 0], 1), [1, 2]), "`velocity` to have 3 numbers"),
         (lambda: PinnedRegion(Sphere([0, 0, 0], 1), held_share=1.0), "`held_share` to lie in"),
         (lambda: Handle(Sphere([0, 0, 0], 1), held_share=-0.1), "`held_share` to lie in"),
@@ -312,7 +312,7 @@ def test_share_that_no_node_reaches_names_its_condition(kind, block):
         (lambda: SequentialRelease(Sphere([0, 0, 0], 1), first=[0, 0, 0]), "both `first` and `last`"),
         (
             lambda: SequentialRelease(Sphere([0, 0, 0], 1), [0, 0, 1], first=[0, 0, 1], last=[5, 0, 1]),
-            "`last` of the SequentialRelease farther along",
+            "`last` of the SequentialRelease to be farther along",
         ),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0, 0], end=None), "`end` of the Impulse to be a finite time"),
         (lambda: Impulse(Sphere([0, 0, 0], 1), [1, 0, 0], end=math.inf), "`end` of the Impulse to be a finite time"),

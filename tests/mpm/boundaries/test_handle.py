@@ -1,4 +1,4 @@
-"""A handle moves and turns what it holds."""
+"""A handle moves and rotates the particles that it holds."""
 
 import math
 
@@ -17,7 +17,7 @@ FORMULATIONS = ["total", "updated"]
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_handle_carries_its_particles_and_the_others_follow(formulation, block, march):
-    """At rest before the window; then exactly velocity * t; let go after it."""
+    """At rest before the window; then exactly velocity * t; released after it."""
     points = block()
     rest, velocity = points.position, torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)
     top = rest[:, 2] > 0.3

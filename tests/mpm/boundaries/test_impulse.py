@@ -1,4 +1,4 @@
-"""An impulse arrives whole and pushes only its region."""
+"""An impulse is applied in full and pushes only its region."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ FORMULATIONS = ["total", "updated"]
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_an_impulse_does_not_move_what_is_pinned(formulation, block, run_for):
-    """Whichever of the two was given first."""
+    """In either order of the two."""
     points, ends = block(), []
     pin = PinnedRegion(Box([None, None, 0.34], [None, None, None]))
     knock = Impulse(Box([None] * 3, [None] * 3), [0.5, 0.0, 0.0], end=0.02)
@@ -30,7 +30,7 @@ def test_an_impulse_does_not_move_what_is_pinned(formulation, block, run_for):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("dt", [1e-3, 1.7e-3, 3e-3])
 def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, block, march):
-    """In proportion to the time gone by within the window; substeps that straddle its ends take their part."""
+    """In proportion to the time gone by within the window; substeps across its ends get their part."""
     points = block(per_side=4)
     impulse = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
     start, end = 0.0105, 0.0382
@@ -57,7 +57,7 @@ def test_impulse_shorter_than_a_substep(formulation, block, march):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_impulse_pushes_by_mass_and_only_its_region(formulation, block, march):
-    """A far body never feels it. The others: the same change of velocity at any mass, so the moment is that of the
+    """A far body is not affected. The others get the same change of velocity at any mass, so the moment is that of the
     impulse at the region's centre of mass."""
     near, far = block(per_side=4), block(low=(2, 0, 0), per_side=4)
     points = MaterialPoints.join([near, far])
@@ -76,7 +76,8 @@ def test_impulse_pushes_by_mass_and_only_its_region(formulation, block, march):
         torch.testing.assert_close(found["linear"], impulse, rtol=0, atol=1e-12)
         torch.testing.assert_close(found["angular"], torch.linalg.cross(centre, impulse), rtol=0, atol=1e-12)
         assert torch.equal(state.position[64:], points.position[64:])
-    # at first only what shares nodes with the region moves, and its top, all of whose nodes are the region's, as one
+    # at first only particles that share nodes with the region move; its top, with only nodes of the region, moves as
+    # one
     first = states[1].velocity[:64]
     assert float(first[points.position[:64, 2] < 0.06].abs().max()) < 0.3 * float(first[pushed[:64]].abs().max())
     top = first[points.position[:64, 2] > 0.3]
@@ -85,7 +86,7 @@ def test_impulse_pushes_by_mass_and_only_its_region(formulation, block, march):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_impulse_per_particle_grows_with_their_number(formulation, block, lone, march):
-    """And with that of each scene of a batch, whatever their mass; counted anew for another material."""
+    """It also grows with the number in each scene of a batch, for any mass; counted again for another material."""
     knock = Impulse(Box([None, None, 0.2], [None] * 3), [0.01, -0.02, 0.03], end=2e-3, per_particle=True)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[knock], gravity=(0, 0, 0))
     impulse = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)

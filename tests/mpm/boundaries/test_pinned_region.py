@@ -1,4 +1,4 @@
-"""A pin holds its end and nothing else."""
+"""A pin holds its region and nothing else."""
 
 import pytest
 

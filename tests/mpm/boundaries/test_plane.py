@@ -37,7 +37,7 @@ def test_plane_holds_a_falling_block_on_its_free_side(formulation, kind, block, 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_plane_does_not_act_on_the_free_side(formulation, block, run_for):
-    """One far below leaves free fall alone."""
+    """A plane far below does not change free fall."""
     points = block(low=(0, 0, 1.0))
     state = run_for(formulation, [Plane([0, 0, -5], [0, 0, 1], "sticky")], points, 0.2)
     free = run_for(formulation, [], points, 0.2)

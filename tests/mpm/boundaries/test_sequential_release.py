@@ -1,4 +1,4 @@
-"""A front lets go what it passes."""
+"""A front releases the particles that it passes."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ FORMULATIONS = ["total", "updated"]
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, march):
-    """The impulse is on each scene; one without a particle in the region feels none. Each front starts at its scene."""
+    """The impulse is on each scene; a scene without a particle in it gets none. Each front starts at its scene."""
     one = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     shifts = torch.tensor([[0, 0, 0], [3, 0, 0], [0, 0, 1]], dtype=torch.float64)
     position = torch.stack([k * one.position + shift for k, shift in zip((1, 2, 1), shifts, strict=True)])
@@ -28,7 +28,7 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, m
     release = SequentialRelease(region, [1, 0, 0], 0.0, 0.04)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[release])
     fall = march(solver, points, 0.01, 3)[-1].velocity[..., 2]
-    # at 0.03 s the first of three has fallen for 3 substeps and the second, let go at 0.02 s, for 1
+    # at 0.03 s the first of three has fallen for 3 substeps and the second, released at 0.02 s, for 1
     counts = torch.tensor([[3.0, 1, 0], [3, 1, 0], [3, 3, 3]], dtype=torch.float64)
     torch.testing.assert_close(fall, -0.098 * counts, rtol=0, atol=1e-12)
 
@@ -36,7 +36,7 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation, lone, m
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("direction", [(2.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (1.0, 2.5, 0.0)])
 def test_release_passes_over_lone_particles_in_order(formulation, direction, lone, march):
-    """Each falls for exactly the substeps since the front met it; what lies outside the region from the beginning."""
+    """Each falls for exactly the substeps since the front met it; the others fall from the beginning."""
     points = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 1, 0], [0, 9, 0]])
     release = SequentialRelease(Box([None] * 3, [None, 5, None]), direction, start=0.055, end=0.355)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[release])
@@ -94,7 +94,7 @@ def test_release_of_a_single_layer_is_at_its_start():
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
 def test_release_between_given_points(up):
-    """The front meets them at its start and end, in whatever frame, and nothing depends on who is there."""
+    """The front meets them at its start and end, in any frame, and independently of the other particles."""
     scene = torch.tensor([[-1.0, 5, 0], [0.5, 0, 1], [1.0, 2, 9], [2.0, 0, 0], [3.5, 0, 0]], dtype=torch.float64)
     frame = SimFrame.fit(scene, up=up, metres_per_unit=0.5)
     release = SequentialRelease(

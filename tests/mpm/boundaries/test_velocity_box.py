@@ -1,4 +1,4 @@
-"""Boxes of velocity, at rest and travelling."""
+"""Velocity boxes, at rest and travelling."""
 
 import pytest
 import torch
@@ -37,7 +37,7 @@ def test_velocity_box_drives_only_its_side(formulation, lone, march):
 
 
 def test_a_travelling_box_takes_its_nodes_from_where_it_is(block):
-    """From its start on, in the metres of a frame that scales and turns; one that stays has none of it."""
+    """It moves from its start on, in the metres of a frame that scales and rotates; a fixed box does not move."""
     frame = SimFrame.fit(block().position, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
     box = Box([0.0, 0.0, 0.0], [0.2, 0.4, 0.4])
     drift = frame.direction_to_sim(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
@@ -56,7 +56,7 @@ def test_a_travelling_box_takes_its_nodes_from_where_it_is(block):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_travelling_box_carries_a_block(formulation, block, run_for):
-    """Far beyond where it began, as the box goes along; one that stays leaves the block behind."""
+    """The block moves far beyond its start, because the box travels with it; a fixed box leaves the block behind."""
     region, ways = Box([-0.1, -0.1, -0.1], [0.5, 0.5, 0.5]), []
     for travels in (True, False):
         drive = VelocityBox(region, [1.0, 0.0, 0.0], end=0.8, travels=travels)

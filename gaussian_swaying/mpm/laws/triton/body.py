@@ -1,7 +1,7 @@
 """Stress and flow of a body of one or several laws, for the fused substep.
 
-The set of laws is a constant of the compiled kernel, so a body of one law compiles to that law alone. With several, the
-result of its own law is selected for each particle; what laws have in common is computed once.
+The set of laws is a constant of the compiled kernel, so a body of one law compiles to that law alone. With several
+laws, the result of its own law is selected for each particle; parts that laws share are computed once.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ ROW = tl.constexpr(6)  # columns of the table: which stress, which flow (-1 for 
 class BodyLaws:
     """The device functions of the laws of a body, each one once.
 
-    It is passed to kernels as a constant, which read its attributes when they are compiled.
+    It is passed to the kernels as a constant; they read its attributes when they are compiled.
 
     Args:
-        laws: All with a twin.
+        laws: The laws; all need a twin.
 
     Attributes:
-        table: A row of six numbers for each law: which stress and which flow are its own, and its coefficients.
+        table: A row of six numbers for each law: the indices of its stress and its flow, and its coefficients.
         spectral: Whether stresses or flow need the decomposition of F.
         principals: Functions of the stresses that come from principal stretches; they are numbered first.
         matrices: Functions of Kirchhoff stresses that come from F itself, numbered after those.
@@ -64,7 +64,7 @@ class BodyLaws:
 
 
 def _once(functions: Any) -> tuple[Any, ...]:
-    """Each function once, in the order in which they come."""
+    """The distinct functions, in order of appearance."""
     return tuple(dict.fromkeys(functions))
 
 
@@ -77,7 +77,7 @@ def _padded(law: ConstitutiveLaw) -> list[float]:
 
 
 def _key(function: Any) -> str:
-    """What tells a device function from others; in the interpreter, which caches nothing, its name."""
+    """A key that identifies a device function; in the interpreter, which caches nothing, its name."""
     return getattr(function, "cache_key", "") + repr(function)
 
 
@@ -88,7 +88,7 @@ def _coefficients(row):
 
 @triton.jit
 def _principal(a, mu, lam, internal, which, p, LAWS: tl.constexpr):
-    """Principal first Piola-Kirchhoff stresses; any value for a law that has another stress."""
+    """Principal first Piola-Kirchhoff stresses; arbitrary for a law with another kind of stress."""
     y = LAWS.principals[0](a, mu, lam, internal, p)
     for k in tl.static_range(1, len(LAWS.principals)):
         y = where3(which == k, LAWS.principals[k](a, mu, lam, internal, p), y)
@@ -135,7 +135,7 @@ def kirchhoff(F, mu, lam, internal, row, dt, LAWS: tl.constexpr, FLOW: tl.conste
     n: tl.constexpr = len(LAWS.principals)
     if LAWS.spectral:
         u, a, v = svd3(F)
-    # what is read here need not be held in registers during the decomposition
+    # read here, so that registers need not hold it during the decomposition
     which = tl.load(row).to(tl.int32)
     p = _coefficients(row)
     if FLOW and len(LAWS.flows) > 0:

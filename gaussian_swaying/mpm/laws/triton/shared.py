@@ -1,4 +1,4 @@
-"""What the device functions of several laws are made of, as :mod:`gaussian_swaying.mpm.laws.shared`."""
+"""Building blocks of the laws' device functions, as in :mod:`gaussian_swaying.mpm.laws.shared`."""
 
 import math
 
@@ -34,7 +34,7 @@ def split_strain(e0, e1, e2):
     trace = e0 + e1 + e2
     d = (e0 - trace / 3, e1 - trace / 3, e2 - trace / 3)
     squared = dot3(d, d)
-    some = squared > 1.4210855e-14  # the square of float32's epsilon, as in the definition
+    some = squared > 1.4210855e-14  # the square of float32's epsilon, as in the reference
     norm = tl.where(some, tl.sqrt(tl.where(some, squared, 1.0)), 0.0)
     scale = 1.0 / tl.where(some, norm, 1.0)
     return trace, d, norm, (d[0] * scale, d[1] * scale, d[2] * scale)
@@ -62,7 +62,7 @@ def share_above(x, y, floor):
 
 @triton.jit
 def log_difference(x, y):
-    """(log x - log y) / (x - y) of the continued logarithm, to round-off where x and y are near each other too."""
+    """(log x - log y) / (x - y) of the continued logarithm, accurate to round-off also if x is close to y."""
     share = share_above(x, y, LOG_FLOOR)
     x = tl.maximum(x, LOG_FLOOR)
     y = tl.maximum(y, LOG_FLOOR)

@@ -10,7 +10,7 @@ from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 @triton.jit
 def _pull(x):
-    """(l - 1) / l of a spring from the square of its length, which goes on as its tangent when small."""
+    """(l - 1) / l of a spring from the square of its length; continued by its tangent when small."""
     inside = tl.maximum(x, LOG_FLOOR * LOG_FLOOR)
     root = tl.sqrt(inside)
     return 1 + (x - inside) / (2 * inside) - 1 / root
@@ -64,7 +64,7 @@ def energy(F, mu, lam):
 
 @triton.jit
 def _pull_difference(x, y):
-    """(_pull(x) - _pull(y)) / (x - y), to round-off where x and y are near each other too."""
+    """(_pull(x) - _pull(y)) / (x - y), accurate to round-off also if x is close to y."""
     low = LOG_FLOOR * LOG_FLOOR
     share = share_above(x, y, low)
     rx = tl.sqrt(tl.maximum(x, low))
@@ -74,7 +74,7 @@ def _pull_difference(x, y):
 
 @triton.jit
 def _pull_slope(x):
-    """Derivative of ``_pull`` by half the square; none where it is continued, as in the definition."""
+    """Derivative of ``_pull`` by half the square; zero where it is continued, as in the reference."""
     low = LOG_FLOOR * LOG_FLOOR
     inside = tl.maximum(x, low)
     return tl.where(x < low, 0.0, 1.0 / (inside * tl.sqrt(inside)))
@@ -84,9 +84,9 @@ def _pull_slope(x):
 def _pair(x, y, plane_x, plane_y, plane, whole, spread, direct, network, bulk, tension):
     """H_ij, twist and flip of two axes of a network.
 
-    The planes are named by the axis across them, and ``plane`` holds both axes. With D the divided difference of the
-    pulls of the two other planes, flip and twist are the same but for (x + y)² D, which is (x - y)² D in twist, and for
-    what does not vanish with the stretches.
+    The planes are named by their normal axis, and ``plane`` contains both axes. With D the divided difference of the
+    pulls of the two other planes, flip and twist are equal except for (x + y)² D, which is (x - y)² D in twist, and for
+    terms that do not vanish with the stretches.
     """
     difference = 2.0 / 105 * _pull_difference(plane_x, plane_y)
     common = direct + network * (whole + 8.0 / 105 * (_pull(plane) + 0.5 * (_pull(plane_x) + _pull(plane_y))))

@@ -1,4 +1,4 @@
-"""What a law brings to the kernels, and which laws have it."""
+"""The device functions that a law provides for the kernels, and how to find them."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 
 @dataclass(frozen=True)
 class LawTwin:
-    """Device functions of a law: Triton functions of one particle per lane, or None where it has none.
+    """Device functions of a law: Triton functions of one particle per lane, or None if the law has none.
 
     A matrix is a tuple of nine values, row by row; stretches and principal stresses are tuples of three; ``p`` are the
     four numbers of ``ConstitutiveLaw.coefficients``, padded with zeros.
 
     Attributes:
         principal: ``(a, mu, lam, internal, p)``: principal first Piola-Kirchhoff stresses from the principal stretches.
-        pk1: ``(F, mu, lam, internal, p)``: first Piola-Kirchhoff stress, where that takes no decomposition.
-        kirchhoff: ``(F, mu, lam, internal, p)``: Kirchhoff stress, where that takes no decomposition.
+        pk1: ``(F, mu, lam, internal, p)``: first Piola-Kirchhoff stress, if it needs no decomposition.
+        kirchhoff: ``(F, mu, lam, internal, p)``: Kirchhoff stress, if it needs no decomposition.
         flow: ``(a, mu, lam, internal, p, dt)``: principal stretches and internal variable after plastic flow.
         energy: ``(F, mu, lam)``: energy density.
         wave: ``(F, mu, lam)``: the first of ``ConstitutiveLaw.moduli``.
 
-    A law needs ``principal``, or ``kirchhoff`` and, if it does not flow, ``pk1``. Where a body needs the decomposition
-    anyway, ``principal`` is used by all laws that have it. Without ``energy`` and ``wave`` torch computes those.
+    A law needs ``principal``, or ``kirchhoff`` and, if it does not flow, ``pk1``. If a body needs the decomposition
+    anyway, all laws that have ``principal`` use it. Without ``energy`` and ``wave``, torch computes them.
 
     Raises:
         ValueError: If the law has no stress.
