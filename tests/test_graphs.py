@@ -260,7 +260,7 @@ def test_what_is_missing_is_named(driver):
         assert "recordable" not in said
         assert "GPU 0" not in said
     waits = RuntimeError("CUDA error: operation not permitted when stream is capturing")
-    attempt(fail(waits), RuntimeError, r"cannot be recorded.*set `recordable` of the boundary")
+    attempt(fail(waits), RuntimeError, r"cannot be recorded.*set `recordable` to False on the boundary")
     broken = RuntimeError("CUDA error: an illegal memory access was encountered")
     assert attempt(fail(broken), RuntimeError, "illegal memory access") == str(broken)
     assert recording == [1, 1, 1]

@@ -14,6 +14,7 @@ from einops import rearrange
 from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply_table import PlyHeader, read_element, read_header
+from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -108,8 +109,6 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
         ValueError: If the cloud is empty.
     """
     from plyfile import PlyData, PlyElement
-
-    from gaussian_swaying.geometry.patches import smallest_axis_normal
 
     path = Path(path)
     if len(cloud) == 0:

@@ -243,9 +243,9 @@ class Fused(ABC):
     def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
         """Copy the state to the buffers, run the substeps, and return the fields of the new state."""
 
-    @abstractmethod
     def _work(self) -> Tensor:
-        """Work of the load in each scene [J], shape (scenes,), float64."""
+        """Work of the load in each scene [J], shape (scenes,), float64; particles are sorted by scene."""
+        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
 
     def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
         """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.

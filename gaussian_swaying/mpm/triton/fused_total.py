@@ -213,10 +213,6 @@ class FusedTotal(Fused):
         lost = self._room("lost", *shape[:-1], dtype=torch.bool)
         return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid)
 
-    def _work(self) -> Tensor:
-        # cells are sorted by scene
-        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
-
 
 def _lanes(sizes: Tensor) -> int:
     """Lanes per cell that give the least total work, with empty lanes included (one synchronisation)."""

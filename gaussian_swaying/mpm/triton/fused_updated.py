@@ -227,7 +227,3 @@ class FusedUpdated(Fused):
         internal = self._room("internal", *shape[:-1]) if self.internal else None
         fields = self._read_into(position, velocity, affine, F, F_total, lost, internal)
         return MPMState(**fields, time=self.time, grid=self.grid)
-
-    def _work(self) -> Tensor:
-        # the particles are always sorted by scene, in any order within a scene
-        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)

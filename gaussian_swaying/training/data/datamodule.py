@@ -18,6 +18,7 @@ from gaussian_swaying.captures.initial_points import initial_points
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.training.data.order import EndlessShuffle
+from gaussian_swaying.training.initial import gaussians_from_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,8 +192,6 @@ class CaptureDataModule(LightningDataModule):
         Raises:
             ValueError: If this capture cannot provide ``points``.
         """
-        from gaussian_swaying.training.initial import gaussians_from_points
-
         cloud = initial_points(self.capture, self.points, self.point_count, self.seed)
         return gaussians_from_points(cloud.points, cloud.colors, sh_degree, self.initial_opacity, self.initial_scale)
 
