@@ -402,7 +402,7 @@ def test_bad_settings(arguments, words, tmp_path, capsys):
         ("material:\n  E: soft\n", ["material.E", "soft"]),
         ("scene: [1\n  b: }\n", ["bad.yaml", "YAML"]),
         ("just a sentence\n", ["config"]),
-        ("preset: preview\n", ["`preset`", "command line", "--preset"]),
+        ("preset: preview\n", ["`preset`", "command-line", "--preset"]),
         ("wind: {flwo: [1, 0, 0]}\n", ["flwo", "did you mean wind.flow?"]),
     ],
     ids=["top", "nested", "type", "malformed", "sentence", "preset", "guess"],

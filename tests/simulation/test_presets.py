@@ -32,7 +32,7 @@ def test_options_after_a_preset_override_it():
     ("arguments", "words"),
     [
         (["--preset", "preview"], "Expected --config before --preset"),
-        (["--config", str(CONFIGS / "flag2.yaml"), "--preset", "nope"], "there is preview"),
+        (["--config", str(CONFIGS / "flag2.yaml"), "--preset", "nope"], "available: preview"),
         (["--config", str(CONFIGS / "flag.yaml"), "--preset", "preview"], "leave out --preset"),
     ],
 )

@@ -222,7 +222,7 @@ def test_a_splat_that_was_exchanged(make_cloud, make_simulation, tmp_path):
     other = shutil.copy(file, tmp_path / "other.ply")
     cloud.means[0] += 0.01
     write_ply(file, cloud)
-    with pytest.raises(ValueError, match=r"splat .*splat.ply is not the one .* put that file back, or start again"):
+    with pytest.raises(ValueError, match=r"splat .*splat.ply has changed since .* restore the old file, or start"):
         go(3, True)
     shutil.copy(other, file)
     go(3, True)
