@@ -128,7 +128,7 @@ def test_diagnostics_are_a_table_too(make_simulation, tmp_path):
 def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
     recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0)
     _run(make_simulation(), tmp_path / "run", recorder=recorder)
-    assert _names(tmp_path / "run") == ["diagnostics.csv", "run.json", "summary.json"]
+    assert _names(tmp_path / "run") == ["config.yaml", "diagnostics.csv", "run.json", "summary.json"]
     with pytest.raises(ValueError, match=r"`recorder.images`"):
         Recorder(images=False)
     for name, value in (("ply_every", -1), ("checkpoint_every", -1), ("fps", 0.0)):
