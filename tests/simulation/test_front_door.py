@@ -462,3 +462,13 @@ def test_a_normalisation_leaves_the_components_as_they_are():
         assert (vars(scene), dataclasses.asdict(material), list(solver.boundaries)) == given
     with pytest.raises(ValueError, match="`hold` cannot be combined with `normalisation`"):
         Simulation(FlagScene(spacing=0.1), hold=POLE, normalisation=Normalisation(), device="cpu")
+
+
+def test_an_error_of_a_custom_force_stays_what_it_is():
+    def broken(state):
+        raise ValueError("no such table")
+
+    simulation = _flag(forces=[broken])
+    with pytest.raises(ValueError, match="no such table") as caught:
+        list(simulation.frames(2))
+    assert caught.type is ValueError
