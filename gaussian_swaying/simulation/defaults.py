@@ -79,7 +79,7 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     return Scene(ply=source, up=direction, sampling="grid")
 
 
-def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene) -> MPMSolver:
+def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud: GaussianCloud) -> MPMSolver:
     """Return the given solver, or make one whose grid suits the size of the scene.
 
     What is held has no gravity then, as in the starters of the preview: its shape at rest is one in balance with its
@@ -90,7 +90,6 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene) -> MP
     """
     if solver is None:
         pins = [] if hold is None else [PinnedRegion(hold)]
-        cloud = scene.cloud()
         chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
         means = cloud.means[chosen]
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)

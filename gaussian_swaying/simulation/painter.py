@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +11,6 @@ from torch import Tensor, nn
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import rotate_sh
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering import passes
@@ -204,10 +202,6 @@ class Painter(nn.Module):
             sh=rotate_sh(cloud.sh, gaussians.rotations),
             normals=gaussians.normals,
         )
-
-    def export(self, gaussians: DeformedGaussians, path: Path) -> None:
-        """Write deformed Gaussians as a 3DGS .ply for any splat viewer, with harmonics rotated with the patches."""
-        write_ply(path, self.cloud(gaussians))
 
     def depth_range(self, frame: int, name: str) -> tuple[float, float]:
         """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""

@@ -48,9 +48,10 @@ def run(
 
     simulation.resumable = None
     fps, cameras = 1 / simulation.frame_dt, tuple(simulation.painter.cameras)
-    checkpoint = recorder.open(output, simulation.config, resume, fps, cameras, check)
+    config = simulation.config  # once: a large splat takes a while to describe
+    checkpoint = recorder.open(output, config, resume, fps, cameras, check)
     try:
-        return Run(simulation, frames, splat).go(state, checkpoint, settings, progress)
+        return Run(simulation, frames, splat, config).go(state, checkpoint, settings, progress)
     finally:
         if recorder.checkpoint_frame is not None:
             simulation.resumable = (recorder.folder / "checkpoint.pt", recorder.checkpoint_frame)
@@ -108,9 +109,9 @@ def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tupl
 class Run:
     """Data that a run carries from frame to frame besides the state."""
 
-    def __init__(self, simulation: Simulation, frames: int, splat: str | None) -> None:
+    def __init__(self, simulation: Simulation, frames: int, splat: str | None = None, config: str = "") -> None:
         self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
-        self.frames, self.splat = frames, splat
+        self.frames, self.splat, self.config = frames, splat, config
         self.log: list[dict[str, Any]] = []
         self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
         self.force_end = self.recorder.force_scale or simulation.force_scale()
@@ -194,7 +195,7 @@ class Run:
                     "frame": frame,
                     "state": state.state_dict(),
                     "log": self.log,
-                    "config": self.simulation.config,
+                    "config": self.config,
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
                 }

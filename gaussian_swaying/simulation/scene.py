@@ -201,6 +201,7 @@ class SimulatedScene(nn.Module):
         dx: Grid spacing [m], for ``material.volume = "cell"``, as twice the spacing of ``scene.filling``, and for
             ``scene.sampling`` and ``scene.loose``.
         dtype: Precision of the simulation.
+        cloud: The Gaussians of the scene, if they have been read already.
 
     Attributes:
         chosen: Indices of the Gaussians selected by region and opacity, without loose ones. With ``sampling: gaussian``
@@ -222,9 +223,16 @@ class SimulatedScene(nn.Module):
         source: The .ply file; None for a scene made in code.
     """
 
-    def __init__(self, scene: Scene, material: Material, dx: float, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        material: Material,
+        dx: float,
+        dtype: torch.dtype = torch.float32,
+        cloud: GaussianCloud | None = None,
+    ) -> None:
         super().__init__()
-        cloud = scene.cloud()
+        cloud = scene.cloud() if cloud is None else cloud
         self.source = scene.ply
         opacity = torch.sigmoid(cloud.opacities)
         chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold)

@@ -150,17 +150,18 @@ class Simulation(nn.Module):
         colour = check_vector("background", background)
         target = resolve_device(device)
         settings, material = as_scene(scene, up), material or Material()
-        solver = as_solver(solver, hold, settings)
+        cloud = settings.cloud()  # read once
+        solver = as_solver(solver, hold, settings, cloud)
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
             settings, material, solver, camera, cameras = copies(settings, material, solver, camera, cameras)
-            space = normalisation.place(settings, material, solver, camera)
+            space = normalisation.place(settings, material, solver, camera, cloud)
             for path in (cameras or {}).values():
                 if isinstance(path, PhysGaussianCamera):
                     path.frame = space
             edits = [replace(e, region=e.region and RegionInFrame(e.region, space)) for e in edits]
-        model = SimulatedScene(settings, material, solver.dx, getattr(torch, dtype))
+        model = SimulatedScene(settings, material, solver.dx, getattr(torch, dtype), cloud)
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
         self.wind = as_wind(wind)

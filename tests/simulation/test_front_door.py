@@ -472,3 +472,28 @@ def test_an_error_of_a_custom_force_stays_what_it_is():
     with pytest.raises(ValueError, match="no such table") as caught:
         list(simulation.frames(2))
     assert caught.type is ValueError
+
+
+class Counted(FlagScene):
+    count = 0
+
+    def generate(self):
+        Counted.count += 1
+        return super().generate()
+
+
+@pytest.mark.parametrize("more", [{}, {"normalisation": Normalisation()}])
+def test_a_splat_is_read_once(more, monkeypatch):
+    monkeypatch.setattr(Counted, "count", 0)
+    Simulation(Scene(generator=Counted(spacing=0.1)), device="cpu", **more)
+    assert Counted.count == 1
+
+
+def test_what_a_run_was_made_from_is_described_once(tmp_path, monkeypatch):
+    """A checkpoint of each frame holds it, and a large splat takes a while."""
+    described = []
+    monkeypatch.setattr(
+        "gaussian_swaying.simulation.simulation.python_text", lambda *a: described.append(a) or "a: 1\n"
+    )
+    _record(_flag(), tmp_path / "run", 4)
+    assert len(described) == 1

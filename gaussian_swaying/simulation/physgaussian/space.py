@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
@@ -125,14 +126,22 @@ class Normalisation:
         origin = torch.tensor(CENTER, dtype=torch.float64) - scale * 0.5 * (low + high)
         return SimFrame(origin, rotation.T.contiguous(), 1 / scale)
 
-    def place(self, scene: Scene, material: Material, solver: MPMSolver, camera: CameraPath | None = None) -> SimFrame:
+    def place(
+        self,
+        scene: Scene,
+        material: Material,
+        solver: MPMSolver,
+        camera: CameraPath | None = None,
+        cloud: GaussianCloud | None = None,
+    ) -> SimFrame:
         """Convert regions, boundaries and camera to scene units, and set the scale of the scene.
 
         Args:
-            scene: Its region gets scene axes, and ``metres_per_unit`` is set; the splat is read.
+            scene: Its region gets scene axes, and ``metres_per_unit`` is set.
             material: Its regions get scene units.
             solver: Its boundaries get scene units.
             camera: A :class:`PhysGaussianCamera` gets scene units; other cameras are not changed.
+            cloud: The Gaussians of the scene, if they have been read already.
 
         Returns:
             The frame of :meth:`fit`.
@@ -147,7 +156,7 @@ class Normalisation:
             )
         turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
         scene.region = RegionInFrame(scene.region, turned)
-        cloud = scene.cloud()
+        cloud = scene.cloud() if cloud is None else cloud
         chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
         frame = self.fit(cloud.means[chosen])
         scene.metres_per_unit = 1 / frame.metres_per_unit

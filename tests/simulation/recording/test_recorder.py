@@ -20,7 +20,7 @@ import torch
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.gaussians.harmonics import sh_to_color
-from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
@@ -78,7 +78,7 @@ def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, mo
             raise OSError("No space left on device")
 
         monkeypatch.setattr(plyfile.PlyData, "write", fail)
-        write = lambda: recorder.write_ply(1, lambda p: simulation.painter.export(simulation.scene.rest(), p))  # noqa: E731
+        write = lambda: recorder.write_ply(1, lambda p: write_ply(p, simulation.painter.cloud(simulation.scene.rest())))  # noqa: E731
     else:
         write = lambda: recorder.write_summary({"a": object()})  # noqa: E731
 
@@ -536,7 +536,7 @@ def test_kernels_are_loaded_without_a_trace(make_simulation, tmp_path):
     for load in (False, True):
         simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
         if load:
-            Run(simulation, 3, None).warm_up(simulation.start(), 0)
+            Run(simulation, 3).warm_up(simulation.start(), 0)
         runs.append(_run(simulation, tmp_path / str(load), 3))
     assert runs[0]["per_frame"] == runs[1]["per_frame"]
     for name in ("00000", "00002"):
