@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -132,20 +130,6 @@ def check_count(name: str, count: Any) -> int:
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"Expected `{name}` to be a whole number of at least 1, but got {count!r}.")
     return count
-
-
-def copies(
-    scene: Scene,
-    material: Material,
-    solver: MPMSolver,
-    camera: CameraPath | None,
-    cameras: Mapping[str, CameraPath] | None,
-) -> tuple[Scene, Material, MPMSolver, CameraPath | None, dict[str, CameraPath]]:
-    """Copies of what a normalisation places, so that the user's own components stay as they are."""
-    own = copy.copy(solver)
-    own._modules = dict(solver._modules)  # the boundaries are exchanged in the copy alone
-    paths = {name: copy.copy(path) for name, path in (cameras or {}).items()}
-    return copy.copy(scene), dataclasses.replace(material), own, copy.copy(camera), paths
 
 
 _KINDS: dict[str, tuple[type, ...]] = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -17,7 +16,7 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.geometry.regions import Region, RegionInFrame
+from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.forces import Force, as_forces
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
@@ -43,7 +42,6 @@ from gaussian_swaying.simulation.defaults import (
     as_wind,
     check_count,
     check_types,
-    copies,
     resolve_device,
 )
 from gaussian_swaying.simulation.diagnostics import (
@@ -57,7 +55,6 @@ from gaussian_swaying.simulation.diagnostics import (
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.frame import Frame
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.simulation.physgaussian.space import Normalisation
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.recording.recorder import Recorder
@@ -155,12 +152,8 @@ class Simulation(nn.Module):
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
-            settings, material, solver, camera, cameras = copies(settings, material, solver, camera, cameras)
-            space = normalisation.place(settings, material, solver, camera, cloud)
-            for path in (cameras or {}).values():
-                if isinstance(path, PhysGaussianCamera):
-                    path.frame = space
-            edits = [replace(e, region=e.region and RegionInFrame(e.region, space)) for e in edits]
+            placed = normalisation.place(settings, material, solver, camera, cameras, edits, cloud)
+            settings, material, solver, camera, cameras, edits = placed
         model = SimulatedScene(settings, material, solver.dx, getattr(torch, dtype), cloud)
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)

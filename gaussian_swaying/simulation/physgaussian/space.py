@@ -5,10 +5,12 @@ Boxes and planes of a PhysGaussian configuration are in this space; :class:`Norm
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +24,7 @@ from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
 from gaussian_swaying.simulation.scene import Material, Scene
 
@@ -132,19 +135,23 @@ class Normalisation:
         material: Material,
         solver: MPMSolver,
         camera: CameraPath | None = None,
+        cameras: Mapping[str, CameraPath] | None = None,
+        edits: Sequence[Edit] = (),
         cloud: GaussianCloud | None = None,
-    ) -> SimFrame:
-        """Convert regions, boundaries and camera to scene units, and set the scale of the scene.
+    ) -> Placed:
+        """Components in scene units, from those in the normalised space, which stay as they are.
 
         Args:
-            scene: Its region gets scene axes, and ``metres_per_unit`` is set.
-            material: Its regions get scene units.
-            solver: Its boundaries get scene units.
-            camera: A :class:`PhysGaussianCamera` gets scene units; other cameras are not changed.
+            scene: Its region is in turned axes.
+            material: Its regions are in the normalised space.
+            solver: Its boundaries are in the normalised space.
+            camera: A :class:`PhysGaussianCamera` is in the normalised space; other cameras are in scene units.
+            cameras: Further cameras, likewise.
+            edits: Their regions are in the normalised space.
             cloud: The Gaussians of the scene, if they have been read already.
 
         Returns:
-            The frame of :meth:`fit`.
+            Copies, the scene with ``metres_per_unit`` set.
 
         Raises:
             ValueError: If the scene already has a scale, or nothing is simulated.
@@ -154,20 +161,43 @@ class Normalisation:
                 "`normalisation` sets the scale of the scene: remove `scene.longest_side` and "
                 "`scene.metres_per_unit`, or `normalisation`."
             )
+        scene, solver = copy.copy(scene), copy.copy(solver)
         turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
         scene.region = RegionInFrame(scene.region, turned)
         cloud = scene.cloud() if cloud is None else cloud
         chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
         frame = self.fit(cloud.means[chosen])
         scene.metres_per_unit = 1 / frame.metres_per_unit
-        material.regions = [
-            dataclasses.replace(entry, region=RegionInFrame(entry.region, frame)) for entry in material.regions
-        ]
-        conditions = [b for b in solver.boundaries if isinstance(b, Boundary)]
-        solver.boundaries = nn.ModuleList([b.in_frame(frame) for b in conditions])
-        if isinstance(camera, PhysGaussianCamera):
-            camera.frame = frame
-        return frame
+        regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
+        conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]
+        solver._modules = solver._modules | {"boundaries": nn.ModuleList(conditions)}  # of the copy alone
+        return Placed(
+            scene,
+            dataclasses.replace(material, regions=regions),
+            solver,
+            None if camera is None else _seen(camera, frame),
+            {name: _seen(path, frame) for name, path in (cameras or {}).items()},
+            [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits],
+        )
+
+
+def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
+    """A camera path in scene units."""
+    if isinstance(camera, PhysGaussianCamera):
+        camera = copy.copy(camera)
+        camera.frame = frame
+    return camera
+
+
+class Placed(NamedTuple):
+    """What :meth:`Normalisation.place` returns, as arguments of a simulation."""
+
+    scene: Scene
+    material: Material
+    solver: MPMSolver
+    camera: CameraPath | None
+    cameras: dict[str, CameraPath]
+    edits: list[Edit]
 
 
 __all__ = ["Normalisation", "heading", "rotation_matrix", "tidy", "up_direction"]
