@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
     from gaussian_swaying.mpm.boundaries.handle import Handle
     from gaussian_swaying.mpm.boundaries.impulse import Impulse
+    from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
     from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
     from gaussian_swaying.mpm.boundaries.plane import Plane
     from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
@@ -51,7 +52,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.laws.snow import Snow
     from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
     from gaussian_swaying.mpm.solver import MPMSolver
-    from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
+    from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, support_force
     from gaussian_swaying.rendering.cameras.camera import Camera
     from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
     from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera
@@ -126,6 +127,7 @@ _HOMES = {
     "mpm.boundaries.enclosing_box": ("EnclosingBox",),
     "mpm.boundaries.handle": ("Handle",),
     "mpm.boundaries.impulse": ("Impulse",),
+    "mpm.boundaries.pinned_points": ("PinnedPoints",),
     "mpm.boundaries.pinned_region": ("PinnedRegion",),
     "mpm.boundaries.plane": ("Plane",),
     "mpm.boundaries.sequential_release": ("SequentialRelease",),
@@ -241,6 +243,7 @@ __all__ = [
     "OrbitCamera",
     "PhongShader",
     "PhysGaussianCamera",
+    "PinnedPoints",
     "PinnedRegion",
     "Plane",
     "Plasticine",
@@ -279,6 +282,7 @@ __all__ = [
     "read_capture",
     "read_gaussians",
     "read_ply",
+    "support_force",
     "write_ply",
     "write_usd",
 ]

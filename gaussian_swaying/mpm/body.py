@@ -47,16 +47,12 @@ class Body:
     Attributes:
         laws: The laws of the material, bound to its particles.
         held: What each boundary holds; None for one that holds no particles.
-        needs_position: Whether a boundary uses the positions of nodes.
-        needs_lattice: Whether a boundary uses the positions of lattice points.
     """
 
     def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary]) -> None:
         self.points, self.boundaries = points, tuple(boundaries)
         self.laws = LawDispatch(points)
         self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
-        self.needs_position = any(b.needs_position for b in self.boundaries)
-        self.needs_lattice = any(b.needs_lattice for b in self.boundaries)
 
     def tensors(self) -> list[Tensor]:
         """Tensors that a substep depends on, besides its state and forces; any of them may require a gradient."""

@@ -238,6 +238,8 @@ class MPMState:
             law has one.
         substep: Length of the last substep [s]; 0 at the start.
         work: Work of the external forces since the start [J], shape (...) over the batch, float64.
+        impulse: Momentum that each boundary took from the body since the start [N s], in the order of the boundaries,
+            shape (..., B, 3), float64; see :func:`support_force`.
     """
 
     position: Tensor
@@ -253,6 +255,7 @@ class MPMState:
     internal: Tensor | None = None
     substep: float = 0.0
     work: Tensor = field(default_factory=lambda: torch.zeros((), dtype=torch.float64))
+    impulse: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.float64))
 
     def replace(self, **changes: Any) -> MPMState:
         """A copy with some fields changed."""
@@ -280,3 +283,17 @@ class MPMState:
         if moved["F_total"] is None:
             moved["F_total"] = moved["F_elastic"]
         return cls(**moved)
+
+
+def support_force(before: MPMState, after: MPMState) -> Tensor:
+    """The mean force that the body exerted on each boundary between two states: on a pin, the force on its support.
+
+    Args:
+        before: The earlier state.
+        after: A later state of the same run.
+
+    Returns:
+        Force [N], in the order of the boundaries of the solver, shape (..., B, 3), float64; zero if no time passed.
+    """
+    time = after.time - before.time
+    return torch.where(time > 0, (after.impulse - before.impulse) / time, 0.0)

@@ -127,7 +127,7 @@ def bspline_stencil(
     f = torch.where(inside, f, 1.0)
     if snap > 0:
         f = torch.where(f - 0.5 < snap, 0.5, torch.where(1.5 - f < snap, 1.5, f))
-    w = torch.stack([0.5 * (1.5 - f).square(), 0.75 - (f - 1).square(), 0.5 * (f - 0.5).square()], dim=1)
+    w, slope = bspline_weights(f)
 
     first = (torch.where(inside, low, 0) * strides).sum(0)
     if batch:
@@ -137,7 +137,7 @@ def bspline_stencil(
     w = w * inside
     factors = [w]
     if gradients:
-        factors.append(torch.stack([f - 1.5, 2 - 2 * f, f - 0.5], dim=1) / dx * inside)
+        factors.append(slope / dx * inside)
     if moments:
         reach = torch.arange(3, device=f.device, dtype=f.dtype)
         factors.append(w * ((reach[:, None] - f[:, None]) * dx))
@@ -148,6 +148,20 @@ def bspline_stencil(
         return stencil
     ranked, order = torch.sort(torch.cat([stencil.layer(i) for i in range(3)]), stable=True)
     return replace(stencil, order=order, start=_borders(ranked, math.prod(batch) * grid.node_count))
+
+
+def bspline_weights(f: Tensor) -> tuple[Tensor, Tensor]:
+    """The three weights of each axis, and their slopes per cell.
+
+    Args:
+        f: Position in cells from the first of the three nodes, shape (3 axes, N); from 0.5 to 1.5 between the borders
+            of the stencil's cell. Beyond them the same polynomials extrapolate.
+
+    Returns:
+        Both of shape (3 axes, 3 nodes, N).
+    """
+    weight = torch.stack([0.5 * (1.5 - f).square(), 0.75 - (f - 1).square(), 0.5 * (f - 0.5).square()], dim=1)
+    return weight, torch.stack([f - 1.5, 2 - 2 * f, f - 0.5], dim=1)
 
 
 def _borders(ranked: Tensor, count: int) -> Tensor:

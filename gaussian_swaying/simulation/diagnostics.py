@@ -11,7 +11,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import MPMState, support_force
 from gaussian_swaying.simulation.health import particle_of_extremes
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
@@ -64,6 +64,8 @@ class FrameDiagnostics:
         moved_particle: Index of the particle that is farthest from rest.
         compressed_particle: Index of the particle with the smallest stretch.
         stretched_particle: Index of the particle with the largest stretch.
+        support: Mean force of the body on each boundary during the frame [N], in the order of ``solver.boundaries``:
+            for a pin the force on its support.
     """
 
     time: float
@@ -90,10 +92,22 @@ class FrameDiagnostics:
     moved_particle: int
     compressed_particle: int
     stretched_particle: int
+    support: tuple[tuple[float, float, float], ...] = ()
 
     def as_dict(self) -> dict[str, float | int]:
-        """The fields by name."""
-        return asdict(self)
+        """The fields by name, with ``support`` as three numbers for each boundary (:func:`entry_names`)."""
+        values = asdict(self)
+        forces = [number for force in values.pop("support") for number in force]
+        return values | dict(zip(_support_names(len(self.support)), forces, strict=True))
+
+
+def _support_names(boundaries: int) -> list[str]:
+    return [f"support_{k}_{axis}" for k in range(boundaries) for axis in "xyz"]
+
+
+def entry_names(boundaries: int) -> list[str]:
+    """The names of ``FrameDiagnostics.as_dict`` with so many boundaries."""
+    return [name for name in FrameDiagnostics.__dataclass_fields__ if name != "support"] + _support_names(boundaries)
 
 
 class TearingGauge:
@@ -161,6 +175,7 @@ def diagnose(
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
     check: bool = False,
+    before: MPMState | None = None,
 ) -> FrameDiagnostics:
     """Measure the health of a state (one GPU synchronisation).
 
@@ -172,6 +187,7 @@ def diagnose(
         wind_work: Work of the wind during the frame [J].
         tearing: Counts torn particles; none are counted without it.
         check: Also run :func:`check_state`, within the same synchronisation.
+        before: The state at the start of the frame, for the forces on supports; they are zero without it.
 
     Returns:
         The measurements.
@@ -179,7 +195,7 @@ def diagnose(
     Raises:
         SimulationDiverged: With ``check``, naming time, particle, cause and remedy.
     """
-    return measure(solver, state, substeps, cfl, wind_work, tearing).read(check)
+    return measure(solver, state, substeps, cfl, wind_work, tearing, before).read(check)
 
 
 class Measurement:
@@ -211,6 +227,7 @@ class Measurement:
             **dict(zip(("J_min", "J_max", "displacement_mean", "displacement_max"), found["extremes"], strict=True)),
             **dict(zip(("stretch_min", "stretch_max"), found["stretch"], strict=True)),
             **{name: int(value) for name, value in zip(_PARTICLES, found["particles"], strict=True)},
+            support=tuple(zip(*[iter(found["support"])] * 3, strict=True)),
         )
 
 
@@ -221,6 +238,7 @@ def measure(
     cfl: Tensor | float,
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
+    before: MPMState | None = None,
 ) -> Measurement:
     """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device."""
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
@@ -242,9 +260,16 @@ def measure(
         "stretch": stretch,
         "particles": particle_of_extremes(moved, squares).double(),
         "given": torch.cat(given) if given else stretch[:0],
+        "support": _supports(state if before is None else before, state),
         "verdict": _verdict(solver, state, moved),
     }
     return Measurement(solver, substeps, parts, [cfl, wind_work])
+
+
+def _supports(before: MPMState, after: MPMState) -> Tensor:
+    """Force on each boundary [N], summed over the scenes, float64, shape (3 * boundaries,)."""
+    force = support_force(before, after)
+    return force.reshape(-1, *force.shape[-2:]).sum(0).reshape(-1)
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

@@ -438,7 +438,7 @@ class Simulation(nn.Module):
                 end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 work = (end.work - state.work).sum()
                 # everything is launched before the host waits for the first time
-                health = measure(self.solver, end, steps, courant, work, self._tearing)
+                health = measure(self.solver, end, steps, courant, work, self._tearing, state)
                 outran = (end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any()
                 cfl, outrun = torch.stack([courant.double(), outran.double()]).tolist()
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)

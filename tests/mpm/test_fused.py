@@ -22,6 +22,7 @@ from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
@@ -177,6 +178,12 @@ def _agree(ends, tolerance=TOLERANCE, names=FIELDS):
         # a sum over particles with both signs: the sum of its absolute terms is some sqrt(P) larger
         scale = max(float(expected.work.abs().max()), 1e-9) * math.sqrt(expected.position.shape[-2])
         torch.testing.assert_close(found.work, expected.work, rtol=0, atol=tolerance * scale, msg=lambda m: "work " + m)
+        # what is taken is a part of the momentum of the body
+        assert found.impulse.dtype == torch.float64
+        scale = float(expected.velocity.abs().max()) * 0.01 * expected.position.shape[-2]
+        torch.testing.assert_close(
+            found.impulse, expected.impulse, rtol=0, atol=tolerance * scale, msg=lambda m: "impulse " + m
+        )
         for name in names:
             a, b = getattr(expected, name), getattr(found, name)
             assert (a is None) == (b is None), name
@@ -841,16 +848,20 @@ def test_many_substeps(formulation):
 LEFT, TOP = Box([None] * 3, [0.12, None, None]), Box([None, None, 0.17], [None] * 3)
 WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}
 BOUNDARIES = {
-    "pin": lambda: [PinnedRegion(LEFT)],
-    "two pins": lambda: [PinnedRegion(LEFT), PinnedRegion(TOP, held_share=0.4)],
-    "pin for some time": lambda: [PinnedRegion(LEFT, **WINDOW)],
-    "handle": lambda: [Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], **WINDOW)],
-    "release": lambda: [SequentialRelease(LEFT, [0.0, 1.0, 0.0], start=0.5 * DT, end=1.5 * DT)],
+    "pin": lambda: [PinnedRegion(LEFT, "nodes")],
+    "hinge": lambda: [PinnedRegion(LEFT)],
+    "two pins": lambda: [PinnedRegion(LEFT, "nodes"), PinnedRegion(TOP, "nodes", held_share=0.4)],
+    "pin for some time": lambda: [PinnedRegion(LEFT, "nodes", **WINDOW)],
+    "hinge for some time": lambda: [PinnedRegion(LEFT, **WINDOW)],
+    "handle": lambda: [Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "nodes", **WINDOW)],
+    "hinged handle": lambda: [Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], **WINDOW)],
+    "release": lambda: [SequentialRelease(LEFT, [0.0, 1.0, 0.0], start=0.5 * DT, end=1.5 * DT, kind="nodes")],
+    "release of points": lambda: [SequentialRelease(LEFT, [0.0, 1.0, 0.0], start=0.5 * DT, end=1.5 * DT)],
     "impulse": lambda: [Impulse(TOP, [0.01, 0.0, 0.02], **WINDOW)],
     "plane": lambda: [Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.4, **WINDOW)],
     "box": lambda: [EnclosingBox([0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)],
     "velocity box": lambda: [VelocityBox(TOP, [0.0, 1.0, 0.0], **WINDOW)],
-    "pin and plane": lambda: [PinnedRegion(LEFT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
+    "pin and plane": lambda: [PinnedRegion(LEFT, "nodes"), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
     "knock and release": lambda: [SequentialRelease(LEFT, end=1.5 * DT), Impulse(Everything(), [0, 0, 0.02], end=DT)],
 }
 
@@ -859,13 +870,70 @@ BOUNDARIES = {
     ("kernel_device", "name"),
     [
         *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
-        *(("interpreted", name) for name in ("two pins", "handle", "knock and release")),
+        *(("interpreted", name) for name in ("two pins", "hinge", "handle", "hinged handle", "knock and release")),
     ],
     indirect=["kernel_device"],
 )
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_boundaries(kernel_device, formulation, name):
     """Over three substeps, of which the first and the last lie outside the window."""
+    _boundaries_case(kernel_device, formulation, BOUNDARIES[name])
+
+
+POINT_HOLDS = {
+    "clamp": lambda: [PinnedRegion(LEFT, "clamp")],
+    "points": lambda: [PinnedPoints([[0.1, 0.12, 0.11], [0.2, 0.17, 0.13]])],
+    "nodes, hinge and clamp": lambda: [
+        PinnedRegion(LEFT),
+        PinnedRegion(TOP, "nodes", held_share=0.4),
+        PinnedPoints([[0.2, 0.1, 0.1]], "clamp"),
+        PinnedRegion(LEFT, "nodes", held_share=0.5),
+    ],
+    "points and plane": lambda: [PinnedPoints([[0.2, 0.1, 0.1]]), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
+    "points one after the other": lambda: [
+        PinnedRegion(LEFT, end=1.5 * DT),
+        PinnedPoints([[0.2, 0.1, 0.1]], "clamp", start=0.5 * DT),
+        Handle(TOP, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "clamp", start=1.5 * DT),
+    ],
+}
+"""These are for `total` alone."""
+
+
+@pytest.mark.parametrize(("kernel_device", "name"), _on(*POINT_HOLDS), indirect=["kernel_device"])
+def test_points_that_are_held(kernel_device, name):
+    _boundaries_case(kernel_device, "total", POINT_HOLDS[name])
+
+
+def test_points_held_in_a_batch(kernel_device):
+    """The scenes have different rows."""
+    points = _points(kernel_device, count=40, batch=(2,))
+    boundaries = [PinnedRegion(LEFT), PinnedRegion(TOP, "nodes", held_share=0.4)]
+    ends = _wind_case(points, "total", steps=2, boundaries=boundaries)
+    _agree(ends)
+    assert ends[1].impulse.shape == (2, 2, 3)
+
+
+@pytest.mark.gpu
+def test_held_points_stay_where_they_are_and_give_the_same_bits():
+    """Thousands of substeps in float32, from graphs."""
+    pytest.importorskip("triton")
+    points = _points("cuda", count=2000)
+    ends = []
+    for _ in range(2):
+        solver = _solver(
+            "triton", "total", deterministic=True, boundaries=[PinnedRegion(LEFT), PinnedRegion(TOP, "clamp")]
+        )
+        ends.append(solver.rollout(_start(solver, points, strain=0.02), 2e-4, 4000, _load(points)))
+    for name in ("position", "velocity", "node_velocity", "impulse"):
+        assert torch.equal(getattr(ends[0], name), getattr(ends[1], name))
+    holds = solver.bound.point_holds
+    rows = (holds.weight[0, 0][..., None] * ends[0].node_displacement[holds.node[0, 0]].double()).sum(-2)
+    start = _start(solver, points, strain=0.02).node_displacement
+    before = (holds.weight[0, 0][..., None] * start[holds.node[0, 0]].double()).sum(-2)
+    assert float((rows - before).abs().max()) < 1e-5 * DX
+
+
+def _boundaries_case(kernel_device, formulation, make):
     points = _points(kernel_device, count=12)
     load = _load(points)
 
@@ -873,8 +941,9 @@ def test_boundaries(kernel_device, formulation, name):
         state = solver.rollout(state, DT, 1, load)
         return [state, solver.rollout(state, DT, 2, load)]
 
-    ends = _both(points, run, formulation, boundaries=BOUNDARIES[name]())
+    ends = _both(points, run, formulation, boundaries=make())
     _agree(ends)
+    assert float(ends[1][1].impulse.abs().max()) > 1e-4
     free = _solver("torch", formulation)
     with torch.no_grad():
         velocity = run(free, _start(free, points))[1].velocity

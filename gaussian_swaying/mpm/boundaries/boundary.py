@@ -3,8 +3,9 @@
 A condition changes nodal velocities after the momentum update. The position of a node depends on the formulation: the
 lattice point in ``updated``, the centre of the mass that it carries in ``total``.
 
-A condition that holds particles holds the nodes that carry them: in ``updated`` all nodes that they touch, in ``total``
-those where they have more than a given share of the mass.
+A condition that holds particles either holds the nodes that carry them (in ``updated`` all nodes that they touch, in
+``total`` those where they have more than a given share of the mass), or, in ``total``, points of the material alone
+(:mod:`~gaussian_swaying.mpm.point_holds`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._graphs import Recordable
@@ -92,6 +94,35 @@ class Boundary(Recordable, nn.Module, ABC):
             vars(moved)["region"] = RegionInFrame(vars(self)["region"], frame)
         return moved
 
+    def hold_kind(self, neighbours_fixed: bool) -> str:
+        """What it acts on: ``nodes``, in :meth:`forward`, or points of the material, as a ``hinge`` or a ``clamp``.
+
+        Args:
+            neighbours_fixed: Whether the particles keep their neighbours, so that points can be held.
+
+        Raises:
+            ValueError: If it can only hold points, but they cannot be held.
+        """
+        return "nodes"
+
+    @property
+    def holds_from(self) -> float:
+        """Time from which it holds points [s]."""
+        return self.start
+
+    @property
+    def moves(self) -> bool:
+        """Whether what it holds moves: whether it has a :meth:`target` of its own."""
+        return type(self).target is not Boundary.target
+
+    def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
+        """Velocity of what it holds at some places now (..., 3) [m/s], for a substep of ``dt`` [s]; zero if at rest."""
+        return torch.zeros_like(place)
+
+    def turning(self, arm: Tensor, dt: float | Tensor) -> Tensor:
+        """How the target velocity differs between two places that are ``arm`` (..., 3) apart; zero if at rest."""
+        return torch.zeros_like(arm)
+
     def particle_mask(self, rest_position: Tensor) -> Tensor | None:
         """Particles that the condition holds, from their rest positions (..., P, 3); None if it holds none."""
         return None
@@ -113,3 +144,11 @@ class Boundary(Recordable, nn.Module, ABC):
             velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
             nodes: Other data about them.
         """
+
+
+def refuse_points(boundary: Boundary, what: str, instead: str) -> ValueError:
+    """The error for a boundary that holds points where only nodes can be held."""
+    return ValueError(
+        f"{what} of the {type(boundary).__name__} needs particles that keep their neighbours, which the updated "
+        f"formulation does not have: set {instead}, or `solver.formulation` to total."
+    )

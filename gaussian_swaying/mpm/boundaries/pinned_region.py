@@ -5,35 +5,65 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.boundary import Nodes, refuse_points
 from gaussian_swaying.mpm.boundaries.particle_boundary import ParticleBoundary
+
+KINDS = ("hinge", "clamp", "nodes")
 
 
 class PinnedRegion(ParticleBoundary):
-    """Holds the grid nodes of the particles whose rest position lies in a region.
+    """Holds the material whose rest position lies in a region.
 
-    A pin that only reset its particles would let a sheet slide off, since their neighbours keep moving the shared
-    nodes. So the nodes are held: in ``updated`` all nodes that the particles touch, in ``total`` those where they have
-    more than ``held_share`` of the mass. The effective edge of the pin is therefore accurate to a fraction of a cell:
-    in ``total`` it lies between 0.4 cells too far out and 0.4 cells too far in, depending on how the particles lie on
-    the grid, and is right on average with the default share; in ``updated`` it lies about 0.7 cells too far in.
+    There are three kinds:
+
+    - ``hinge`` holds one point in each grid cell of the region: the centre of the particles there. The material can
+      turn about a line of such points, like a flag on its pole. It is held exactly where the region is.
+    - ``clamp`` also holds the deformation at these points, so the material cannot turn either.
+    - ``nodes`` holds the grid nodes of the particles: in ``updated`` all nodes that the particles touch, in ``total``
+      those where they have more than ``held_share`` of the mass. It is right for solids. It also holds the slope of a
+      sheet, and its effective edge is accurate to a fraction of a cell: in ``total`` it lies between 0.4 cells too far
+      out and 0.4 cells too far in, depending on how the particles lie on the grid, and is right on average with the
+      default share; in ``updated`` it lies about 0.7 cells too far in.
 
     Args:
         region: Region of the pinned particles at rest, in scene units.
-        held_share: Share of the nodal mass in ``total``, between 0 and 1.
+        kind: ``hinge`` and ``clamp`` (only in ``total``), ``nodes``, or None: ``hinge`` in ``total``, ``nodes`` in
+            ``updated``.
+        held_share: Share of the nodal mass for ``nodes`` in ``total``, between 0 and 1.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
     """
 
     recordable = True
 
-    def __init__(self, region: Region, held_share: float = 0.07, start: float = 0.0, end: float | None = None) -> None:
+    def __init__(
+        self,
+        region: Region,
+        kind: str | None = None,
+        held_share: float = 0.07,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
         super().__init__(region, start, end)
+        if kind is not None:
+            check_choice("kind", kind, KINDS)
         if not 0 <= held_share < 1:
             raise ValueError(f"Expected `held_share` to lie in [0, 1), but got {held_share}.")
-        self.held_share = held_share
+        self.kind, self.held_share = kind, held_share
+
+    def hold_kind(self, neighbours_fixed: bool) -> str:
+        """The ``kind``, or the one that suits the formulation."""
+        if self.kind is None:  # a subclass with its own `forward` acts on nodes
+            return "hinge" if neighbours_fixed and type(self).forward is PinnedRegion.forward else "nodes"
+        if self.kind != "nodes" and not neighbours_fixed:
+            raise refuse_points(self, f"`kind: {self.kind}`", "`kind` to nodes")
+        return self.kind
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Hold the nodes."""
-        return torch.where((nodes.held & self.active(nodes.time))[..., None], torch.zeros_like(velocity), velocity)
+        """Give the held nodes their target velocity."""
+        target = (
+            torch.zeros_like(velocity) if nodes.lattice is None else self.target(nodes.lattice, nodes.time, nodes.dt)
+        )
+        return torch.where((nodes.held & self.active(nodes.time))[..., None], target, velocity)

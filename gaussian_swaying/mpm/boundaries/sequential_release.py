@@ -11,7 +11,6 @@ from torch import Tensor
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 
 
@@ -23,13 +22,13 @@ class SequentialRelease(PinnedRegion):
         direction: Direction in which the front travels, in scene axes.
         start: Time at which the front meets the first particle [s]; before that, all are held.
         end: Time at which it passes the last one [s].
-        held_share: Share of the nodal mass in ``total``, between 0 and 1.
+        kind: ``hinge``, ``clamp``, ``nodes`` or None, as for a :class:`PinnedRegion`. Held points are released when the
+            front passes them.
+        held_share: Share of the nodal mass for ``nodes`` in ``total``, between 0 and 1.
         first: Point that the front meets at ``start``, in scene units, instead of the first particle.
         last: Point that it passes at ``end``, in scene units, instead of the last particle; must be given together with
             ``first`` and lie farther along ``direction``.
     """
-
-    recordable = True
 
     def __init__(
         self,
@@ -37,11 +36,12 @@ class SequentialRelease(PinnedRegion):
         direction: Sequence[float] = (0.0, 0.0, 1.0),
         start: float = 0.0,
         end: float = 1.0,
+        kind: str | None = None,
         held_share: float = 0.07,
         first: Sequence[float] | None = None,
         last: Sequence[float] | None = None,
     ) -> None:
-        super().__init__(region, held_share, start, end)
+        super().__init__(region, kind, held_share, start, end)
         if not math.isfinite(self.end):
             raise ValueError(f"Expected `end` of the SequentialRelease to be a finite time, but got {end}.")
         if not any(check_vector("direction", direction)):
@@ -68,6 +68,15 @@ class SequentialRelease(PinnedRegion):
             tensors["ends"] = frame.point_to_sim(self.ends)
         return self.copy_in(frame, **tensors)
 
+    @property
+    def holds_from(self) -> float:
+        """It holds from the beginning."""
+        return -math.inf
+
+    def active(self, time: Tensor) -> Tensor:
+        """Always: particles are released one by one instead."""
+        return time > -math.inf
+
     def release_time(self, rest_position: Tensor) -> Tensor:
         """When the front passes each particle [s], shape (..., P), float64."""
         mask = self.region.contains(rest_position)
@@ -79,7 +88,3 @@ class SequentialRelease(PinnedRegion):
             low, high = (self.ends.to(along) @ self.direction.to(along)).unbind()
         part = (along - low) / (high - low).clamp(min=torch.finfo(torch.float64).tiny)
         return self.start + part * (self.end - self.start)
-
-    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Hold the nodes of the particles not yet released."""
-        return torch.where(nodes.held[..., None], torch.zeros_like(velocity), velocity)

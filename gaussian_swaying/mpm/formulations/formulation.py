@@ -53,6 +53,9 @@ class Formulation(ABC):
             such a body cannot tear, flow or leave its grid, and its velocity does not count in the Courant number.
         viscous_power: Power of the largest squared stretch with which the viscous stress stiffens.
         held: As in the body, with the parts that are constant on this grid.
+        kinds: What each boundary holds: ``nodes``, or points as ``hinge`` or ``clamp`` (``Boundary.hold_kind``).
+        needs_position: Whether a boundary uses the positions of nodes.
+        needs_lattice: Whether a boundary uses the positions of lattice points.
     """
 
     name: ClassVar[str]
@@ -62,6 +65,10 @@ class Formulation(ABC):
     def __init__(self, body: Body, settings: Settings) -> None:
         self.body, self.settings = body, settings
         self.held: tuple[Held | None, ...] = body.held
+        self.kinds = tuple(boundary.hold_kind(self.neighbours_fixed) for boundary in body.boundaries)
+        on_nodes = [b for b, kind in zip(body.boundaries, self.kinds, strict=True) if kind == "nodes"]
+        self.needs_position = any(b.needs_position for b in on_nodes)
+        self.needs_lattice = any(b.needs_lattice for b in on_nodes)
         device = body.points.position.device
         with torch.inference_mode(False):  # an ordinary tensor, which a gradient may need
             # float64 on the device: no copy in a step, full precision in a float64 run
@@ -102,7 +109,14 @@ class Formulation(ABC):
             grid=self.first_grid(margin),
             internal=self.body.laws.initial_internal(),
             work=torch.zeros(position.shape[:-2], dtype=torch.float64, device=position.device),
+            impulse=self.no_impulse(),
         )
+
+    def no_impulse(self) -> Tensor:
+        """A momentum of zero for each boundary, shape (..., B, 3), float64."""
+        position = self.body.points.position
+        shape = (*position.shape[:-2], len(self.kinds), 3)
+        return torch.zeros(shape, dtype=torch.float64, device=position.device)
 
     @abstractmethod
     def fit_grid(self, state: MPMState, horizon: float, margin: int) -> MPMState:
@@ -165,16 +179,18 @@ class Formulation(ABC):
     def constrain(
         self,
         velocity: Tensor,
+        mass: Tensor,
         share_of: Callable[[Held], Tensor],
         position: Tensor | None,
         lattice: Tensor | None,
         time: Tensor,
         dt: float | Tensor,
-    ) -> Tensor:
-        """Apply the boundary conditions to node velocities, in order.
+    ) -> tuple[Tensor, Tensor]:
+        """Apply the boundary conditions that act on nodes to their velocities, in order.
 
         Args:
             velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
+            mass: Node mass [kg], shape (..., G).
             share_of: Returns the share of the nodal mass that held particles have now, shape (..., G).
             position: Positions of the nodes [m], shape (..., G, 3), if a boundary needs them.
             lattice: Positions of the lattice points [m], shape (..., G, 3), if a boundary needs them.
@@ -182,18 +198,23 @@ class Formulation(ABC):
             dt: Substep [s], a number or a scalar float64 tensor.
 
         Returns:
-            Shape (..., G, 3).
+            The velocity, shape (..., G, 3), and the momentum that each boundary took from the body [N s], shape
+            (..., B, 3), float64.
         """
-        pairs = zip(self.body.boundaries, self.held, strict=True)
+        taken = list(self.no_impulse().unbind(-2))
+        acting = [k for k, kind in enumerate(self.kinds) if kind == "nodes"]
         # impulses come before conditions that hold nodes, in whatever order they were given
-        for boundary, held in sorted(pairs, key=lambda pair: not isinstance(pair[0], Impulse)):
+        for k in sorted(acting, key=lambda k: not isinstance(self.body.boundaries[k], Impulse)):
+            boundary, held, before = self.body.boundaries[k], self.held[k], velocity
             if held is None:
                 nodes = Nodes(time, dt, position, lattice)
             else:
                 share = share_of(held) if held.share is None else held.share
                 nodes = Nodes(time, dt, position, lattice, share, held.threshold, held.total)
             velocity = boundary(velocity, nodes)
-        return velocity
+            with torch.no_grad():
+                taken[k] = (mass[..., None] * (before - velocity)).sum(-2, dtype=torch.float64)
+        return velocity, torch.stack(taken, dim=-2) if taken else self.no_impulse()
 
     # ---- measures of a state
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
+from gaussian_swaying.mpm.point_holds import PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
@@ -59,10 +60,26 @@ class Total(Formulation):
         self.node_mass = scatter(self.stencil, points.mass[..., None, None])[..., 0]
         self.node_inverse_mass = safe_inverse(self.node_mass)
         self.node_rest: Tensor | None = None
-        if body.needs_position:
+        if self.needs_position:
             first_moment = scatter(self.stencil, (points.mass[..., None] * position)[..., None, :])
             self.node_rest = first_moment * self.node_inverse_mass[..., None]
-        self.held = tuple(None if held is None else self._on_nodes(k, held) for k, held in enumerate(body.held))
+        self.held = tuple(
+            held if held is None or self.kinds[k] != "nodes" else self._on_nodes(k, held)
+            for k, held in enumerate(body.held)
+        )
+        self._point_holds: PointHolds | None = None
+        self._windows: tuple[tuple[float, float], ...] = ()
+        assert self.point_holds is not None or all(kind == "nodes" for kind in self.kinds)
+
+    @property
+    def point_holds(self) -> PointHolds | None:
+        """The points that boundaries hold, or None; made again if a boundary got another time window."""
+        pairs = zip(self.body.boundaries, self.kinds, strict=True)
+        windows = tuple((b.holds_from, b.end) for b, kind in pairs if kind != "nodes")
+        if windows != self._windows:
+            self._windows = windows
+            self._point_holds = PointHolds(self.body, self.kinds, self.stencil.first, self.grid, self.node_inverse_mass)
+        return self._point_holds
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
@@ -131,11 +148,28 @@ class Total(Formulation):
         if self.node_rest is not None:
             shift = (state.position - points.position) * points.mass[..., None]
             position = self.node_rest + scatter(self.stencil, shift[..., None, :]) * inverse_mass
-        if self.body.needs_lattice:
+        if self.needs_lattice:
             lattice = state.grid.node_positions(velocity) + displacement
-        velocity = self.constrain(velocity, self.share_at(state.time), position, lattice, state.time, dt)
-        state = state.replace(time=state.time + dt, substep=dt)
+        velocity, taken = self.hold(velocity, displacement, position, lattice, state.time, dt)
+        state = state.replace(time=state.time + dt, substep=dt, impulse=state.impulse + taken)
         return self.read_particles(state, displacement + dt * velocity, velocity)
+
+    def hold(
+        self,
+        velocity: Tensor,
+        displacement: Tensor,
+        position: Tensor | None,
+        lattice: Tensor | None,
+        time: Tensor,
+        dt: float | Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Apply all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
+        velocity, taken = self.constrain(velocity, self.node_mass, self.share_at(time), position, lattice, time, dt)
+        holds = self.point_holds
+        if holds is not None:
+            velocity, more = holds.hold(velocity, displacement, time, dt)
+            taken = taken + more.reshape(taken.shape)
+        return velocity, taken
 
     def share_at(self, time: Tensor) -> partial[Tensor]:
         """The function for ``constrain`` that returns the share of the nodal mass of held particles at a time."""

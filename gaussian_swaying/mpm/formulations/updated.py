@@ -105,10 +105,10 @@ class Updated(Formulation):
             velocity = velocity * (1 / (1 + kick * scatter(stencil, drag[..., None, None]) * inverse_mass))
         velocity = self.decay(velocity, kick)
         position = None
-        if body.needs_position or body.needs_lattice:
+        if self.needs_position or self.needs_lattice:
             position = state.grid.node_positions(velocity).expand_as(velocity)
         share = partial(held_share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
-        velocity = self.constrain(velocity, share, position, position, state.time, dt)
+        velocity, taken = self.constrain(velocity, nodes[..., 3], share, position, position, state.time, dt)
         new_velocity, affine, gradient = g2p(velocity, stencil, settings.dx)
         identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         update = identity + dt * gradient
@@ -127,6 +127,7 @@ class Updated(Formulation):
             time=state.time + dt,
             internal=internal,
             substep=dt,
+            impulse=state.impulse + taken,
         )
 
     def kinetic(self, state: MPMState) -> Tensor:

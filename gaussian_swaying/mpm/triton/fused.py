@@ -69,6 +69,8 @@ class Fused(ABC):
         self.watches = self.wave is not None
         """Whether rollouts can measure the wave speed."""
         self.speed = torch.zeros(1, device=self.device)
+        self.impulse = bound.no_impulse()
+        """Momentum that each boundary took in the current part of the rollout, shape (..., B, 3)."""
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in bound.settings.gravity]

@@ -8,10 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.forces import TWIN_VALUES
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.formulations.total import Total
+from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, check_indices
@@ -69,20 +71,39 @@ class FusedTotal(Fused):
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = _lanes(sizes)
         self._cut(sizes)
-        self.plain = all(type(b) is PinnedRegion and b.start <= 0 and b.end == math.inf for b in body.boundaries)
-        self.position = body.needs_position
-        self.lattice = grid.node_positions(self.rest) if body.needs_lattice else None
-        held = torch.zeros(len(inverse), dtype=torch.bool, device=self.device)
-        if self.plain:
-            for pin in bound.held:
-                assert pin is not None
-                assert pin.share is not None
-                held |= (pin.share > pin.threshold).reshape(-1)
-        self.held = held[active].to(torch.int8)
+        pins = (PinnedRegion, PinnedPoints)
+        self.plain = all(type(b) in pins and b.start <= 0 and b.end == math.inf for b in body.boundaries)
+        self.position = bound.needs_position
+        self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
+        self._take_pins()
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
         self._partial: dict[tuple[int, int], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
+
+    def _take_pins(self) -> None:
+        """What pins without a window hold: nodes, and points."""
+        bound, active = self.bound, self.active.long()
+        owner = torch.full((self.bound.node_mass.numel(),), -1, device=self.device)
+        for k in reversed(range(len(bound.held)) if self.plain else ()):  # the first pin takes the momentum
+            pin = bound.held[k]
+            if bound.kinds[k] == "nodes":
+                assert pin is not None
+                assert pin.share is not None
+                owner = torch.where((pin.share > pin.threshold).reshape(-1), k, owner)
+        owner = owner[active]
+        self.held = (owner >= 0).to(torch.int8)
+        self.taken = torch.zeros(len(active), 4, device=self.device)  # momentum taken from each held node
+        scene = active // self.grid.node_count
+        # the held nodes of each boundary in each scene, for sums in a fixed order
+        self.own_nodes = [
+            [((owner == k) & (scene == s)).nonzero()[:, 0] for k in range(len(bound.held))] for s in range(self.scenes)
+        ]
+        self.points: DenseHolds | None = None
+        if self.plain and bound.point_holds is not None:
+            self.points = bound.point_holds.dense()
+            check_indices(self.points.push.numel())
+            self.residual = torch.zeros(2, self.points.node.shape[1], 4, device=self.device)  # now, and its sum
 
     def _cut(self, sizes: Tensor) -> None:
         """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU."""
@@ -110,6 +131,8 @@ class FusedTotal(Fused):
         assert state.node_velocity is not None
         self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
         self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
+        for buffer in (self.taken, self.impulse, *([] if self.points is None else [self.residual])):
+            buffer.zero_()
         done = 0
         for mark in sorted({*looks, steps}):
             self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
@@ -151,14 +174,39 @@ class FusedTotal(Fused):
         nodes = len(self.active)
         kernels.total_nodes[(-(-nodes // block),)](
             self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
-            self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity,
+            self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
-            HELD=self.plain and len(self.body.boundaries) > 0, MOVE=self.plain, BLOCK=block, num_warps=2,
+            HELD=self.plain and "nodes" in self.bound.kinds, MOVE=self.plain, BLOCK=block, num_warps=2,
         )  # fmt: skip
+        if self.points is not None:
+            self._hold_points(self.points, offset)
         if not self.plain:
             self._constrain()
         if not self.plain or self.asked:
             self.time.add_(self.dt)
+
+    def _hold_points(self, points: DenseHolds, offset: int) -> None:
+        """Stop the held points: their velocities, then those of the nodes around them."""
+        rows, block = points.node.shape[1], 32
+        kernels.total_rows[(-(-rows // block),)](
+            points.node, points.weight, rows, self.fields, self.residual, BLOCK=block, num_warps=1
+        )
+        nodes, block = len(points.affected), 8
+        kernels.total_hold[(-(-nodes // block),)](
+            points.affected, points.scene, points.push, self.residual, nodes, points.push.shape[1], self.fields,
+            self.schedule, self.first_step, offset, BLOCK=block, ROWS=64, num_warps=2,
+        )  # fmt: skip
+
+    def _impulse(self) -> Tensor:
+        """Momentum that each boundary took in this part of the rollout, shape of ``impulse``; in a fixed order."""
+        total = self.impulse.reshape(self.scenes, -1, 3).clone()
+        if "nodes" in self.bound.kinds and self.plain:
+            for s, own in enumerate(self.own_nodes):
+                for k, nodes in enumerate(own):
+                    total[s, k] += self.taken[nodes, :3].sum(0, dtype=torch.float64)
+        if self.points is not None:
+            total += self.points.share @ self.residual[1, :, :3].double().reshape(self.scenes, -1, 3)
+        return total.reshape(self.impulse.shape)
 
     def _constrain(self) -> None:
         """Apply the boundary conditions that the kernels do not support, and update the displacements."""
@@ -171,7 +219,9 @@ class FusedTotal(Fused):
             position = bound.node_rest + self.shift[:, :3].reshape(shape)
         if self.lattice is not None:
             lattice = self.lattice + self.displacement[:, :3].reshape(shape)
-        velocity = bound.constrain(velocity, bound.share_at(self.time), position, lattice, self.time, self.dt)
+        displacement = self.displacement[:, :3].reshape(shape)
+        velocity, taken = bound.hold(velocity, displacement, position, lattice, self.time, self.dt)
+        self.impulse.add_(taken)
         self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
         self.displacement.addcmul_(self.velocity, self.dt.float())
 
@@ -190,6 +240,7 @@ class FusedTotal(Fused):
             "F_total": F,
             "node_displacement": self.displacement[:, :3].reshape(nodes).contiguous(),
             "node_velocity": self.velocity[:, :3].reshape(nodes).contiguous(),
+            "impulse": state.impulse + self._impulse(),
         }
 
     def _read_into(

@@ -64,11 +64,12 @@ class FusedUpdated(Fused):
         if grid != self.grid:
             self.repeater.forget()  # they read the node positions
             self.grid, self.node_position = grid, None
-            if self.body.needs_position or self.body.needs_lattice:
+            if self.bound.needs_position or self.bound.needs_lattice:
                 self.node_position = grid.node_positions(self.velocity)
 
     def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
+        self.impulse.zero_()
         fields: dict[str, Any] = {}
         marks = sorted({*looks, *range(RESORT, steps, RESORT), steps})
         load, done = True, 0
@@ -88,7 +89,7 @@ class FusedUpdated(Fused):
             if mark in looks:
                 self._look()
             load, done = sort, mark
-        return fields
+        return {**fields, "impulse": state.impulse + self.impulse}
 
     def _load(self, state: MPMState) -> None:
         """Sort the particles by cell and copy their fields to the buffers."""
@@ -167,7 +168,10 @@ class FusedUpdated(Fused):
         position = self.node_position
         if position is not None:
             position = position.expand_as(velocity)
-        velocity = self.bound.constrain(velocity, self._share, position, position, self.time, self.dt)
+        inverse = self.inverse_mass[:nodes].reshape(shape)
+        mass = torch.where(inverse > 0, 1 / inverse, 0.0)
+        velocity, taken = self.bound.constrain(velocity, mass, self._share, position, position, self.time, self.dt)
+        self.impulse.add_(taken)
         self.velocity[:nodes, :3].copy_(velocity.reshape(-1, 3))
 
     def _share(self, held: Held) -> Tensor:

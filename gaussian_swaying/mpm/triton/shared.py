@@ -16,7 +16,7 @@ SCHEDULE = 4
 # Numbers that differ between bodies and between grids, and are not specialised. Otherwise Triton would compile a kernel
 # again whenever one of them becomes one or a multiple of 16, in the middle of a run, even while a graph is recorded.
 VARIES = (
-    "count", "cells", "pieces", "nodes", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
+    "count", "cells", "pieces", "nodes", "rows", "scenes", "scene_size", "step_offset", "sx", "sy", "ox", "oy", "oz",
     "nx", "ny", "nz",
 )  # fmt: skip
 

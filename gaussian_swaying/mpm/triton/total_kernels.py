@@ -2,7 +2,8 @@
 
 Stencils do not move, so particles are sorted by cell once. A program handles some cells with up to ``LANES`` particles
 at a time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of its
-27 cells. No atomics: the result is the same in every run.
+27 cells. Points that are held all the time are stopped by two more kernels. No atomics: the result is the same in every
+run.
 
 Rows of node arrays: displacement and velocity, each in four columns of eight, a sector of memory. The sums have four
 columns, or eight if boundaries need positions.
@@ -203,7 +204,7 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 @triton.jit(do_not_specialize=VARIES)
 def total_nodes(
     active, source, inverse_mass, held, nodes, cells, partial, fields, shift,
-    schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z,
+    schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z, taken,
     IMPLICIT: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, HELD: tl.constexpr, MOVE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -244,6 +245,12 @@ def total_nodes(
     v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
+        stopped = mask & (free == 0)
+        mass = 1.0 / tl.where(stopped, inverse, 1.0)
+        to = taken + k * 4
+        tl.store(to, tl.load(to, stopped, 0.0) + mass * v0, stopped)
+        tl.store(to + 1, tl.load(to + 1, stopped, 0.0) + mass * v1, stopped)
+        tl.store(to + 2, tl.load(to + 2, stopped, 0.0) + mass * v2, stopped)
         v0 = tl.where(free, v0, 0.0)
         v1 = tl.where(free, v1, 0.0)
         v2 = tl.where(free, v2, 0.0)
@@ -260,6 +267,60 @@ def total_nodes(
         tl.store(out, m0 * inverse, mask)
         tl.store(out + 1, m1 * inverse, mask)
         tl.store(out + 2, m2 * inverse, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_rows(node, weight, rows, fields, residual, BLOCK: tl.constexpr):
+    """``total``: velocities of the held points, and their sums since the start of the rollout."""
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = k < rows
+    r0 = tl.zeros([BLOCK], tl.float32)
+    r1 = tl.zeros([BLOCK], tl.float32)
+    r2 = tl.zeros([BLOCK], tl.float32)
+    for o in range(27):
+        place = fields + tl.load(node + o * rows + k, mask, 0) * 8 + 4
+        w = tl.load(weight + o * rows + k, mask, 0.0)
+        r0 += w * tl.load(place, mask, 0.0)
+        r1 += w * tl.load(place + 1, mask, 0.0)
+        r2 += w * tl.load(place + 2, mask, 0.0)
+    out = residual + k * 4
+    tl.store(out, r0, mask)
+    tl.store(out + 1, r1, mask)
+    tl.store(out + 2, r2, mask)
+    total = out + rows * 4
+    tl.store(total, tl.load(total, mask, 0.0) + r0, mask)
+    tl.store(total + 1, tl.load(total + 1, mask, 0.0) + r1, mask)
+    tl.store(total + 2, tl.load(total + 2, mask, 0.0) + r2, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_hold(
+    affected, scene, push, residual, nodes, rows, fields, schedule, first_step, step_offset,
+    BLOCK: tl.constexpr, ROWS: tl.constexpr,
+):  # fmt: skip
+    """``total``: velocities and displacements of the nodes around held points, of which a scene has ``rows``."""
+    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = n < nodes
+    first = tl.load(scene + n, mask, 0) * rows
+    a0 = tl.zeros([BLOCK], tl.float32)
+    a1 = tl.zeros([BLOCK], tl.float32)
+    a2 = tl.zeros([BLOCK], tl.float32)
+    for start in range(0, rows, ROWS):
+        k = start + tl.arange(0, ROWS)
+        known = mask[:, None] & (k < rows)[None, :]
+        b = tl.load(push + n[:, None] * rows + k[None, :], known, 0.0)
+        place = residual + (first[:, None] + k[None, :]) * 4
+        a0 += tl.sum(b * tl.load(place, known, 0.0), 1)
+        a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
+        a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
+    at = fields + tl.load(affected + n, mask, 0) * 8
+    tl.store(at, tl.load(at, mask, 0.0) - dt * a0, mask)
+    tl.store(at + 1, tl.load(at + 1, mask, 0.0) - dt * a1, mask)
+    tl.store(at + 2, tl.load(at + 2, mask, 0.0) - dt * a2, mask)
+    tl.store(at + 4, tl.load(at + 4, mask, 0.0) - a0, mask)
+    tl.store(at + 5, tl.load(at + 5, mask, 0.0) - a1, mask)
+    tl.store(at + 6, tl.load(at + 6, mask, 0.0) - a2, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)

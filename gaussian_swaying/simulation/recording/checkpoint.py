@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.runs.seal import check_seal, save_sealed
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
+from gaussian_swaying.simulation.diagnostics import entry_names
 
 _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": dict}
 
@@ -106,7 +106,7 @@ def check_state(
     _require(
         abs(float(state["time"]) - frame * frame_dt) <= 0.01 * frame_dt, f"its `time` is not that of frame {frame}"
     )
-    names = set(FrameDiagnostics.__dataclass_fields__)
+    names = set(entry_names(start.impulse.shape[-2]))
     _require(len(log) == frame + 1, f"its `log` does not have {frame + 1} frames")
     for entry in log:
         _require(isinstance(entry, dict) and set(entry) == names, "its `log` lacks diagnostics of a frame")

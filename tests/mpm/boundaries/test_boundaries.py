@@ -17,6 +17,7 @@ from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
@@ -36,6 +37,7 @@ CONDITIONS = {
     "velocity": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5),
     "velocity-travels": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5, travels=True),
 }
+POINTS = {"points": lambda r: PinnedPoints([[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]], end=0.5)}  # they hold no nodes
 REGIONS = {
     "everything": Everything(),
     "box": Box([None, 0.1, 0.23], [0.35, None, None]),
@@ -76,7 +78,7 @@ def test_a_boundary_is_one_file():
     found = boundaries.BOUNDARIES
     assert {kind.__module__.rsplit(".", 1)[1] for kind in found.values()} == files
     assert len(found) == len(files)
-    assert {type(make(Everything())) for make in CONDITIONS.values()} == set(found.values())
+    assert {type(make(Everything())) for make in (CONDITIONS | POINTS).values()} == set(found.values())
 
 
 def test_the_documented_boundaries_are_those_that_there_are():
@@ -89,8 +91,8 @@ def test_the_documented_boundaries_are_those_that_there_are():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda start, end: PinnedRegion(Sphere([0.2, 0.2, 0.2], 2.0), start=start, end=end),
-        lambda start, end: Handle(Sphere([0.2, 0.2, 0.2], 2.0), start=start, end=end),
+        lambda start, end: PinnedRegion(Sphere([0.2, 0.2, 0.2], 2.0), "nodes", start=start, end=end),
+        lambda start, end: Handle(Sphere([0.2, 0.2, 0.2], 2.0), kind="nodes", start=start, end=end),
         lambda start, end: Plane([0, 0, 5], [0, 0, 1], "sticky", start=start, end=end),
         lambda start, end: Plane([0, 0, 5], [0, 0, 1], "slip", start=start, end=end),
         lambda start, end: Plane([0, 0, 5], [0, 0, 1], "separate", 0.4, start=start, end=end),
@@ -211,13 +213,13 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
         assert torch.equal(seen[3], velocity)
 
 
-@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize("name", CONDITIONS | POINTS)
 def test_in_frame_leaves_the_original_alone(name, block):
     """A second frame, or a dtype change of the original, does not change the copy in metres either."""
     scene = block().position
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=3.0)
     region = Box([None, None, 0.23], [None] * 3)
-    boundary = CONDITIONS[name](region)
+    boundary = (CONDITIONS | POINTS)[name](region)
 
     def values(condition):
         return {key: value.clone() for key, value in condition.state_dict().items()}
@@ -240,13 +242,14 @@ def test_in_frame_leaves_the_original_alone(name, block):
     assert all(torch.equal(value, values(boundary)[key]) for key, value in before.items())
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize(
+    ("formulation", "name"), [(f, n) for f in FORMULATIONS for n in CONDITIONS] + [("total", n) for n in POINTS]
+)
 def test_conditions_can_be_copied_saved_and_narrowed(name, formulation, block, march):
     """A deep copy and a copy from the state dict give the same bits; float32 gives the same to round-off."""
     points = block(per_side=5)
     region = Box([None, None, 0.23], [None] * 3)
-    boundary = CONDITIONS[name](region)
+    boundary = (CONDITIONS | POINTS)[name](region)
     run = {"dx": 0.1, "formulation": formulation}
     known = march(MPMSolver(**run, boundaries=[boundary]), points, 2e-3, 6)[-1]
     twin = copy.deepcopy(boundary)
@@ -283,7 +286,7 @@ def test_region_that_holds_nothing_names_its_condition(name, framed, block):
 @pytest.mark.parametrize("kind", [PinnedRegion, Handle, SequentialRelease])
 def test_share_that_no_node_reaches_names_its_condition(kind, block):
     """One particle among many at a node: it holds less than the share."""
-    pin = kind(Sphere([0.2333, 0.2333, 0.2333], 0.03), held_share=0.9)
+    pin = kind(Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes", held_share=0.9)
     with pytest.raises(ValueError, match=rf"no grid node.*`region` of the {kind.__name__} or lower its `held_share`"):
         MPMSolver(dx=0.4, boundaries=[pin]).init_state(block())
 
@@ -299,6 +302,10 @@ def test_share_that_no_node_reaches_names_its_condition(kind, block):
         (lambda: EnclosingBox([0, 0, 0], [1, 0, 1]), "`min` of the box to be below `max`"),
         (lambda: VelocityBox(Sphere([0, 0, 0], 1), [1, 2]), "`velocity` to have 3 numbers"),
         (lambda: PinnedRegion(Sphere([0, 0, 0], 1), held_share=1.0), "`held_share` to lie in"),
+        (lambda: PinnedRegion(Sphere([0, 0, 0], 1), "glue"), "`kind` to be one of hinge, clamp, nodes"),
+        (lambda: PinnedPoints([]), "`at` of the PinnedPoints to name at least one place"),
+        (lambda: PinnedPoints([[0, 0]]), "`at` to have 3 numbers"),
+        (lambda: PinnedPoints([[0, 0, 0]], "nodes"), "`kind` to be one of hinge, clamp"),
         (lambda: Handle(Sphere([0, 0, 0], 1), held_share=-0.1), "`held_share` to lie in"),
         (lambda: SequentialRelease(Sphere([0, 0, 0], 1), held_share=1.5), "`held_share` to lie in"),
         (lambda: Handle(Sphere([0, 0, 0], 1), [1, 2]), "`velocity` to have 3 numbers"),

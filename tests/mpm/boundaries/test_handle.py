@@ -21,7 +21,9 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation, block, 
     points = block()
     rest, velocity = points.position, torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)
     top = rest[:, 2] > 0.3
-    handle = Handle(Box([None, None, 0.3], [None] * 3), velocity.tolist(), held_share=0.0, start=0.0099, end=0.0499)
+    handle = Handle(
+        Box([None, None, 0.3], [None] * 3), velocity.tolist(), kind="nodes", held_share=0.0, start=0.0099, end=0.0499
+    )
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
     dt = 2e-3
     states = march(solver, points, dt, 50)
@@ -58,7 +60,7 @@ def test_handle_turns_twice_without_growing(formulation, block, march, rotation)
     axis, pivot = [1.0, 2.0, -2.0], torch.tensor([0.1, 0.3, 0.2], dtype=torch.float64)
     rate, substeps = 3.0, 160
     spin = [rate * c / 3 for c in axis]
-    handle = Handle(Sphere([0, 0, 0], 9.0), angular_velocity=spin, pivot=pivot.tolist())
+    handle = Handle(Sphere([0, 0, 0], 9.0), angular_velocity=spin, pivot=pivot.tolist(), kind="nodes")
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle])
     dt = 4 * math.pi / rate / substeps
     states = march(solver, points, dt, substeps)

@@ -56,7 +56,7 @@ def test_release_passes_over_lone_particles_in_order(formulation, direction, lon
 def test_release_lets_layers_of_a_block_fall_in_order(formulation, sign, block, march):
     points = block(e=2e3)
     rest = points.position
-    release = SequentialRelease(Sphere([0, 0, 0], 9.0), [sign, 0, 0], start=0.03, end=0.13)
+    release = SequentialRelease(Sphere([0, 0, 0], 9.0), [sign, 0, 0], start=0.03, end=0.13, kind="nodes")
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[release])
     dt = 5e-3
     states = march(solver, points, dt, 45)

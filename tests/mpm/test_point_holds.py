@@ -1,0 +1,497 @@
+"""Points that boundaries hold exactly: hinges and clamps, their windows, their impulses and gradients."""
+
+import dataclasses
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Box, Everything, Region
+from gaussian_swaying.mpm import point_holds
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState, support_force
+from gaussian_swaying.mpm.transfer import bspline_stencil, gather
+
+DX, STEP = 0.1, 0.045
+TOP = Box([None, None, -0.03], [None] * 3)
+
+
+def _sheet(dtype=torch.float64, layers=1, width=8, height=10, turn=0.0, shift=(0.0, 0.0, 0.0), e=4e3):
+    """A sheet in the x-z plane that hangs down from z = 0."""
+    x = STEP * (torch.arange(width, dtype=torch.float64) + 0.5)
+    z = -STEP * (torch.arange(height, dtype=torch.float64) + 0.5)
+    y = 0.01 * torch.tensor([0.0] if layers == 1 else [-1.0, 0.0, 1.0], dtype=torch.float64)
+    rest = torch.stack(torch.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3)
+    c, s = math.cos(turn), math.sin(turn)
+    matrix = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]], dtype=torch.float64)
+    position = (rest @ matrix.T + torch.tensor(shift, dtype=torch.float64)).to(dtype)
+    return MaterialPoints.create(
+        position, volume=STEP**2 * 0.02 / layers, density=100.0, youngs_modulus=e, poisson_ratio=0.3
+    )
+
+
+class Chosen(Region):
+    """Particles by their number."""
+
+    def __init__(self, mask):
+        super().__init__()
+        self.mask = mask
+
+    def forward(self, points):
+        return self.mask
+
+    def contains(self, points):
+        return self.mask.to(points.device)
+
+
+def _read(solver, place, field, state):
+    """Values and slopes of a nodal field at rest places, by the transfers of the solver."""
+    stencil = bspline_stencil(torch.as_tensor(place, dtype=field.dtype), state.grid, False)
+    return gather(field, stencil)
+
+
+def _run(solver, points, steps, dt=1e-3, force=None, velocity=None, every=1):
+    states = [solver.init_state(points, velocity)]
+    for _ in range(steps // every):
+        state = states[-1]
+        for _ in range(every):
+            state = solver.step(state, dt, force=force)
+        states.append(state)
+    return states
+
+
+def _push(points, size=0.02):
+    generator = torch.Generator().manual_seed(1)
+    push = size * torch.randn(points.position.shape, generator=generator, dtype=torch.float64)
+    return push.to(points.position) + points.position.new_tensor([0.0, size / 3, 0.0])
+
+
+def _own_places(holds, phase=0, scene=0):
+    """The values among the rows."""
+    own = ~holds.slope[phase, scene]
+    return holds.place[phase, scene][own]
+
+
+# ---- what is held
+
+
+@pytest.mark.parametrize(("dtype", "most"), [(torch.float64, 1e-14), (torch.float32, 2e-7)])
+@pytest.mark.parametrize("kind", ["hinge", "clamp"])
+@pytest.mark.parametrize("layers", [1, 3])
+def test_held_points_stay_where_they_are(kind, dtype, most, layers):
+    points = _sheet(dtype, layers)
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)])
+    state = _run(solver, points, 200, force=_push(points), every=200)[-1]
+    holds = solver.bound.point_holds
+    moved = _read(solver, _own_places(holds), state.node_displacement, state)
+    assert float(state.node_displacement.abs().max()) > 0.02
+    assert float(moved[:, 0].abs().max()) < most
+    slopes = moved[:, 1:].abs().amax((0, 2))  # along x, y, z
+    assert (float(slopes[1:].max()) < most / DX * 10) == (kind == "clamp")
+    for rows in (_own_places(holds), points.position[TOP.contains(points.position)]):
+        assert len(rows) >= 4
+
+
+def test_a_hinge_holds_one_row_per_cell_on_the_middle_plane():
+    points = _sheet(layers=3)
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP)])
+    state = solver.init_state(points)
+    places = _own_places(solver.bound.point_holds)
+    held = points.position[TOP.contains(points.position)]
+    cells = torch.unique(torch.floor(held / DX - 0.5), dim=0)
+    assert len(places) == len(cells)
+    assert float(places[:, 1].abs().max()) < 1e-15
+    assert state.impulse.shape == (1, 3)
+
+
+def test_a_hinge_turns_and_a_clamp_does_not():
+    """A side load of the weight: a hinged sheet hangs at 45 degrees."""
+    points = _sheet(layers=3, e=1e6)
+    load = torch.zeros_like(points.position)
+    load[:, 1] = 9.8 * points.mass
+    slopes = {}
+    for kind in ("hinge", "clamp", "nodes"):
+        solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], damping=8.0)
+        state = solver.init_state(points)
+        state = solver.rollout(state, 2e-4, 8000, lambda _: load)
+        low = points.position[:, 2] < -0.4
+        arm = state.position[low] - points.position[TOP.contains(points.position)].mean(0)
+        slopes[kind] = math.degrees(math.atan2(float(arm[:, 1].mean()), -float(arm[:, 2].mean())))
+    assert slopes["hinge"] == pytest.approx(45, abs=1.5)
+    assert slopes["clamp"] < 20
+    assert slopes["nodes"] < 20
+
+
+@pytest.mark.parametrize("kind", ["hinge", "clamp"])
+def test_given_places_need_not_be_particles(kind):
+    points = _sheet()
+    at = [[0.013, 0.0, -0.001], [0.31, 0.0, -0.017], [0.2, 0.0, -0.3]]
+    solver = MPMSolver(DX, boundaries=[PinnedPoints(at, kind)])
+    state = _run(solver, points, 200, force=_push(points), every=200)[-1]
+    moved = _read(solver, at, state.node_displacement, state)
+    assert float(moved[:, 0].abs().max()) < 1e-14
+    assert (float(moved[:, 1:].abs().max()) < 1e-12) == (kind == "clamp")
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.2, 0.4, 0.45, 0.6, 0.8])
+def test_a_place_just_outside_extends_the_nearest_cell(shift):
+    """A linear field is read exactly, although nodes beyond the material have no mass and do not move."""
+    points = _sheet(shift=(0.0, 0.0, shift * DX))
+    solver = MPMSolver(DX, boundaries=[PinnedPoints([[0.2, 0.0, shift * DX]])])
+    state = solver.init_state(points)
+    holds = solver.bound.point_holds
+    field = state.grid.node_positions(state.position)
+    massive = solver.bound.node_mass > 0
+    seen = (holds.weight[0, 0, 0, :, None] * torch.where(massive[:, None], field, 1e6)[holds.node[0, 0, 0]]).sum(0)
+    used = holds.weight[0, 0, 0] != 0
+    assert bool(massive[holds.node[0, 0, 0][used]].all())
+    torch.testing.assert_close(seen, torch.tensor([0.2, 0.0, shift * DX], dtype=torch.float64), rtol=0, atol=1e-13)
+
+
+def test_places_are_converted_from_scene_units():
+    scene = _sheet().position * 3 + 5
+    frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
+    points = dataclasses.replace(_sheet(), position=frame.point_to_sim(scene))
+    at = [[5.1, 5.0, 4.9]]
+    solver = MPMSolver(DX, boundaries=[PinnedPoints(at)])
+    solver.init_state(points, frame=frame)
+    expected = frame.point_to_sim(torch.tensor(at, dtype=torch.float64))
+    torch.testing.assert_close(_own_places(solver.bound.point_holds), expected, rtol=0, atol=1e-13)
+
+
+# ---- which rows are kept
+
+
+@pytest.mark.parametrize("patch", [1, 2, 8])
+@pytest.mark.parametrize(("kind", "most"), [("hinge", 50.0), ("clamp", 200.0)])
+def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
+    """Lines and patches, in one layer and in three. What is left out hardly moves: it depends on what is kept."""
+    generator = torch.Generator().manual_seed(patch)
+    worst = 0.0
+    for k in range(8):
+        turn = [0.0, math.pi / 4, math.pi / 2][k] if k < 3 else math.pi * float(torch.rand((), generator=generator))
+        shift = (DX * torch.rand(3, generator=generator)).tolist()
+        points = _sheet(layers=1 + 2 * (k % 2), width=20, turn=turn, shift=shift)
+        height = _sheet(layers=1 + 2 * (k % 2), width=20).position[:, 2]
+        pin = PinnedRegion(Chosen(height > -STEP * patch), kind)
+        solver = MPMSolver(DX, boundaries=[pin])
+        solver.init_state(points)
+        holds = solver.bound.point_holds
+        assert int((holds.release[0, 0] > 0).sum()) >= 0.8 * 20 * STEP / DX
+        worst = max(worst, holds.condition())
+    assert 1.5 < worst < most
+
+
+def test_a_line_along_the_grid_keeps_all_its_cells():
+    points = _sheet(width=22, shift=(0.05, 0.02, 0.03))
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP.__class__([None, None, -0.001], [None] * 3), "clamp")])
+    solver.init_state(points)
+    holds = solver.bound.point_holds
+    held = points.position[points.position[:, 2] > -0.001]
+    cells = torch.unique(torch.floor(held / DX - 0.5), dim=0)
+    own, slope = ~holds.slope[0, 0], holds.slope[0, 0]
+    assert int(own.sum()) == len(cells)
+    along = holds.place[0, 0][slope][:, 0] > 0
+    assert int(along.sum()) <= 2  # the slope along the line depends on the values, except at its ends
+    assert int(slope.sum()) >= 2 * len(cells)
+    assert holds.condition() < 200
+
+
+def test_condition_of_a_plain_line_is_small():
+    points = _sheet(width=40, shift=(0.05, 0.02, 0.03))
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(Box([None, None, -0.001], [None] * 3))])
+    solver.init_state(points)
+    assert 1.5 < solver.bound.point_holds.condition() < 8
+
+
+def test_rows_come_in_the_order_of_their_release():
+    product = torch.eye(4, dtype=torch.float64)
+    product[0, 1] = product[1, 0] = 0.99  # nearly the same row
+    everything = torch.ones(4, dtype=torch.bool)
+    late = torch.tensor([False, True, False, True])
+    assert point_holds.independent_rows(product, [everything]).tolist() == [0, 2, 3]
+    assert point_holds.independent_rows(product, [late, ~late]).tolist() == [1, 3, 2]
+    assert point_holds.independent_rows(torch.zeros(2, 2, dtype=torch.float64), [everything[:2]]).tolist() == []
+
+
+def test_pins_in_the_same_cells_agree():
+    """Each alone would move the points of the other."""
+    points = _sheet()
+    at = [[0.1, 0.0, -0.09], [0.2, 0.0, -0.15]]
+    pins = [PinnedRegion(TOP), PinnedPoints(at), PinnedRegion(Box([0.3, None, -0.2], [None, None, -0.1]), "clamp")]
+    solver = MPMSolver(DX, boundaries=[*pins, Plane([0, 0, -0.42], [0, 0, 1], "slip")])
+    state = _run(solver, points, 200, force=_push(points), every=200)[-1]
+    places = _own_places(solver.bound.point_holds)
+    assert len(places) >= 8
+    assert float(_read(solver, places, state.node_displacement, state)[:, 0].abs().max()) < 1e-14
+    assert state.impulse.shape == (4, 3)
+    assert bool((state.impulse[:3].abs().amax(-1) > 0).all())
+
+
+# ---- motion and time
+
+
+@pytest.mark.parametrize("kind", ["hinge", "clamp"])
+def test_a_handle_moves_its_points_exactly(kind):
+    """720 degrees about a travelling pivot; a clamp also turns the deformation gradient."""
+    points = _sheet(layers=3)
+    velocity, pivot, rate, steps, dt = [0.2, -0.1, 0.3], [0.1, 0.05, 0.02], 2 * math.pi, 2000, 1e-3
+    handle = Handle(TOP, velocity, [0.0, 0.0, rate], pivot, kind)
+    solver = MPMSolver(DX, boundaries=[handle])
+    states = _run(solver, points, steps, dt, every=500)
+    rest = _own_places(solver.bound.point_holds)
+    for state in states[1:]:
+        angle, time = rate * float(state.time), float(state.time)
+        c, s = math.cos(angle), math.sin(angle)
+        turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+        centre = torch.tensor(pivot, dtype=torch.float64)
+        wanted = centre + time * torch.tensor(velocity, dtype=torch.float64) + (rest - centre) @ turn.T
+        rows = _read(solver, rest, state.node_displacement, state)
+        torch.testing.assert_close(rest + rows[:, 0], wanted, rtol=0, atol=1e-11)
+        F = rows[:, 1:].mT + torch.eye(3, dtype=torch.float64)
+        # the slope along the line of points is theirs up to the bending of the line between them
+        error = (F - turn)[:, :, 1:].abs().max()
+        assert (float(error) < 1e-9) == (kind == "clamp")
+
+
+def test_pins_act_within_their_windows():
+    """One from the start, one for some time, one that starts later: three phases and two releases."""
+    points = _sheet()
+    dt = 1e-3
+    pins = [
+        PinnedRegion(TOP, end=0.1495),
+        PinnedPoints([[0.1, 0.0, -0.25]], start=0.0495, end=0.0995),
+        PinnedPoints([[0.3, 0.0, -0.3], [0.1, 0.0, -0.25]], start=0.0795),
+    ]
+    solver = MPMSolver(DX, boundaries=pins)
+    states = _run(solver, points, 200, dt, force=_push(points))
+    holds = solver.bound.point_holds
+    assert holds.starts.tolist() == [0.0495, 0.0795]
+    for places, first, last in ((None, 0, 149), ([[0.1, 0.0, -0.25]], 50, 200), ([[0.3, 0.0, -0.3]], 80, 200)):
+        places = _own_places(holds) if places is None else places
+        speed = torch.stack([_read(solver, places, s.node_velocity, s)[:, 0].abs().max() for s in states])
+        assert bool((speed[1:] < 1e-13)[first:last].all()), (places, first, last)
+        assert int((speed[1 : first + 1] < 1e-6).sum()) == 0
+        assert int((speed[last + 3 :] < 1e-6).sum()) == 0
+    taken = torch.stack([s.impulse for s in states])
+    changes = (taken[1:] != taken[:-1]).any(-1)
+    assert changes[:, 0].nonzero()[:, 0].tolist() == list(range(150))
+    # where two hold the same place, the one that holds longer carries it
+    assert changes[:, 1].nonzero()[:, 0].tolist() == list(range(50, 80))
+    assert int(changes[:80, 2].sum()) == 0
+    assert bool(changes[80:, 2].all())
+
+
+def test_points_are_released_one_by_one():
+    points = _sheet(width=12)
+    release = SequentialRelease(TOP, [1.0, 0.0, 0.0], start=0.02, end=0.12)
+    solver = MPMSolver(DX, boundaries=[release])
+    dt = 1e-3
+    states = _run(solver, points, 160, dt)
+    holds = solver.bound.point_holds
+    rest, when = _own_places(holds), holds.release[0, 0]
+    assert when.tolist() == sorted(when.tolist(), reverse=True)
+    assert len(set(when.tolist())) == len(torch.unique(torch.floor(rest[:, 0] / DX - 0.5)))
+    held = TOP.contains(points.position)
+    low, high = points.position[held, 0].min(), points.position[held, 0].max()
+    torch.testing.assert_close(when, 0.02 + 0.1 * (rest[:, 0] - low) / (high - low), rtol=1e-12, atol=0)
+    for state in states[1:]:
+        time = float(state.time) - dt
+        moved = _read(solver, rest, state.node_displacement, state)[:, 0].norm(dim=-1)
+        fixed = when > time + 1e-9
+        assert float(moved[fixed].sum()) < 1e-13
+        assert bool((moved[when < time - 2 * dt] > 1e-9).all())
+
+
+@pytest.mark.parametrize("kind", ["hinge", "clamp"])
+def test_the_longest_proven_substep_stays_stable(kind):
+    """The projection adds no stiffness: energy stays bounded over thousands of substeps."""
+    points = _sheet(layers=3, e=1e5)
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], gravity=(0, 0, 0))
+    generator = torch.Generator().manual_seed(2)
+    velocity = 1e-3 * torch.randn(points.position.shape, generator=generator, dtype=torch.float64)
+    state = solver.init_state(points, velocity)
+    dt = solver.stable_substep(state)
+    first = solver.rollout(state, dt, 20)
+    before = sum(float(e) for e in solver.energies(first).values())
+    largest = 0.0
+    state = first
+    for _ in range(40):
+        state = solver.rollout(state, dt, 100)
+        largest = max(largest, sum(float(e) for e in solver.energies(state).values()))
+    assert 0 < largest < 6 * before
+
+
+# ---- the support
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_supports_take_the_momentum_of_the_forces(formulation):
+    """In every substep: momentum gained = gravity - what the boundaries took."""
+    points = _sheet()
+    pins = [PinnedRegion(TOP), Plane([0, 0, -0.41], [0, 0, 1], "separate", 0.3)]
+    solver = MPMSolver(DX, formulation=formulation, boundaries=pins)
+    states = _run(solver, points, 60, 1e-3)
+    weight = float(points.mass.sum()) * torch.tensor([0, 0, -9.8], dtype=torch.float64)
+    for a, b in pairwise(states):
+        gained = solver.momenta(b)["linear"] - solver.momenta(a)["linear"]
+        taken = (b.impulse - a.impulse).sum(-2)
+        torch.testing.assert_close(gained, weight * 1e-3 - taken, rtol=0, atol=1e-14)
+    assert states[-1].impulse.dtype == torch.float64
+    assert float(states[-1].impulse[0, 2]) < 0
+
+
+@pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
+def test_two_pins_carry_weight_and_wind_at_rest(kind):
+    points = _sheet(width=12, shift=(0.03, 0, 0))  # symmetric on the grid
+    ends = [Box([None, None, -0.03], [0.13, None, None]), Box([0.47, None, -0.03], [None] * 3)]
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(end, kind) for end in ends], damping=6.0)
+    wind = torch.zeros_like(points.position)
+    wind[:, 1] = 0.3 * 9.8 * points.mass
+    state = solver.init_state(points)
+    state = solver.rollout(state, 1e-3, 3000, lambda _: wind)
+    later = solver.rollout(state, 1e-3, 100, lambda _: wind)
+    found, weight = support_force(state, later), 9.8 * float(points.mass.sum())
+    assert found.shape == (2, 3)
+    expected = torch.tensor([0.0, 0.3 * weight, -weight], dtype=torch.float64)
+    torch.testing.assert_close(found.sum(0), expected, rtol=0, atol=0.01 * weight)
+    torch.testing.assert_close(found[0, 1:], found[1, 1:], rtol=0, atol=0.01 * weight)
+    assert float(found[0, 0]) == pytest.approx(-float(found[1, 0]), abs=0.01 * weight)
+    assert torch.equal(support_force(state, state), torch.zeros(2, 3, dtype=torch.float64))
+
+
+def test_the_impulse_is_saved():
+    points = _sheet()
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP)])
+    state = _run(solver, points, 3, every=3)[-1]
+    again = MPMState.from_state_dict(state.state_dict())
+    assert torch.equal(again.impulse, state.impulse)
+    assert float(state.impulse.abs().max()) > 0
+
+
+# ---- gradients, batches, bits
+
+
+def _small(mass=None):
+    points = _sheet(width=3, height=4)
+    return points if mass is None else dataclasses.replace(points, mass=mass)
+
+
+@pytest.mark.parametrize("kind", ["hinge", "clamp"])
+def test_gradients_with_respect_to_velocity_and_mass(kind):
+    points = _small()
+    generator = torch.Generator().manual_seed(3)
+    velocity = 0.2 * torch.randn(points.position.shape, generator=generator, dtype=torch.float64)
+
+    def run(velocity, mass):
+        solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind), PinnedPoints([[0.1, 0.0, -0.13]], end=0.0025)])
+        state = solver.init_state(_small(mass), velocity)
+        return solver.rollout(state, 1e-3, 4).position
+
+    inputs = (velocity.requires_grad_(), points.mass.clone().requires_grad_())
+    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+def test_gradients_pass_through_checkpoints():
+    points = _small()
+    velocity = torch.full_like(points.position, 0.1).requires_grad_()
+    found = []
+    for checkpoint in (0, 2):
+        solver = MPMSolver(DX, boundaries=[Handle(TOP, [0.1, 0, 0], [0, 0, 1.0])])
+        end = solver.rollout(solver.init_state(points, velocity), 1e-3, 6, checkpoint=checkpoint)
+        found.append(torch.autograd.grad(end.position.square().sum(), velocity)[0])
+    torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-18)
+    assert float(found[0].abs().max()) > 0
+
+
+def test_scenes_of_a_batch_are_independent():
+    one, two = _sheet(), _sheet(shift=(0.03, 0.01, -0.02))
+    fields = ("position", "mass", "volume", "youngs_modulus", "poisson_ratio")
+    both = MaterialPoints(**{name: torch.stack([getattr(one, name), getattr(two, name)]) for name in fields})
+    make = lambda: [PinnedRegion(Box([None, None, -0.06], [None] * 3)), PinnedPoints([[0.2, 0.01, -0.2]], start=0.02)]  # noqa: E731
+    ends = []
+    for points in (one, two, both):
+        solver = MPMSolver(DX, boundaries=make())
+        state = solver.init_state(points)
+        ends.append(solver.rollout(state, 1e-3, 60))
+    for k in range(2):
+        torch.testing.assert_close(ends[2].position[k], ends[k].position, rtol=0, atol=1e-13)
+        torch.testing.assert_close(ends[2].impulse[k], ends[k].impulse, rtol=0, atol=1e-15)
+    assert ends[2].impulse.shape == (2, 2, 3)
+
+
+def test_repeated_runs_have_the_same_bits():
+    ends = []
+    for _ in range(2):
+        solver = MPMSolver(
+            DX, boundaries=[PinnedRegion(TOP, "clamp"), PinnedRegion(Box([None] * 3, [0.05, None, None]))]
+        )
+        ends.append(_run(solver, _sheet(torch.float32, 3), 50, every=50)[-1])
+    assert torch.equal(ends[0].position, ends[1].position)
+    assert torch.equal(ends[0].impulse, ends[1].impulse)
+
+
+# ---- kinds and errors
+
+
+def test_the_kind_suits_the_formulation():
+    points = _sheet()
+    for formulation, kinds in (("total", ("hinge", "hinge", "nodes")), ("updated", ("nodes", "nodes", "nodes"))):
+        boundaries = [PinnedRegion(TOP), Handle(TOP), Plane([0, 0, -9], [0, 0, 1])]
+        solver = MPMSolver(DX, formulation=formulation, boundaries=boundaries)
+        solver.init_state(points)
+        assert solver.bound.kinds == kinds
+
+
+def test_a_subclass_with_its_own_forward_acts_on_nodes():
+    class Stopper(PinnedRegion):
+        def forward(self, velocity, nodes):
+            return torch.where(nodes.held[..., None], 0.0, velocity)
+
+    class Lifter(PinnedRegion):
+        def target(self, place, time, dt):
+            return torch.ones_like(place)
+
+    solver = MPMSolver(DX, boundaries=[Stopper(TOP), Lifter(Box([None] * 3, [None, None, -0.4]))])
+    state = _run(solver, _sheet(), 3, every=3)[-1]
+    assert solver.bound.kinds == ("nodes", "hinge")
+    places = _own_places(solver.bound.point_holds)
+    speed = _read(solver, places, state.node_velocity, state)[:, 0]
+    torch.testing.assert_close(speed, torch.ones_like(speed), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", [PinnedRegion, Handle, SequentialRelease])
+def test_points_are_refused_in_updated(kind):
+    message = rf"`kind: clamp` of the {kind.__name__} needs .* set `kind` to nodes, or `solver.formulation` to total"
+    with pytest.raises(ValueError, match=message):
+        MPMSolver(DX, formulation="updated", boundaries=[kind(TOP, kind="clamp")]).init_state(_sheet())
+    with pytest.raises(ValueError, match=r"Pinned points of the PinnedPoints .* set the boundary to a PinnedRegion"):
+        MPMSolver(DX, formulation="updated", boundaries=[PinnedPoints([[0, 0, 0]])]).init_state(_sheet())
+
+
+def test_a_place_far_from_the_material_is_refused():
+    solver = MPMSolver(DX, boundaries=[PinnedPoints([[0.1, 0.0, -0.1], [0.1, 0.3, -0.1]])])
+    with pytest.raises(ValueError, match="place 1 of `at` of the PinnedPoints has no material around it"):
+        solver.init_state(_sheet())
+
+
+def test_too_many_rows_are_refused(monkeypatch):
+    monkeypatch.setattr(point_holds, "MOST_ROWS", 9)
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(Everything())])
+    with pytest.raises(
+        ValueError, match=r"hold \d+ points and slopes, more than the 9 .* `kind` of the PinnedRegion to"
+    ):
+        solver.init_state(_sheet())
+
+
+def test_only_what_has_a_target_moves():
+    assert Handle(TOP).moves
+    assert not PinnedRegion(TOP).moves
+    assert not PinnedPoints([[0, 0, 0]]).moves
