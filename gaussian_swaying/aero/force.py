@@ -238,7 +238,7 @@ class AeroForce(nn.Module):
     def on_groups(
         self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums
     ) -> tuple[Tensor, Tensor]:
-        """:func:`~gaussian_swaying.aero.patches.grouped_force` with these coefficients: force [N] (P, 3), area [m²] (P,)."""
+        """The result of :func:`~gaussian_swaying.aero.patches.grouped_force` with the numbers of this component."""
         return grouped_force(
             wind,
             velocity,

@@ -96,6 +96,26 @@ class PatchSums(nn.Module):
         """Area of the patches of each point at rest [m²], shape (P,)."""
         return self.tensor.diagonal(dim1=-2, dim2=-1).sum(-1)
 
+    @property
+    def rows(self) -> int:
+        """Length of the :meth:`table` in rows of four numbers."""
+        return len(self.vector) + 2 * len(self.tensor)
+
+    def lists(self) -> Tensor:
+        """First row of each point in the :meth:`table`, and its number of vectors, shape (P, 2)."""
+        count = self.point.bincount(minlength=len(self.tensor))
+        first = count.cumsum(0) - count + 2 * torch.arange(len(count), device=count.device)
+        return torch.stack([first, count], -1).to(self.tensor)
+
+    def table(self) -> Tensor:
+        """For each point two rows with the six numbers of its tensor, and a row for each vector; shape (4 rows,)."""
+        first = self.lists()[:, 0].long()
+        found = self.tensor.new_zeros(self.rows, 4)
+        upper = self.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        found[first], found[first + 1, :2] = upper[:, :4], upper[:, 4:]
+        found[torch.arange(len(self.point), device=first.device) + 2 * (self.point + 1), :3] = self.vector
+        return found.reshape(-1)
+
     def normals(self) -> Tensor:
         """Unit normal of each point, if it has patches of one direction, shape (P, 3); z where it has none."""
         normal = self.tensor.new_tensor([0.0, 0.0, 1.0]).repeat(len(self.tensor), 1)
