@@ -185,6 +185,12 @@ class AeroForce(nn.Module):
         """Whether the force is zero in any wind, so that it need not be computed."""
         return self.air_density == 0 or not any(float(c) for c in (self.C_D, self.C_F, self.C_L))
 
+    @property
+    def mostly_linear(self) -> bool:
+        """Whether less than a tenth of the force depends on the side of the patch that the flow meets."""
+        sided = float(self.C_L.abs()) / max(float(self.C_D + self.C_F + self.C_L.abs()), 1e-30)
+        return self.law == "projected" and not self.unit_tangent and sided < 0.1
+
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
         """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component."""
         coefficient = (self.C_D + self.C_F + self.C_L.abs()).to(speed.dtype)

@@ -54,7 +54,7 @@ class WindForce(Force):
         super().__init__()
         self.sums: PatchSums | None = None
         if isinstance(normal, Patches):
-            found = PatchSums(normal)
+            found = PatchSums(normal, coarse=aero.mostly_linear)
             self.sums = None if found.single else found
             normal, area = found.normals(), found.area
         if area is None:
