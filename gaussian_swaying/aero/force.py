@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape
+from gaussian_swaying.aero.patches import PatchSums, grouped_force
 
 LAWS = ("paper", "projected")
 
@@ -232,6 +233,25 @@ class AeroForce(nn.Module):
             law=self.law,
             lift_direction=self.lift_direction,
             unit_tangent=self.unit_tangent,
+        )
+
+    def on_groups(
+        self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums
+    ) -> tuple[Tensor, Tensor]:
+        """:func:`~gaussian_swaying.aero.patches.grouped_force` with these coefficients: force [N] (P, 3), area [m²] (P,)."""
+        return grouped_force(
+            wind,
+            velocity,
+            deformation_gradient,
+            patches,
+            drag=self.C_D,
+            friction=self.C_F,
+            lift=self.C_L,
+            air_density=self.air_density,
+            law=self.law,
+            lift_direction=self.lift_direction,
+            unit_tangent=self.unit_tangent,
+            max_area_ratio=self.max_area_ratio,
         )
 
     def extra_repr(self) -> str:

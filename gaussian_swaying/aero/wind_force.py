@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record
 from gaussian_swaying.aero.force import AeroForce, capped_area
+from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
@@ -27,8 +28,15 @@ class WindForce(Force):
     Args:
         aero: Coefficients and law of the force.
         wind: The wind, or a list with one wind for each scene of a batch.
-        normal: Unit normals of the patches at rest, shape (..., P, 3).
-        area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind.
+        normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
+            :class:`~gaussian_swaying.aero.patches.Patches`, which belong to the particles of one scene.
+        area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
+
+    Attributes:
+        normal: Unit normals at rest, shape (..., P, 3).
+        area: Area of the patches of each particle at rest [m²], shape (..., P).
+        sums: The sums over patches, if a particle has patches of several directions; else None, and ``normal`` is the
+            direction of each particle.
 
     Raises:
         ValueError: If the shapes do not agree, or the numbers of winds and scenes differ.
@@ -40,8 +48,17 @@ class WindForce(Force):
         torch.Size([4, 3])
     """
 
-    def __init__(self, aero: AeroForce, wind: Wind | Sequence[Wind], normal: Tensor, area: Tensor) -> None:
+    def __init__(
+        self, aero: AeroForce, wind: Wind | Sequence[Wind], normal: Tensor | Patches, area: Tensor | None = None
+    ) -> None:
         super().__init__()
+        self.sums: PatchSums | None = None
+        if isinstance(normal, Patches):
+            found = PatchSums(normal)
+            self.sums = None if found.single else found
+            normal, area = found.normals(), found.area
+        if area is None:
+            raise ValueError("Expected `area` of the patches, one for each `normal`.")
         check_shape("normal", normal, "P", 3)
         check_shape("area", area, normal.shape[-2])
         self.aero = aero
@@ -176,6 +193,9 @@ class WindForce(Force):
             state: The state at the start of the substep.
             wind: Air velocity [m/s], broadcastable to (..., P, 3).
         """
+        if self.sums is not None:
+            force, area = self.aero.on_groups(wind, state.velocity, state.F_total, self.sums)
+            return force, self.aero.resistance(wind, state.velocity, area)
         normal, area = deform_patch(state.F_total, self.normal, self.area)
         area = capped_area(area, self.area, self.aero.max_area_ratio)
         return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)

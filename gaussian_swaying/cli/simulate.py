@@ -59,8 +59,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     simulation = Simulation.from_settings(parser, settings)
     folder = output_folder(settings)
     scene = simulation.scene
-    by = f" by {scene.points.count:,} points" if len(scene.simulated) < len(scene.chosen) else ""
-    print(f"{len(scene.chosen):,} of {len(scene.model.means):,} Gaussians simulated{by} on {simulation.device}")
+    by = f" by {scene.points.count:,} points" if scene.points.count != len(scene.simulated) else ""
+    print(f"{len(scene.simulated):,} of {len(scene.model.means):,} Gaussians simulated{by} on {simulation.device}")
     if scene.loose:
         print(f"{scene.loose:,} loose ones follow their neighbours")
     if scene.filled:

@@ -1,4 +1,7 @@
-"""Fewer points for a coarse grid: one for each small cube, what hangs on none of them, and how the rest follows."""
+"""Fewer points for a coarse grid: groups of points that share a small part of a cell, and specks that hang on nothing.
+
+A grid carries no more information than its nodes, and captures have many more Gaussians than a cell can tell apart.
+"""
 
 from __future__ import annotations
 
@@ -10,77 +13,82 @@ from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 LOOSE = 0.01  # share of the largest part; what is smaller and connected to nothing is loose
 _NEIGHBOURS = 26  # that are looked at, as many as the cubes around a cube
+_ALIGNED = (
+    0.8  # share of the normals' second moment along their main direction: above it, a group is a sheet or several
+)
+_APART = 0.12  # standard deviation across a sheet [cells], above which it is two: of two sheets 0.24 cells apart
 
 
 @torch.no_grad()
-def group_points(points: Tensor, weight: Tensor, side: float, preferred: int | None = None) -> tuple[Tensor, Tensor]:
-    """Divide space into cubes and choose one point of each: the one closest to the weighted centre of its cube.
+def grid_groups(
+    position: Tensor,
+    dx: float,
+    per_cell: int,
+    weight: Tensor,
+    normal: Tensor | None = None,
+    label: Tensor | None = None,
+) -> Tensor:
+    """Group points for a grid: those in the same cube of side ``dx / per_cell``, with the same label, on one sheet.
+
+    Cubes are parts of the cells whose points share their 27 nodes in a quadratic B-spline. So the centre of a group
+    touches the same nodes as its points, and no point follows a node without mass. Two points per cell and direction
+    integrate the square of a linear function, the strain of such a cell, to a quarter of its smallest term.
+
+    Sheets that lie close to each other in a cube stay apart: a group whose normals agree is split in two if the points
+    spread across the sheet as those of two sheets do that are 0.24 cells apart.
 
     Args:
-        points: Points, shape (N, 3).
-        weight: Their weights, zero or more, shape (N,).
-        side: Side of the cubes, in the unit of the points.
-        preferred: If a cube contains some of the first ``preferred`` points, one of these is chosen; None for no
-            preference.
+        position: Points [m], shape (N, 3), in the precision in which the solver has them.
+        dx: Grid spacing [m].
+        per_cell: Cubes along the side of a cell, at least 1.
+        weight: Weights above zero, shape (N,).
+        normal: Unit normals of either sign, zero inside a solid, shape (N, 3); None to keep no sheets apart.
+        label: Integers, shape (N, L): points of one group agree in all of them.
 
     Returns:
-        Indices of the chosen points, ascending, shape (M,); and for each point which of these represents it, (N,).
+        The group of each point, from 0 on, shape (N,).
 
     Raises:
-        ValueError: If a tensor does not have the shape above, or ``side`` is not positive.
+        ValueError: If a shape is not the one above, or ``dx`` or ``per_cell`` is not positive.
     """
-    check_shape("points", points, None, 3)
-    check_shape("weight", weight, len(points))
-    check_positive("side", side)
-    where = points.double()
-    share = weight.double().clamp_min(1e-12 * float(weight.sum()) + 1e-300)
-    cell = torch.floor((where - where.amin(0)) / side).long()
-    cube = torch.unique(cell, dim=0, return_inverse=True)[1]
-    count = int(cube.max()) + 1
-    total = share.new_zeros(count).index_add_(0, cube, share)
-    centre = where.new_zeros(count, 3).index_add_(0, cube, share[:, None] * where) / total[:, None]
-    distance = (where - centre[cube]).square().sum(-1)
-    if preferred is not None:
-        distance[preferred:] += 3 * side**2  # more than a cube's diagonal
-    order = distance.argsort(stable=True)
-    first = torch.full((count,), len(points)).scatter_reduce_(0, cube[order], torch.arange(len(points)), "amin")
-    chosen = order[first]
-    kept, rank = chosen.sort()
-    place = torch.empty_like(rank).scatter_(0, rank, torch.arange(count))
-    return kept, place[cube]
+    check_shape("position", position, None, 3)
+    check_shape("weight", weight, len(position))
+    check_positive("dx", dx)
+    check_positive("per_cell", per_cell)
+    lattice = position / dx
+    base = torch.floor(lattice - 0.5)
+    part = ((lattice - base - 0.5) * per_cell).floor().clamp(0, per_cell - 1)
+    rows = [base.long() * per_cell + part.long()]
+    if label is not None:
+        check_shape("label", label, len(position), None)
+        rows.append(label)
+    group = torch.unique(torch.cat(rows, -1), dim=0, return_inverse=True)[1]
+    if normal is None or len(group) == 0:
+        return group
+    check_shape("normal", normal, len(position), 3)
+    place, share, across = position.double(), weight.double(), normal.double()
+    total = sums(share, group)
+    centre = sums(share[:, None] * place, group) / total[:, None]
+    moment = sums(share[:, None, None] * across[:, :, None] * across[:, None, :], group) / total[:, None, None]
+    size, axis = torch.linalg.eigh(moment)
+    height = ((place - centre[group]) * axis[group, :, 2]).sum(-1)
+    spread = (sums(share * height.square(), group) / total).sqrt()
+    two = (spread > _APART * dx) & (size[:, 2] > _ALIGNED * size.sum(-1))
+    return torch.unique(2 * group + (two[group] & (height > 0)), return_inverse=True)[1]
 
 
-@torch.no_grad()
-def blend_weights(points: Tensor, queries: Tensor, count: int = 6) -> tuple[Tensor, Tensor]:
-    """The points that a query follows, and their weights, which are continuous in space.
-
-    The weight of a point at distance d is (1/d - 1/R)², where R is the distance of the nearest point that is not used
-    (Franke and Little's form of Shepard's method). So a query at a point follows that point alone.
-
-    Args:
-        points: Points, shape (M, 3).
-        queries: Points that follow, shape (C, 3).
-        count: How many points a query follows; fewer if there are fewer points.
-
-    Returns:
-        Indices of the points, and weights that add up to 1, each of shape (C, K).
-    """
-    near = min(count + 1, len(points))
-    distance, index = nearest_neighbours(points.double(), near, queries.double())
-    if near == 1:
-        return index, torch.ones_like(distance)
-    reach = distance[:, -1:].clamp_min(1e-300)
-    inverse = 1 / distance[:, :-1].clamp_min(1e-9 * reach)
-    weight = (inverse - 1 / reach).clamp_min(1e-12 / reach).square()
-    return index[:, :-1], weight / weight.sum(-1, keepdim=True)
+def sums(values: Tensor, group: Tensor) -> Tensor:
+    """Sum of values (N, ...) over the points of each group (N,); shape (M, ...), with M the largest group plus one."""
+    count = int(group.max()) + 1 if len(group) else 0
+    return values.new_zeros(count, *values.shape[1:]).index_add_(0, group, values)
 
 
 @torch.no_grad()
 def loose_points(points: Tensor, side: float) -> Tensor:
     """Which points hang on nothing, or by a thread, so that the wind would blow them off a grid.
 
-    One point of each cube counts (:func:`group_points`), and two of them are connected if they are at most two sides
-    apart, as are points in cubes side by side. Loose are
+    One point of each cube counts, the one nearest to the centre of its cube's points, and two of them are connected if
+    they are at most two sides apart, as are points in cubes side by side. Loose are
 
     - the parts with fewer than one in a hundred of the points of the largest part: as surfaces they are less than a
       tenth as long as it, too short for a usual grid to bend;
@@ -97,10 +105,19 @@ def loose_points(points: Tensor, side: float) -> Tensor:
     Raises:
         ValueError: If a shape is not the one above or ``side`` is not positive.
     """
-    kept, group = group_points(points, torch.ones(len(points)), side)
+    check_shape("points", points, None, 3)
+    check_positive("side", side)
+    where = points.double()
+    cell = torch.floor((where - where.amin(0)) / side).long()
+    group = torch.unique(cell, dim=0, return_inverse=True)[1]
+    centre = sums(where, group) / sums(torch.ones_like(where[:, :1]), group)
+    order = (where - centre[group]).square().sum(-1).argsort(stable=True)
+    first = torch.full((len(centre),), len(points))
+    first.scatter_reduce_(0, group[order], torch.arange(len(points)), "amin")
+    kept = order[first]
     if len(kept) < 3:
         return torch.zeros(len(points), dtype=torch.bool)
-    distance, index = nearest_neighbours(points[kept].double(), min(_NEIGHBOURS, len(kept) - 1))
+    distance, index = nearest_neighbours(where[kept], min(_NEIGHBOURS, len(kept) - 1))
     near = distance <= 2 * side
     pairs = torch.stack([near.nonzero()[:, 0], index[near]])
     part = joined(len(kept), pairs)

@@ -61,7 +61,7 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
         up: Direction that points up in it; z if None.
 
     Returns:
-        A :class:`Scene` as it is. Anything else is simulated as a whole, with points chosen for the grid.
+        A :class:`Scene` as it is. Anything else is simulated as a whole.
 
     Raises:
         ValueError: If ``up`` is given twice.
@@ -73,8 +73,8 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     direction = [0.0, 0.0, 1.0] if up is None else list(check_vector("up", up))
     if isinstance(source, ProceduralScene | GaussianCloud):
         generator = GivenScene(source) if isinstance(source, GaussianCloud) else source
-        return Scene(generator=generator, up=direction, sampling="grid")
-    return Scene(ply=source, up=direction, sampling="grid")
+        return Scene(generator=generator, up=direction)
+    return Scene(ply=source, up=direction)
 
 
 def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud: GaussianCloud) -> MPMSolver:

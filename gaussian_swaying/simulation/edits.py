@@ -175,7 +175,7 @@ class SceneEditor:
         """
         scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
         if region is None:
-            particles = torch.ones_like(scene.patch_area, dtype=torch.bool)
+            particles = torch.ones_like(scene.points.mass, dtype=torch.bool)
             gaussians = torch.zeros_like(means[:, 0], dtype=torch.bool).index_fill(0, scene.moving, True)
         else:
             particles = region.contains(scene.frame.point_to_scene(scene.points.position).to(means.dtype))

@@ -177,12 +177,12 @@ class Painter(nn.Module):
         """Picture of a force per area, with a colour scale that ends at ``largest`` [Pa], shape (H, W, 3).
 
         Args:
-            pressure: Force per area of each particle [Pa], shape (P,).
+            pressure: Force per area of each Gaussian [Pa], shape (N,).
             gaussians: In scene units.
             camera: The camera, on the device of the Gaussians.
             largest: End of the colour scale [Pa].
         """
-        shown = self.scene.on_gaussians(pressure)
+        shown = pressure.to(gaussians.means)
         picture = self._draw(gaussians, shown[:, None].expand(-1, 3), camera)
         return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest)
 

@@ -79,6 +79,12 @@ def _check_checkpoint(
             f"The checkpoint in {output} holds {len(held)} particles, but the scene has "
             f"{scene.points.count}: resume with the same splat, or start again without --resume."
         )
+    tracked = checkpoint.get("tracked")
+    if not isinstance(tracked, int) or tracked != scene.tracked:
+        raise ValueError(
+            f"The trajectory in {output} is of {tracked} places, but the scene has {scene.tracked}: "
+            "resume with the same splat, or start again without --resume."
+        )
     most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
     try:
         check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited)
@@ -198,6 +204,7 @@ class Run:
                     "config": self.config,
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
+                    "tracked": self.simulation.scene.tracked,
                 }
             )
 
@@ -215,7 +222,7 @@ class Run:
             if exporting:
                 recorder.write_splat(frame, self.painter.cloud(gaussians), self.simulation.scene.frame)
             if recorder.trajectory:
-                recorder.write_trajectory(frame, state.position, state.F_total)
+                recorder.write_trajectory(frame, *self.simulation.scene.surface(state))
 
     def picture(self, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str) -> None:
         """Draw the requested pictures of a frame from one camera and pass them to the recorder."""
@@ -255,12 +262,12 @@ class Run:
             "seed": getattr(simulation.wind, "seed", None),
             "particles": solver.points.count,
             "gaussians": len(scene.model.means),
-            "simulated_gaussians": len(scene.chosen),
+            "simulated_gaussians": len(scene.simulated),
             "loose_gaussians": scene.loose,
             "surface_particles": scene.on_surface,
             "filled_particles": scene.filled,
             "mass_kg": float(solver.points.mass.sum()),
-            "patch_area_m2": float(scene.patch_area.sum()),
+            "patch_area_m2": float(scene.patches.area.sum()),
             "formulation": solver.formulation,
             "dtype": str(state.position.dtype).removeprefix("torch."),
             "grid": {"dx_m": solver.dx, "resolution": list(state.grid.resolution)},

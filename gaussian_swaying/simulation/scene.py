@@ -3,84 +3,34 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_poisson_ratio, check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
-from gaussian_swaying.gaussians.grouping import blend_weights, group_points, loose_points
+from gaussian_swaying.gaussians.grouping import loose_points
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.regions import Everything, Region
-from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
-from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
+from gaussian_swaying.simulation.followers import Followers, GridFollowers, PointFollowers, on_material
+from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.sampling import grouped, sample_object
 
-
-@dataclass
-class MaterialRegion:
-    """Different material in a part of the object.
-
-    Args:
-        region: Where, in scene units.
-        E: Young's modulus [Pa]; unchanged if null.
-        nu: Poisson's ratio; unchanged if null.
-        density: Density [kg/m³]; unchanged if null.
-        thickness: Thickness of the surface [m]; unchanged if null.
-        law: Constitutive law; unchanged if null.
-    """
-
-    region: Region
-    E: float | None = None
-    nu: float | None = None
-    density: float | None = None
-    thickness: float | None = None
-    law: ConstitutiveLaw | None = None
-
-
-@dataclass
-class Material:
-    """What the object is made of.
-
-    Args:
-        E: Young's modulus [Pa].
-        nu: Poisson's ratio, below 0.5.
-        density: Density [kg/m³].
-        thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
-        volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
-            (PhysGaussian's rule for solids: cell volume / particles in it).
-        law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
-            elasticity if null. Plastic laws need ``solver.formulation: updated``.
-        regions: Parts with a different material; later entries win.
-    """
-
-    E: float = 1e5
-    nu: float = 0.3
-    density: float = 200.0
-    thickness: float = 0.01
-    volume: str = "patch"
-    law: ConstitutiveLaw | None = None
-    regions: list[MaterialRegion] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        check_choice("material.volume", self.volume, ("patch", "cell"))
-        entries: list[Material | MaterialRegion] = [self, *self.regions]
-        for entry in entries:
-            for name in ("E", "density", "thickness"):
-                if getattr(entry, name) is not None:
-                    check_positive(f"material.{name}", getattr(entry, name))
-            if entry.nu is not None:
-                check_poisson_ratio("material.nu", entry.nu)
+__all__ = ["Material", "MaterialRegion", "Scene", "SimulatedScene"]
 
 
 class Scene:
@@ -115,11 +65,16 @@ class Scene:
             weights of Simpson's rule) and needs three times the points.
         particle_spacing: Largest distance between neighbouring material points on the surface [m]. Larger Gaussians get
             extra points (see :func:`~gaussian_swaying.gaussians.subdivision.subdivide`). A splat trained without a
-            limit on sizes needs this: use 0.45 ``solver.dx`` or less. Null for one point per Gaussian.
-        sampling: Which points carry the material: ``gaussian`` (every simulated Gaussian), or ``grid`` (one point for
-            each cube of side ``solver.dx`` / 2.2, with the total mass and area of the Gaussians in it; the other
-            Gaussians follow the points around them). ``grid`` is many times faster where the splat is much finer than
-            the grid.
+            limit on sizes needs this: use 0.45 ``solver.dx`` or less. Null for none with ``points: gaussian``; with
+            ``grid``, null fills holes: extra points, ``solver.dx / points_per_cell`` apart, where no Gaussian is
+            within 0.6 cells.
+        points: Which points carry the material: ``gaussian`` (one for each simulated Gaussian, as in the paper and
+            PhysGaussian), or ``grid`` (groups of Gaussians, as many as the grid can use, and extra points where
+            Gaussians are sparse; the Gaussians follow the nodes). ``grid`` is many times faster where the splat is
+            much finer than the grid, and needs ``solver.formulation: total``. Null for ``grid`` in ``total`` and
+            ``gaussian`` in ``updated``.
+        points_per_cell: Points along the side of a cell with ``points: grid``: a sheet then has the square of it in a
+            cell, a solid the cube.
     """
 
     def __init__(
@@ -138,10 +93,16 @@ class Scene:
         max_stretch: float | None = 2.0,
         layers: int = 1,
         particle_spacing: float | None = None,
-        sampling: str = "gaussian",
+        points: str | None = None,
+        points_per_cell: int = 2,
         loose: str = "simulate",
     ) -> None:
-        check_choice("scene.sampling", sampling, ("gaussian", "grid"))
+        if points is not None:
+            check_choice("scene.points", points, ("gaussian", "grid"))
+        if points_per_cell not in range(1, 9):
+            raise ValueError(
+                f"Expected `scene.points_per_cell` to be a whole number from 1 to 8, but got {points_per_cell}."
+            )
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.loose", loose, ("simulate", "carry"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
@@ -162,8 +123,6 @@ class Scene:
             check_positive("scene.particle_spacing", particle_spacing)
             if filling is not None:
                 raise ValueError("Expected `scene.particle_spacing` null with `scene.filling`, which adds points.")
-        if sampling == "grid" and filling is not None:
-            raise ValueError('Expected `scene.sampling` "gaussian" with `scene.filling`, which chooses points itself.')
         if ply is None and generator is None:
             raise ValueError("The scene is empty: give `scene.ply` (a 3DGS .ply file) or `scene.generator`.")
         self.ply, self.generator, self.region = ply, generator, region or Everything()
@@ -171,7 +130,8 @@ class Scene:
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
         self.max_stretch = None if max_stretch is None else float(max_stretch)
-        self.layers, self.particle_spacing, self.sampling, self.loose = layers, particle_spacing, sampling, loose
+        self.layers, self.particle_spacing, self.loose = layers, particle_spacing, loose
+        self.points, self.points_per_cell = points, int(points_per_cell)
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -181,45 +141,47 @@ class Scene:
         return self.generator.generate()
 
 
-POINTS_PER_CELL = 2.2  # per direction, for ``sampling: grid``; more is finer than the grid can resolve
-FOLLOWED = 6  # number of points that a Gaussian without its own point follows
-_SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
+HOLE = 0.6
+"""Distance from all Gaussians [cells] at which ``points: grid`` puts extra points on large ones by itself."""
+
+SPECK = 1 / 2.2
+"""Side of the cubes by which ``scene.loose`` finds specks [cells]."""
 
 
 class SimulatedScene(nn.Module):
-    """Gaussians, material points and patches of one scene, and how the Gaussians follow the points.
+    """Gaussians, material points and patches of one scene, and how the Gaussians follow the material.
 
-    There are three kinds of Gaussians: simulated ones are material points themselves, carried ones follow the nearest
-    simulated one (with ``sampling: grid`` the nearest few), and static ones do not move. The points that fill a solid,
-    and those at the faces of a sheet of three layers, are material only: no Gaussian belongs to them, and their patch
-    area is zero. The extra points of large Gaussians (``particle_spacing``) are separate patches, but no Gaussian is
-    drawn at them.
+    There are three kinds of Gaussians: simulated ones belong to the material, carried ones (faint or loose) follow the
+    nearest simulated one, and static ones do not move. With ``points: gaussian`` each simulated Gaussian is a material
+    point, and the points that fill a solid, those at the faces of a sheet of three layers, and the extra points of
+    large Gaussians (``particle_spacing``) come after them. With ``points: grid`` a material point is a group of
+    Gaussians and of such points. Wind acts on patches: those of the simulated Gaussians and of their extra points.
 
     Args:
         scene: Where the Gaussians come from.
         material: What they are made of.
-        dx: Grid spacing [m], for ``material.volume = "cell"``, as twice the spacing of ``scene.filling``, and for
-            ``scene.sampling`` and ``scene.loose``.
+        dx: Grid spacing [m].
         dtype: Precision of the simulation.
         cloud: The Gaussians of the scene, if they have been read already.
+        fixed: Whether the solver keeps the neighbours of its points (``total``), as ``points: grid`` needs.
+        apart: Regions whose borders no group of Gaussians crosses, in scene units: those of pins and edits.
 
     Attributes:
-        chosen: Indices of the Gaussians selected by region and opacity, without loose ones. With ``sampling: gaussian``
-            all of them are simulated; with ``grid`` some are simulated and the others are carried.
+        simulated: Indices of the simulated Gaussians.
+        carried: Indices of the carried Gaussians.
         loose: Number of Gaussians selected by region and opacity that are loose and therefore carried.
-        points: The material, for the solver: the simulated Gaussians in their order, then the points without a
-            Gaussian.
+        points: The material, for the solver.
         filled: Number of points inside a solid.
-        on_surface: Number of points on the surface. They come first: the simulated Gaussians, then the extra points of
-            large ones.
-        patch_normal: Unit normals of the points at rest in the z-up frame, shape (P, 3).
-        patch_area: Areas of the points that feel the wind [m²], shape (P,).
+        on_surface: Number of points on the surface, without those at the faces of a sheet.
+        patches: The patches that feel the wind.
         frame: Conversion from scene units to metres.
         bounds: Smallest and largest corner of the simulated part at rest [scene units].
         size: Its longest side [scene units].
         moving: Indices of the Gaussians that move, first the simulated and then the carried ones, shape (M,).
         all_move: Whether ``moving`` is all Gaussians, in their order.
         rest_facing: Normals at rest of the Gaussians that move, in the z-up frame, shape (M, 3).
+        further: Number of extra points on large Gaussians.
+        tracked: Number of places that :meth:`surface` returns.
         source: The .ply file; None for a scene made in code.
     """
 
@@ -230,10 +192,18 @@ class SimulatedScene(nn.Module):
         dx: float,
         dtype: torch.dtype = torch.float32,
         cloud: GaussianCloud | None = None,
+        fixed: bool = True,
+        apart: Sequence[Region] = (),
     ) -> None:
         super().__init__()
         cloud = scene.cloud() if cloud is None else cloud
         self.source = scene.ply
+        by_grid = scene.points == "grid" or (scene.points is None and fixed)
+        if by_grid and not fixed:
+            raise ValueError(
+                "`scene.points: grid` needs `solver.formulation: total`, where Gaussians can follow the nodes: set "
+                "`scene.points` to gaussian."
+            )
         opacity = torch.sigmoid(cloud.opacities)
         chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold)
         faint = scene.region.contains(cloud.means) & ~chosen
@@ -242,24 +212,27 @@ class SimulatedScene(nn.Module):
         self.model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
         simulated = chosen.nonzero()[:, 0]
         self.frame = SimFrame.fit(cloud.means[simulated], scene.up, scene.longest_side, scene.metres_per_unit)
+        unit = self.frame.metres_per_unit
         means = cloud.means[simulated]
-        check_extent(means, self.frame.metres_per_unit, dx, simulated)
+        check_extent(means, unit, dx, simulated)
         self.bounds = (means.amin(0), means.amax(0))
         largest = cloud.scales[simulated].amax().exp()  # a single Gaussian has a size too
         self.size = max(float((self.bounds[1] - self.bounds[0]).amax()), float(largest))
-        piece_spacing = None if scene.particle_spacing is None else scene.particle_spacing / self.frame.metres_per_unit
-        pieces = _pieces(cloud, simulated, piece_spacing)
+        spacing, hole = scene.particle_spacing, 0.0
+        if spacing is None and by_grid and scene.filling is None:
+            spacing, hole = dx / scene.points_per_cell, HOLE * dx / unit
+        spacing = None if spacing is None else spacing / unit
+        pieces = _pieces(cloud, simulated, spacing, hole)
         carried = faint if scene.faint == "carry" else torch.zeros_like(faint)
         self.loose = 0
         if scene.loose == "carry":
             where = means if pieces is None else torch.cat([means, pieces.means.to(means)])
-            side = dx / POINTS_PER_CELL / self.frame.metres_per_unit
-            specks = simulated[loose_points(where, side)[: len(means)]]
+            specks = simulated[loose_points(where, SPECK * dx / unit)[: len(means)]]
             self.loose = len(specks)
             if self.loose:
                 chosen[specks], carried[specks] = False, True
                 simulated = chosen.nonzero()[:, 0]
-                pieces = _pieces(cloud, simulated, piece_spacing)
+                pieces = _pieces(cloud, simulated, spacing, hole)
         normals = self.model.normals()
         position = self.frame.point_to_sim(cloud.means[simulated].double())
         filling = None
@@ -267,116 +240,70 @@ class SimulatedScene(nn.Module):
             shape = self.frame.covariance_to_sim(self.model.covariance()[simulated].double())
             visible = self.model.opacity()[simulated]
             filling = within_region(scene.filling.fill(position, shape, visible, 0.5 * dx), scene.region, self.frame)
-        self.filled = 0 if filling is None else len(filling.position)
         if pieces is not None:
             position = torch.cat([position, self.frame.point_to_sim(pieces.means.double())])
-        source = torch.arange(len(simulated))  # the simulated Gaussian of each point on the surface
+        source = torch.arange(len(simulated))  # the simulated Gaussian of each sample of the surface
         source = source if pieces is None else torch.cat([source, pieces.parent])
-        self.on_surface = len(source)
         outer = torch.ones(len(source), dtype=torch.bool) if filling is None else filling.on_surface
         areas = cloud.means.new_zeros(len(source))
-        for group in (outer, ~outer):  # inner points take no area from the surface
-            areas[group] = _areas(cloud.select(simulated), normals[simulated], source, pieces, group, scene.area)
+        for part in (outer, ~outer):  # inner points take no area from the surface
+            areas[part] = _areas(cloud.select(simulated), normals[simulated], source, pieces, part, scene.area)
+        body_area = self.frame.area_to_sim(areas).double()
+        area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
+        facing = self.frame.direction_to_sim(normals[simulated[source]].double())
+        samples, laws = sample_object(position, facing, body_area, area, filling, material, self.frame, dx)
+        if scene.layers == 3 and material.volume != "patch":
+            raise ValueError('Expected `material.volume` "patch" with `scene.layers` 3: layers share a thickness.')
+        owner = torch.arange(len(samples.position))
+        chosen_samples = samples
+        if by_grid:
+            chosen_samples, owner = grouped(samples, dx, scene.points_per_cell, apart, self.frame, dtype)
+        self.points = chosen_samples.points(scene.layers, laws, dtype)
+        self.on_surface = int(chosen_samples.surface.sum())
+        self.filled = len(chosen_samples.surface) - self.on_surface
+        feels = samples.area > 0
+        self.patches = Patches(
+            samples.normal[feels].to(dtype), samples.area[feels].to(dtype), owner[feels], self.points.count
+        )
         self.max_stretch = scene.max_stretch
-        followed = 1
-        if scene.sampling == "grid":
-            kept, group = group_points(position, areas, dx / POINTS_PER_CELL, preferred=len(simulated))
-            areas = areas.new_zeros(len(kept)).index_add_(0, group, areas)
-            position, normal_of = position[kept], simulated[source[kept]]
-            followed, carried = FOLLOWED, carried | chosen
-            simulated = simulated[kept[kept < len(simulated)]]
-            carried[simulated] = False
-            self.on_surface, outer = len(kept), outer[kept]
-        else:
-            normal_of = simulated[source]
-        carried = carried.nonzero()[:, 0]
-        self.register_buffer("chosen", chosen.nonzero()[:, 0], persistent=False)
         self._kept: tuple[MaterialPoints, Tensor] | None = None
+        carried = carried.nonzero()[:, 0]
         self.register_buffer("simulated", simulated)
         self.register_buffer("carried", carried)
-        anchor, share = blend_weights(cloud.means[simulated], cloud.means[carried], followed)
-        self.register_buffer("anchor", anchor)
-        self.register_buffer("share", share.to(cloud.means.dtype), persistent=False)
         self.register_buffer("rest_covariances", self.model.covariance())
         self.register_buffer("rest_normals", normals)
-        facing = self.frame.direction_to_sim(normals[normal_of].double())
-        area = self.frame.area_to_sim(areas)
-        body_area, area = area, area if scene.wind_on == "all" else torch.where(outer, area, 0)
-        if filling is not None:  # a filled point is a patch of zero area
-            position = torch.cat([position, filling.position])
-            facing = torch.cat([facing, torch.tensor([[0.0, 0.0, 1.0]]).to(facing).expand(self.filled, 3)])
-            body_area, area = (torch.cat([part, part.new_zeros(self.filled)]) for part in (body_area, area))
-        self.register_buffer("patch_normal", facing.to(dtype))
-        self.register_buffer("patch_area", area.to(dtype))
         # computed once here, as every picture needs it
         moving = torch.cat([simulated, carried])
         self.all_move = bool(moving.equal(torch.arange(len(cloud.means))))
         self.register_buffer("moving", moving, persistent=False)
-        arm = cloud.means[carried][:, None] - cloud.means[simulated[self.anchor]]
-        self.register_buffer("arm", arm, persistent=False)
+        nearest = nearest_neighbours(cloud.means[simulated].double(), 1, cloud.means[carried].double())[1][:, 0]
+        anchor = torch.cat([torch.arange(len(simulated)), nearest])  # the simulated Gaussian that is followed
+        self.register_buffer("owner", owner[anchor], persistent=False)
+        self.further = len(source) - len(simulated)
+        self.tracked = len(source) if by_grid else self.points.count
+        place = samples.position[: len(source)]
+        own = self.frame.point_to_sim(cloud.means[moving].double())
+        if by_grid:
+            read = on_material(place, owner[: len(source)], self.points, dx)
+            self.follow: Followers = GridFollowers(read[anchor].to(dtype), _arm(own - read[anchor], dtype))
+            self.track: GridFollowers | None = GridFollowers(read.to(dtype), _arm(place - read, dtype))
+        else:
+            self.follow = PointFollowers(anchor, _arm(own - place[anchor], dtype), self.points.position)
+            self.track = None
         facing = self.frame.direction_to_sim(normals[moving].double()).to(normals.dtype)
         self.register_buffer("rest_facing", facing, persistent=False)
+        felt = area[anchor] > 0
+        self.register_buffer("in_wind", felt, persistent=False)
         self.register_buffer("identity", torch.eye(3, dtype=cloud.means.dtype), persistent=False)
-        self.chosen: Tensor
         self.simulated: Tensor
         self.carried: Tensor
-        self.anchor: Tensor
-        self.share: Tensor
+        self.owner: Tensor
+        self.in_wind: Tensor
         self.rest_covariances: Tensor
         self.rest_normals: Tensor
-        self.patch_normal: Tensor
-        self.patch_area: Tensor
         self.moving: Tensor
-        self.arm: Tensor
         self.rest_facing: Tensor
         self.identity: Tensor
-        count = len(position)
-        where = cloud.means[simulated]
-        if filling is not None or pieces is not None:
-            further = self.frame.point_to_scene(position[len(simulated) :])
-            where = torch.cat([where, further.to(where.dtype)])
-        fields = {name: torch.full((count,), getattr(material, name), dtype=dtype) for name in _MATERIAL_FIELDS}
-        laws, law_index = [material.law or FixedCorotated()], torch.zeros(count, dtype=torch.long)
-        for entry in material.regions:
-            inside = entry.region.contains(where)
-            if not bool(inside.any()):
-                low, high = entry.region.bounds(where)
-                raise ValueError(
-                    f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie between "
-                    f"{low} and {high}{entry.region.axes}; move or enlarge it."
-                )
-            for name in _MATERIAL_FIELDS:
-                if getattr(entry, name) is not None:
-                    fields[name][inside] = getattr(entry, name)
-            if entry.law is not None:
-                law_index[inside] = len(laws)
-                laws.append(entry.law)
-        if material.volume == "patch":
-            volume = body_area.to(dtype) * fields["thickness"]
-            if filling is not None:
-                solid = torch.cat([filling.gaussian_volume, filling.volume]).to(dtype)
-                volume = torch.where(solid > 0, solid, volume)
-        else:
-            volume = cell_volume(position, dx).to(dtype)
-        if scene.layers == 3:
-            if material.volume != "patch":
-                raise ValueError('Expected `material.volume` "patch" with `scene.layers` 3: layers share a thickness.')
-            out = 0.5 * (fields["thickness"][:, None] * self.patch_normal).to(position)
-            position = torch.cat([position, position + out, position - out])
-            volume = torch.cat([part * volume for part in _SIMPSON])
-            fields = {name: value.repeat(3) for name, value in fields.items()}
-            law_index = law_index.repeat(3)
-            self.patch_normal = torch.cat([self.patch_normal] * 3)
-            self.patch_area = torch.cat([self.patch_area, self.patch_area.new_zeros(2 * count)])
-        self.points = MaterialPoints.create(
-            position.to(dtype),
-            volume=volume,
-            density=fields["density"],
-            youngs_modulus=fields["E"],
-            poisson_ratio=fields["nu"],
-            law=laws,
-            law_index=law_index if len(laws) > 1 else None,
-        )
 
     def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
         super()._apply(fn, recurse)
@@ -409,14 +336,8 @@ class SimulatedScene(nn.Module):
         """
         rest = self.rest()
         kind = rest.means.dtype
-        count = len(self.simulated)  # the points after them are not drawn
-        move = self.frame.displacement_to_scene((state.position - self.points.position)[:count].to(kind))
-        F = self.frame.gradient_to_scene(state.F_total[:count].to(kind))
-        if len(self.carried):
-            near = F[self.anchor]
-            turned = (near * self.arm[..., None, :]).sum(-1) - self.arm  # a difference, so that nothing moves at rest
-            along = self._blend(move[self.anchor] + turned)
-            move, F = torch.cat([move, along]), torch.cat([F, self._blend(near)])
+        move, F = self.follow.motion(state)
+        move, F = self.frame.displacement_to_scene(move.to(kind)), self.frame.gradient_to_scene(F.to(kind))
         if self.all_move:
             covariances, normals, turns = self._deform(F, rest.covariances, rest.normals, rotations)
             return DeformedGaussians(
@@ -431,6 +352,17 @@ class SimulatedScene(nn.Module):
             rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
         )
 
+    def surface(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        """Position [m], shape (S, 3), and F, shape (S, 3, 3), of the places that a trajectory records.
+
+        These are all particles, or with ``points: grid`` the simulated Gaussians and their extra points.
+        """
+        if self.track is None:
+            return state.position, state.F_total
+        move, F = self.track.motion(state)
+        rest = self.track.place if self.track.arm is None else self.track.place + self.track.arm
+        return rest + move, F
+
     def _deform(
         self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -444,37 +376,36 @@ class SimulatedScene(nn.Module):
             laws, index = self.points.laws, self.points.law_index
             with torch.inference_mode(False):  # it outlives the call
                 solid = torch.tensor([not law.plastic for law in laws], device=self.simulated.device)
-                count = len(self.simulated)
-                own = solid[:1].expand(count) if index is None else solid[index[:count]]
-                self._kept = (self.points, torch.cat([own, own[self.anchor[:, 0]]]))
+                own = solid[:1].expand(self.points.count) if index is None else solid[index]
+                self._kept = (self.points, own[self.owner])
         return self._kept[1]
 
-    def _blend(self, values: Tensor) -> Tensor:
-        """Blend the values (C, K, ...) of the points that each carried Gaussian follows into one, shape (C, ...)."""
-        if values.shape[1] == 1:
-            return values[:, 0]
-        return (values * self.share.reshape(self.share.shape + (1,) * (values.ndim - 2))).sum(1)
-
     def on_gaussians(self, values: Tensor) -> Tensor:
-        """Particle values for all Gaussians: carried ones take the values of their neighbours, static ones get 0.
-
-        Args:
-            values: One number per particle, shape (P,).
-
-        Returns:
-            Shape (N,), in the precision of the Gaussians.
-        """
-        own = values[: len(self.simulated)].to(self.model.means.dtype)
-        found = own.new_zeros(len(self.model.means))
-        return found.index_copy(0, self.moving, torch.cat([own, self._blend(own[self.anchor])]))
+        """Values of the moving Gaussians (M,) for all of them (N,); the static ones get 0."""
+        own = values.to(self.model.means.dtype)
+        return own.new_zeros(len(self.model.means)).index_copy(0, self.moving, own)
 
 
-def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None) -> Subdivision | None:
-    """Extra points on large simulated Gaussians, no farther apart than a spacing [scene units]."""
+def _arm(arm: Tensor, dtype: torch.dtype) -> Tensor | None:
+    """Arms in the precision of the solver; None if all are zero."""
+    return arm.to(dtype) if bool(arm.any()) else None
+
+
+def _pieces(cloud: GaussianCloud, simulated: Tensor, spacing: float | None, hole: float) -> Subdivision | None:
+    """Extra points on large simulated Gaussians, no farther apart than a spacing [scene units].
+
+    Only those farther than ``hole`` from all Gaussians [scene units]; None if there are none.
+    """
     if spacing is None:
         return None
     part = cloud.select(simulated)
-    return subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
+    found = subdivide(part.means, part.quats, part.scales, torch.sigmoid(part.opacities), spacing)
+    if hole > 0 and len(found.means):
+        far = nearest_neighbours(part.means.double(), 1, found.means.double())[0][:, 0] > hole
+        own = torch.arange(len(far))[far]
+        of_all = torch.cat([torch.arange(len(part.means)), len(part.means) + own])
+        found = Subdivision(found.parent[far], found.means[far], found.log_scales[of_all], found.opacity[of_all])
+    return found if len(found.means) else None
 
 
 def _areas(
@@ -491,25 +422,7 @@ def _areas(
     return found.mean().expand(len(found)) if mode == "equal" and len(found) else found
 
 
-_MATERIAL_FIELDS = ("E", "nu", "density", "thickness")
-
-
 def within_region(filling: Filling, region: Region, frame: SimFrame) -> Filling:
     """A filling without the points outside a region given in scene units."""
     inside = region.contains(frame.point_to_scene(filling.position))
     return replace(filling, position=filling.position[inside], volume=filling.volume[inside])
-
-
-def cell_volume(position: Tensor, dx: float) -> Tensor:
-    """PhysGaussian's rule for solids: the volume of the grid cell divided by the number of particles in it.
-
-    Args:
-        position: Rest position [m], shape (P, 3).
-        dx: Grid spacing [m].
-
-    Returns:
-        Volume [m³], shape (P,).
-    """
-    cell = torch.floor(position / dx).long()
-    _, inverse, counts = torch.unique(cell, dim=0, return_inverse=True, return_counts=True)
-    return dx**3 / counts[inverse].to(position.dtype)

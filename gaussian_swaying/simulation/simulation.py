@@ -80,7 +80,7 @@ class Simulation(nn.Module):
 
     Args:
         scene: Where the Gaussians come from and which of them move. In Python also a file, Gaussians or a scene made in
-            code; these are simulated as a whole, with points chosen for the grid (``sampling: grid``).
+            code; these are simulated as a whole, with the defaults of a :class:`Scene`.
         material: What the object is made of; :class:`Material` with its defaults if None.
         solver: Grid, formulation, gravity and boundaries; if None, a grid of 32 cells along the longest side.
         wind: Air velocity over time; in Python also one that varies in space, or three numbers [m/s]. Still air if
@@ -154,7 +154,12 @@ class Simulation(nn.Module):
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
             placed = normalisation.place(settings, material, solver, camera, cameras, edits, cloud)
             settings, material, solver, camera, cameras, edits = placed
-        model = SimulatedScene(settings, material, solver.dx, getattr(torch, dtype), cloud)
+        apart = [
+            part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
+        ]
+        model = SimulatedScene(
+            settings, material, solver.dx, getattr(torch, dtype), cloud, solver.neighbours_fixed, apart
+        )
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
         self.wind = as_wind(wind)
@@ -255,7 +260,7 @@ class Simulation(nn.Module):
     @property
     def wind_force(self) -> WindForce:
         """The wind on the patches of the scene."""
-        parts = (self.aero, self.wind, self.scene.patch_normal, self.scene.patch_area)
+        parts = (self.aero, self.wind, self.scene.patches)
         if not self._wind_force or any(a is not b for a, b in zip(parts, self._wind_parts, strict=True)):
             self._wind_force, self._wind_parts = [WindForce(*parts)], parts
         return self._wind_force[0]
@@ -480,7 +485,7 @@ class Simulation(nn.Module):
         winds = self.wind_force.samples(state, self.frame_dt / 4, 5)
         wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
         speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
-        fastest = self.aero.rate(speed, self.scene.patch_area, self.solver.points.mass).amax()
+        fastest = self.aero.rate(speed, self.wind_force.area, self.solver.points.mass).amax()
         rate, blowing = torch.stack([fastest.double(), wind.double()]).tolist()
         if not (math.isfinite(rate) and blowing < MAX_WIND):
             cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
@@ -490,14 +495,16 @@ class Simulation(nn.Module):
     # ---- what is measured
 
     def wind_pressure(self, state: MPMState) -> Tensor:
-        """Force of the wind per area of the patches as they are now [Pa], shape (P,); 0 for patches without wind."""
-        area = self.scene.patch_area
+        """Force of the wind per area of the Gaussians as they are now [Pa], shape (N,); 0 for those without wind."""
+        scene = self.scene
         if self.idle:
-            return torch.zeros_like(area)
-        normal, _ = deform_patch(state.F_total, self.scene.patch_normal, area)
-        wind = self.wind_force.air(state.time, state.position)
-        force = self.aero(wind, state.velocity, normal, torch.ones_like(area))
-        return torch.where(area > 0, torch.linalg.vector_norm(force, dim=-1), 0.0)
+            return scene.on_gaussians(torch.zeros_like(scene.in_wind, dtype=state.position.dtype))
+        move, F = scene.follow.motion(state)
+        normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
+        place = scene.frame.point_to_sim(scene.model.means[scene.moving].double()).to(move) + move
+        wind = self.wind_force.air(state.time, place)
+        force = self.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
+        return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
 
     def force_scale(self) -> float:
         """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""

@@ -1,62 +1,77 @@
-"""One point for each cube, and who follows whom."""
+"""Groups of points for a grid, and specks that hang on nothing."""
 
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.grouping import blend_weights, group_points, joined, loose_points
+from gaussian_swaying.gaussians.grouping import grid_groups, joined, loose_points, sums
+
+DX = 0.1
 
 
-def test_each_cube_keeps_the_point_nearest_to_its_weighted_centre():
-    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
-    weight = torch.rand(500, generator=torch.Generator().manual_seed(1))
-    kept, group = group_points(points, weight, 0.25)
-    cell = torch.floor((points.double() - points.double().amin(0)) / 0.25).long()
-    assert len(kept) == len(cell.unique(dim=0)) < 500
-    assert torch.equal(kept, kept.sort().values)
-    assert torch.equal(cell[kept[group]], cell)  # each is stood for by one of its own cube
-    for number, index in enumerate(kept.tolist()):
-        own = group == number
-        share = weight[own].double()
-        centre = (share[:, None] * points[own].double()).sum(0) / share.sum()
-        distance = (points.double() - centre).norm(dim=-1)
-        assert float(distance[index]) == float(distance[own].min())
+def cloud(count=4000, seed=0):
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_preferred_points_stand_for_their_cube():
-    points = torch.tensor([[0.0, 0, 0], [0.09, 0, 0], [0.05, 0, 0], [0.95, 0, 0]])
-    weight = torch.ones(4)
-    assert group_points(points, weight, 0.1)[0].tolist() == [2, 3]
-    kept, group = group_points(points, weight, 0.1, preferred=2)
-    assert len(kept) == 2
-    assert int(kept[0]) in (0, 1)  # not the point in the middle
-    assert group.tolist() == [0, 0, 0, 1]
-    with pytest.raises(ValueError, match="side"):
-        group_points(points, weight, 0.0)
+@pytest.mark.parametrize("per_cell", [1, 2, 3])
+def test_points_of_a_group_share_their_nodes(per_cell):
+    points = cloud()
+    group = grid_groups(points, DX, per_cell, torch.ones(len(points)))
+    assert group.unique().equal(torch.arange(int(group.max()) + 1))
+    base = torch.floor(points / DX - 0.5)
+    centre = sums(points, group) / group.bincount()[:, None]
+    for k in range(3):
+        low, high = (torch.full((len(centre),), s * 99.0).double() for s in (1, -1))
+        low = low.scatter_reduce(0, group, base[:, k], "amin")
+        high = high.scatter_reduce(0, group, base[:, k], "amax")
+        assert torch.equal(low, high)
+    assert torch.equal(torch.floor(centre / DX - 0.5)[group], base)
+    far = (points - centre[group]).norm(dim=-1).max()
+    assert float(far) < 3**0.5 * DX / per_cell
+    expected = len(torch.unique(torch.floor((points / DX - 0.5) * per_cell), dim=0))
+    assert int(group.max()) + 1 == expected
 
 
-def test_blend_is_a_smooth_partition_that_interpolates():
-    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(2))
-    line = torch.stack([torch.linspace(0.2, 0.8, 4001), torch.full((4001,), 0.4), torch.full((4001,), 0.6)], -1)
-    index, weight = blend_weights(points, torch.cat([points[:5], line]), 6)
-    assert index.shape == (4006, 6)
-    torch.testing.assert_close(weight.sum(-1), torch.ones(4006, dtype=torch.float64))
-    assert index[:5, 0].tolist() == [0, 1, 2, 3, 4]
-    assert float(weight[:5, 0].min()) > 1 - 1e-6
-    # of any values, the blend moves by less than a step's worth along the line, also where neighbours are exchanged
-    value = torch.rand(200, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    blend = (weight * value[index]).sum(-1)[5:]
-    assert float(blend.diff().abs().max()) < 0.01
-    assert float(blend.max() - blend.min()) > 0.2
+def test_labels_are_never_mixed():
+    points = cloud()
+    label = torch.stack([torch.arange(len(points)) % 3, torch.arange(len(points)) % 2], -1)
+    group = grid_groups(points, DX, 2, torch.ones(len(points)), label=label)
+    assert len(torch.cat([group[:, None], label], -1).unique(dim=0)) == int(group.max()) + 1
+    assert int(group.max()) > int(grid_groups(points, DX, 2, torch.ones(len(points))).max())
 
 
-def test_few_points_are_followed_as_they_are():
-    one = torch.zeros(1, 3)
-    index, weight = blend_weights(one, torch.rand(3, 3), 6)
-    assert index.tolist() == [[0]] * 3
-    assert weight.tolist() == [[1.0]] * 3
-    index, weight = blend_weights(torch.rand(9, 3), torch.rand(3, 3), 1)
-    assert index.shape == (3, 1)
-    assert weight.tolist() == [[1.0]] * 3
+@pytest.mark.parametrize(("gap", "apart"), [(0.1, False), (0.4, True)])
+def test_close_sheets_stay_apart(gap, apart):
+    """Two level sheets, 0.1 or 0.4 cells apart, within one layer of cubes."""
+    axis = torch.arange(0.5, 40, dtype=torch.float64) * 0.25 * DX
+    x, y = (g.reshape(-1) for g in torch.meshgrid(axis, axis, indexing="ij"))
+    low = torch.stack([x, y, torch.full_like(x, 0.52 * DX)], -1)
+    points = torch.cat([low, low + torch.tensor([0.0, 0.0, gap * DX])])
+    normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(points), 3) * (-1) ** torch.arange(len(points))[:, None]
+    group = grid_groups(points, DX, 2, torch.ones(len(points)), normal)
+    sheets = torch.stack([group, (points[:, 2] > 0.55 * DX + 1e-9).long()], -1).unique(dim=0)
+    assert (len(sheets) == int(group.max()) + 1) is apart
+
+
+def test_a_tilted_noisy_sheet_is_not_split():
+    points = cloud()
+    points[:, 2] = 0.3 * points[:, 0] + 0.002 * points[:, 2]
+    normal = torch.nn.functional.normalize(torch.tensor([-0.3, 0.0, 1.0]), dim=0).expand(len(points), 3)
+    weight = torch.ones(len(points))
+    assert torch.equal(grid_groups(points, DX, 2, weight, normal), grid_groups(points, DX, 2, weight))
+
+
+def test_nothing_and_one():
+    assert grid_groups(torch.zeros(0, 3), DX, 2, torch.zeros(0), torch.zeros(0, 3)).tolist() == []
+    assert grid_groups(torch.zeros(1, 3), DX, 2, torch.ones(1), torch.zeros(1, 3)).tolist() == [0]
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="`dx`"):
+        grid_groups(cloud(), 0.0, 2, torch.ones(4000))
+    with pytest.raises(ValueError, match="`weight`"):
+        grid_groups(cloud(), DX, 2, torch.ones(3))
+    with pytest.raises(ValueError, match="`side`"):
+        loose_points(cloud(), 0.0)
 
 
 def sheet(count=20):

@@ -50,10 +50,11 @@ def make_cloud():
 
 @pytest.fixture
 def make_scene():
-    """A SimulatedScene of a splat (a random one by default)."""
+    """A SimulatedScene of a splat (a random one by default), one point for each Gaussian unless told otherwise."""
 
     def make(cloud=None, material=None, dx=0.25, dtype=torch.float32, **settings):
         cloud = _make_cloud() if cloud is None else cloud
+        settings = {"points": "gaussian", **settings}
         return SimulatedScene(Scene(generator=CloudScene(cloud), **settings), material or Material(), dx, dtype)
 
     return make
@@ -61,7 +62,7 @@ def make_scene():
 
 @pytest.fixture
 def make_simulation():
-    """A flag of 96 Gaussians on its pole, 32 x 18 pixels."""
+    """A flag of 96 Gaussians on its pole, one point for each unless told otherwise, 32 x 18 pixels."""
 
     def make(
         cloud=None,
@@ -83,7 +84,7 @@ def make_simulation():
         if pinned:
             solver["boundaries"] = [PinnedRegion(Box([None, None, None], [0.11, None, None]))]
         return Simulation(
-            Scene(generator=source, **(scene or {})),
+            Scene(generator=source, **{"points": "gaussian", **(scene or {})}),
             material or Material(E=3e3, density=30.0),
             MPMSolver(**solver),
             wind or WindField([6.0, 1.5, 0.0]),

@@ -9,7 +9,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 
-SAMPLINGS = ["gaussian", "grid"]
+POINTS = ["gaussian", "grid"]
 FLAG = 30 * 20  # Gaussians
 
 
@@ -23,40 +23,43 @@ def speckled():
     return GaussianCloud(*(torch.cat([getattr(flag, n), getattr(specks, n)]) for n in names))
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_specks_are_carried_and_weigh_nothing(sampling, make_scene):
+@pytest.mark.parametrize("points", POINTS)
+def test_specks_are_carried_and_weigh_nothing(points, make_scene):
     cloud = speckled()
-    scene = make_scene(cloud, dx=0.1, sampling=sampling, loose="carry")
-    alone = make_scene(cloud.select(torch.arange(FLAG)), dx=0.1, sampling=sampling)
+    scene = make_scene(cloud, dx=0.1, points=points, loose="carry")
+    alone = make_scene(cloud.select(torch.arange(FLAG)), dx=0.1, points=points)
     specks = torch.arange(FLAG, FLAG + 12)
     assert scene.loose == 12
     assert bool(torch.isin(specks, scene.carried).all())
-    assert torch.equal(scene.chosen, torch.arange(FLAG))
+    assert torch.equal(scene.simulated, torch.arange(FLAG))
     assert scene.points.count == alone.points.count
     assert float(scene.points.mass.sum()) == pytest.approx(float(alone.points.mass.sum()), rel=1e-5)
-    simulated = make_scene(cloud, dx=0.1, sampling=sampling)
+    simulated = make_scene(cloud, dx=0.1, points=points)
     assert simulated.loose == 0
-    assert torch.equal(simulated.chosen, torch.arange(FLAG + 12))
+    assert torch.equal(simulated.simulated, torch.arange(FLAG + 12))
     assert scene.size == simulated.size  # the region's, whoever is simulated in it
     assert torch.equal(scene.frame.origin, simulated.frame.origin)
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_they_go_where_their_neighbours_take_them(sampling, make_scene):
-    scene = make_scene(speckled(), dx=0.1, sampling=sampling, loose="carry")
+@pytest.mark.parametrize("points", POINTS)
+def test_they_go_where_their_neighbours_take_them(points, make_scene):
+    scene = make_scene(speckled(), dx=0.1, points=points, loose="carry")
     state = MPMSolver(dx=0.1).init_state(scene.points)
     assert torch.equal(scene.deformed(state).means, scene.rest().means)
     F = torch.tensor([[1.1, 0.2, 0.0], [0.0, 0.9, 0.3], [-0.1, 0.0, 1.0]])
-    moved = state.replace(position=state.position @ F.T, F_total=F.expand_as(state.F_total))
+    nodes = state.grid.node_positions(F)
+    moved = state.replace(
+        position=state.position @ F.T, F_total=F.expand_as(state.F_total), node_displacement=nodes @ F.T - nodes
+    )
     expected = scene.frame.point_to_scene(scene.frame.point_to_sim(scene.model.means.double()) @ F.double().T)
     torch.testing.assert_close(scene.deformed(moved).means.double(), expected, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_the_wind_blows_specks_away_unless_they_are_carried(sampling, make_simulation):
+@pytest.mark.parametrize("points", POINTS)
+def test_the_wind_blows_specks_away_unless_they_are_carried(points, make_simulation):
     moved = {}
     for loose in ("simulate", "carry"):
-        simulation = make_simulation(cloud=speckled(), dx=0.1, scene={"sampling": sampling, "loose": loose})
+        simulation = make_simulation(cloud=speckled(), dx=0.1, scene={"points": points, "loose": loose})
         with torch.inference_mode():
             state = simulation.start()
             for _ in range(12):
@@ -89,9 +92,9 @@ def test_what_further_points_join_is_not_loose(make_scene):
 
 def test_nothing_changes_where_nothing_is_loose(make_scene):
     flag = FlagScene(spacing=0.04).generate()
-    for sampling in SAMPLINGS:
-        carry, plain = (make_scene(flag, dx=0.1, sampling=sampling, loose=loose) for loose in ("carry", "simulate"))
-        for name in ("simulated", "carried", "anchor", "share", "patch_area", "patch_normal"):
+    for points in POINTS:
+        carry, plain = (make_scene(flag, dx=0.1, points=points, loose=loose) for loose in ("carry", "simulate"))
+        for name in ("simulated", "carried", "owner", "in_wind"):
             assert torch.equal(getattr(carry, name), getattr(plain, name)), name
         assert torch.equal(carry.points.position, plain.points.position)
 

@@ -128,4 +128,5 @@ def test_a_capture_takes_the_place_of_the_generated_splat(tmp_path):
     settings = parser.parse_args(["--config", str(CONFIGS / "flag2.yaml"), "--scene.ply", str(path), "--device", "cpu"])
     simulation = Simulation.from_settings(parser, settings)
     assert len(simulation.scene.simulated) == 96
-    assert simulation.scene.points.count == 3 * 96  # three layers
+    assert simulation.scene.further > 1000  # its Gaussians are 5 cells apart
+    assert simulation.scene.points.count == 3 * simulation.scene.on_surface  # three layers

@@ -88,7 +88,7 @@ def test_normals_in_world_axes_are_those_of_the_z_up_frame(flag_ply, make_simula
         ]
         - 1
     )
-    expected = simulation.scene.patch_normal[len(simulation.scene.patch_normal) // 2]
+    expected = simulation.scene.patches.normal[len(simulation.scene.patches.normal) // 2]
     assert abs(float(found @ expected)) > 0.95
     assert abs(float(found[2])) < 0.1  # the flag hangs, so no normal points up
 
@@ -120,9 +120,9 @@ def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     cloud.opacities[5] = -6.0
     scene = make_scene(cloud, region=Box([None, None, None], [0.5, None, None]))
     values = torch.arange(1.0, 1 + len(scene.simulated))
-    found = scene.on_gaussians(values)
+    found = scene.on_gaussians(values[scene.owner])
     assert torch.equal(found[scene.simulated], values)
-    assert torch.equal(found[scene.carried], values[scene.anchor[:, 0]])
+    assert torch.equal(found[scene.carried], values[scene.owner[len(scene.simulated) :]])
     static = torch.ones(len(cloud), dtype=torch.bool)
     static[scene.moving] = False
     assert bool(static.any())

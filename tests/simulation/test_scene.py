@@ -14,7 +14,8 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
-from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
+from gaussian_swaying.simulation.sampling import cell_volume
+from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
 
 LEFT = Box([None, None, None], [0.5, None, None])
 UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]
@@ -97,7 +98,7 @@ def test_carried_gaussians_follow_their_nearest_particle(make_cloud, make_scene)
     deformed = scene.deformed(state.replace(position=state.position + shift, F_total=F))
     for k, index in enumerate(scene.carried.tolist()):
         particle = int((cloud.means[::2] - cloud.means[index]).norm(dim=-1).argmin())
-        assert int(scene.anchor[k]) == particle
+        assert int(scene.owner[len(scene.simulated) + k]) == particle
         arm = cloud.means[index] - cloud.means[2 * particle]
         torch.testing.assert_close(deformed.means[index], deformed.means[2 * particle] + F[particle] @ arm)
         covariance = F[particle] @ scene.rest_covariances[index] @ F[particle].T
@@ -224,7 +225,7 @@ def test_a_patch_weighs_density_times_area_times_thickness(make_scene, metres_pe
     material = Material(density=30.0, thickness=0.02)
     flag = FlagScene(spacing=0.1, ripple=0.0).generate()
     scene = make_scene(flag, material, metres_per_unit=metres_per_unit)
-    torch.testing.assert_close(scene.points.volume, scene.patch_area * 0.02)
+    torch.testing.assert_close(scene.points.volume, scene.patches.areas() * 0.02)
     torch.testing.assert_close(scene.points.mass, scene.points.volume * 30.0)
     weight = 1.2 * 0.8 * metres_per_unit**2 * 0.02 * 30.0
     assert float(scene.points.mass.sum()) == pytest.approx(weight, rel=0.02)
@@ -236,7 +237,7 @@ def test_faint_gaussians_take_no_area(make_cloud, make_scene):
     haze = dataclasses.replace(flag, means=flag.means + 0.01, opacities=torch.full((96,), -5.0))
     names = ("means", "quats", "scales", "opacities", "sh")
     both = GaussianCloud(*(torch.cat([getattr(flag, name), getattr(haze, name)]) for name in names))
-    torch.testing.assert_close(make_scene(both).patch_area, make_scene(flag).patch_area)
+    torch.testing.assert_close(make_scene(both).patches.area, make_scene(flag).patches.area)
 
 
 def test_each_part_has_the_law_it_was_given(make_cloud, make_scene):
@@ -258,14 +259,14 @@ def test_areas_as_in_the_paper(make_cloud, make_scene):
     cloud = make_cloud()
     s = cloud.scales.exp().sort(dim=-1).values
     scene = make_scene(cloud, area="paper", metres_per_unit=2.0)
-    torch.testing.assert_close(scene.patch_area, 4 * math.pi * s[:, 1] * s[:, 2])
+    torch.testing.assert_close(scene.patches.area, 4 * math.pi * s[:, 1] * s[:, 2])
 
 
 def test_equal_areas_have_the_same_sum(make_cloud, make_scene):
     cloud = make_cloud()
-    areas = make_scene(cloud, area="equal").patch_area
+    areas = make_scene(cloud, area="equal").patches.area
     assert areas.unique().numel() == 1
-    torch.testing.assert_close(areas.sum(), make_scene(cloud, area="coverage").patch_area.sum())
+    torch.testing.assert_close(areas.sum(), make_scene(cloud, area="coverage").patches.area.sum())
 
 
 def test_cell_rule(make_scene):
@@ -304,7 +305,7 @@ def test_material_regions(make_cloud, make_scene):
     assert torch.equal(points.youngs_modulus, field(1e4, 2e4, 3e4))
     assert torch.equal(points.poisson_ratio, field(0.2, 0.4, 0.4))
     torch.testing.assert_close(points.mass / points.volume, field(100.0, 50.0, 50.0))
-    torch.testing.assert_close(points.volume / scene.patch_area, field(0.01, 0.03, 0.03))
+    torch.testing.assert_close(points.volume / scene.patches.area, field(0.01, 0.03, 0.03))
 
 
 def test_a_material_region_that_holds_nothing_is_an_error(make_scene):
@@ -332,13 +333,13 @@ def test_bad_scenes():
     bad = [("faint", "hide"), ("area", "disc"), ("opacity_threshold", 1.0), ("up", [0.0, 1.0]), ("max_stretch", 1.0)]
     for name, value in bad:
         with pytest.raises(ValueError, match=f"scene.{name}"):
-            Scene(generator=flag, **{name: value})
+            Scene(points="gaussian", generator=flag, **{name: value})
 
 
 def test_points_move_with_the_module(make_scene):
     scene = make_scene()
     scene.to(torch.float64)
-    assert scene.points.position.dtype == scene.patch_area.dtype == torch.float64
+    assert scene.points.position.dtype == scene.patches.area.dtype == torch.float64
 
 
 def _sheet_with_a_hole():
@@ -359,22 +360,24 @@ def test_large_gaussians_get_further_points():
     count = len(cloud)
     lower = MaterialRegion(region=Box([None, None, None], [None, None, 0.49]), density=1000.0)
     material = Material(density=100.0, thickness=0.02, regions=[lower])
-    plain = SimulatedScene(Scene(generator=_Given(cloud)), material, 0.1)
-    full = SimulatedScene(Scene(generator=_Given(cloud), particle_spacing=0.05), material, 0.1)
+    plain = SimulatedScene(Scene(points="gaussian", generator=_Given(cloud)), material, 0.1)
+    full = SimulatedScene(Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.05), material, 0.1)
     assert plain.on_surface == plain.points.count == count
     assert full.on_surface == full.points.count > count + 50
     assert torch.equal(full.points.position[:count], plain.points.position)
-    assert float(plain.patch_area.sum()) < 0.9 < float(full.patch_area.sum()) < 1.03
+    assert float(plain.patches.area.sum()) < 0.9 < float(full.patches.area.sum()) < 1.03
     density = full.points.mass / full.points.volume
     below = full.frame.point_to_scene(full.points.position.double())[:, 2] < 0.49
     torch.testing.assert_close(density, torch.where(below, 1000.0, 100.0))
-    torch.testing.assert_close(full.points.volume, 0.02 * full.patch_area)
-    of_large = full.patch_normal[count - 1 :]  # the flag is not quite flat, and one normal stands for the hole
+    torch.testing.assert_close(full.points.volume, 0.02 * full.patches.area)
+    of_large = full.patches.normal[count - 1 :]  # the flag is not quite flat, and one normal stands for the hole
     assert torch.equal(of_large, of_large[:1].expand_as(of_large))
     state = _rest_state(full)
     moved = full.deformed(state.replace(position=state.position + 0.25))
     torch.testing.assert_close(moved.means, cloud.means + 0.25)
-    layered = SimulatedScene(Scene(generator=_Given(cloud), particle_spacing=0.05, layers=3), material, 0.1)
+    layered = SimulatedScene(
+        Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.05, layers=3), material, 0.1
+    )
     assert layered.on_surface == full.points.count
     assert layered.points.count == 3 * full.points.count
 
@@ -383,40 +386,46 @@ def test_further_points_in_the_paper_s_areas():
     """Each Gaussian keeps pi s1 s2, shared among its points."""
     cloud = _sheet_with_a_hole()
     plain, full = (
-        SimulatedScene(Scene(generator=_Given(cloud), area="paper", particle_spacing=s), Material(), 0.1)
+        SimulatedScene(
+            Scene(points="gaussian", generator=_Given(cloud), area="paper", particle_spacing=s), Material(), 0.1
+        )
         for s in (None, 0.05)
     )
-    torch.testing.assert_close(full.patch_area.sum(), plain.patch_area.sum())
+    torch.testing.assert_close(full.patches.area.sum(), plain.patches.area.sum())
     assert full.points.count > plain.points.count
 
 
 def test_spacing_of_the_particles_is_in_metres():
     cloud = _sheet_with_a_hole()
     one, half = (
-        SimulatedScene(Scene(generator=_Given(cloud), particle_spacing=s, metres_per_unit=m), Material(), 0.1)
+        SimulatedScene(
+            Scene(points="gaussian", generator=_Given(cloud), particle_spacing=s, metres_per_unit=m), Material(), 0.1
+        )
         for s, m in ((0.05, 1.0), (0.1, 2.0))
     )
     assert one.points.count == half.points.count
     with pytest.raises(ValueError, match="particle_spacing"):
-        Scene(generator=_Given(cloud), particle_spacing=0.0)
+        Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.0)
     with pytest.raises(ValueError, match="particle_spacing"):
-        Scene(generator=_Given(cloud), particle_spacing=0.05, filling=InteriorFilling())
+        Scene(points="gaussian", generator=_Given(cloud), particle_spacing=0.05, filling=InteriorFilling())
 
 
 def test_three_layers_are_a_plate(make_cloud):
     """The mass of one, and its moment about the middle plane: that of a plate of this thickness, h² / 12."""
     cloud = make_cloud()
     material = Material(thickness=0.03)
-    one, three = (SimulatedScene(Scene(generator=_Given(cloud), layers=n), material, 0.25) for n in (1, 3))
+    one, three = (
+        SimulatedScene(Scene(points="gaussian", generator=_Given(cloud), layers=n), material, 0.25) for n in (1, 3)
+    )
     count = one.points.count
     assert three.points.count == 3 * count
     torch.testing.assert_close(three.points.mass.sum(), one.points.mass.sum())
-    height = ((three.points.position - one.points.position.repeat(3, 1)) * one.patch_normal.repeat(3, 1)).sum(-1)
+    height = ((three.points.position - one.points.position.repeat(3, 1)) * one.patches.normal.repeat(3, 1)).sum(-1)
     assert torch.equal(three.points.position[:count], one.points.position)
     moment = (three.points.mass * height.square()).sum() / three.points.mass.sum()
     assert float(moment) == pytest.approx(0.03**2 / 12, rel=1e-4)
-    assert torch.equal(three.patch_area[:count], one.patch_area)  # the wind meets the sheet once
-    assert not bool(three.patch_area[count:].any())
+    assert torch.equal(three.patches.areas()[:count], one.patches.area)  # the wind meets the sheet once
+    assert not bool(three.patches.areas()[count:].any())
     assert len(three.deformed(_rest_state(three)).means) == len(cloud)
 
 
@@ -430,4 +439,4 @@ def test_three_layers_are_a_plate(make_cloud):
 )
 def test_layers_that_do_not_fit(make_cloud, scene, material, words):
     with pytest.raises(ValueError, match=words):
-        SimulatedScene(Scene(generator=_Given(make_cloud()), **scene), Material(**material), 0.25)
+        SimulatedScene(Scene(points="gaussian", generator=_Given(make_cloud()), **scene), Material(**material), 0.25)

@@ -703,7 +703,7 @@ def test_gaussians_of_extreme_shape(scales):
     )
     scene = simulation.scene
     assert bool((scene.points.mass > 0).all())
-    assert float(scene.patch_area.sum()) < 10.0
+    assert float(scene.patches.area.sum()) < 10.0
     state, log = _advance(simulation, 3)
     picture = simulation.painter.render(state, 3)
     for image in (picture.color, picture.alpha, picture.depth):

@@ -118,7 +118,7 @@ def _drag_substeps(simulation: Simulation, state: MPMState, frames: int) -> int:
         return 1
     winds = simulation.wind_force.samples(state, simulation.frame_dt, frames)
     speed = torch.linalg.vector_norm(winds, dim=-1).reshape(frames, -1).amax(1)
-    area, mass = simulation.scene.patch_area, simulation.solver.points.mass
+    area, mass = simulation.wind_force.area, simulation.solver.points.mass
     rates = [
         float(simulation.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values
     ]

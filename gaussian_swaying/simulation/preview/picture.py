@@ -59,10 +59,12 @@ def classify(simulation: Simulation) -> Parts:
     """
     scene = simulation.scene
     simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
-    index = scene.chosen.cpu()
+    index = scene.simulated.cpu()
     carried[scene.carried.cpu()] = True
     simulated[index], carried[index] = True, False
-    where = scene.frame.point_to_sim(scene.model.means.detach()[scene.chosen].double()).to(scene.points.position.dtype)
+    where = scene.frame.point_to_sim(scene.model.means.detach()[scene.simulated].double()).to(
+        scene.points.position.dtype
+    )
     names = []
     for boundary in conditions(simulation):
         moved = boundary.in_frame(scene.frame)

@@ -137,7 +137,7 @@ scene:
   loose: carry                  # and so do specks that hang on nothing or by a thread
   area: coverage
   particle_spacing: {_fill(s)}
-  sampling: grid                # as many points as the grid needs; all Gaussians follow them; gaussian: one for each
+  points: grid                  # as many as the grid can use; the Gaussians follow its nodes; gaussian: one for each
 
 {_material(s)}
 solver:

@@ -237,8 +237,8 @@ class Recorder:
             film = video_file(place) if self.video and place in self._films else None
             told += check_pictures(path, place, frames, film)
         if self.trajectory:
-            position = checkpoint["state"].get("position")
-            told += check_positions(path, frames, len(position) if isinstance(position, Tensor) else None)
+            tracked = checkpoint.get("tracked")
+            told += check_positions(path, frames, tracked if isinstance(tracked, int) else None)
         if self.ply_every and self.export_format == "usd":
             told += check_shards(path, range(0, frames, self.ply_every))
         elif self.ply_every:

@@ -39,7 +39,7 @@ from gaussian_swaying.simulation.preview.suggest import (
     visible_weight,
 )
 from gaussian_swaying.simulation.preview.up import CONVENTION, floor_mask, guess_up
-from gaussian_swaying.simulation.scene import POINTS_PER_CELL
+from gaussian_swaying.simulation.scene import SPECK
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
@@ -373,7 +373,7 @@ def test_page_states_the_numbers_of_the_rules():
         f"first {calibration.SECONDS:g} s",
         f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
         f"less than {LOOSE:.0%}".replace("%", " % of what the largest part has"),
-        f"side `dx` / {POINTS_PER_CELL}",
+        f"side `dx` / {1 / SPECK:g}",
         f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
         f"below {SHEET:g} of the next",
     ):
@@ -389,7 +389,7 @@ def test_draft_is_the_starter_on_a_coarser_grid():
     assert draft["solver"]["dx"] == float(f"{1 / DRAFT_CELLS:.2g}") > starter["solver"]["dx"]
     assert draft["frames"] == DRAFT_FRAMES < starter["frames"]
     assert draft["camera"]["init_args"]["height"] < starter["camera"]["init_args"]["height"]
-    assert draft["scene"]["sampling"] == starter["scene"]["sampling"] == "grid"
+    assert draft["scene"]["points"] == starter["scene"]["points"] == "grid"
     for part in ("material", "wind", "aero", "shader"):
         assert draft[part] == starter[part]
     assert draft["solver"]["boundaries"] == starter["solver"]["boundaries"]

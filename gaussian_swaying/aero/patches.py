@@ -1,0 +1,211 @@
+r"""The wind on groups of patches that move together: sums over the patches of a material point.
+
+A point may carry many patches, with normals of all directions. Under a deformation gradient F of the point, the area
+vector of a patch, :math:`\mathbf{b} = A \mathbf{N}` at rest, becomes :math:`\operatorname{cof}(F)\, \mathbf{b}`
+(Nanson's formula). The terms of the force of :func:`~gaussian_swaying.aero.force.aero_force` then need three sums:
+
+.. math::
+    \mathbf{s} = \operatorname{cof} F \sum_i \operatorname{sign}(\mathbf{b}_i \cdot \mathbf{w})\, \mathbf{b}_i, \qquad
+    T = \frac1\kappa \operatorname{cof} F\, \Bigl(\sum_i A_i \mathbf{N}_i \mathbf{N}_i^T\Bigr) \operatorname{cof} F^T,
+    \qquad A = \operatorname{tr} T, \qquad \mathbf{w} = \operatorname{cof} F^T \mathbf{v}_r
+
+The paper's drag is :math:`C_D v_r^2 \mathbf{s}`, the projected one :math:`C_D v_r T \mathbf{v}_r`, friction
+:math:`C_F v_r (A - T) \mathbf{v}_r`, and lift follows from s. The sum of signs is over all directions, the others are
+constant tensors of six numbers. All are exact for F that turns, or stretches patches of one direction; the mean growth
+of the area :math:`\kappa` stands for that of each patch.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_shape
+from gaussian_swaying.gaussians.grouping import sums
+from gaussian_swaying.geometry.linalg import cofactor
+
+MOST = 75
+"""Directions that are kept of the patches of one point; like ones are joined until there are no more."""
+
+_ANGLES = (0.003, 0.01, 0.03, 0.1, 0.25, 0.5)  # [rad] of the cells of directions; the coarsest make 3 x 5 x 5 of them
+
+
+class Patches(nn.Module):
+    """Surface patches that feel the wind, and the material points that they belong to.
+
+    Args:
+        normal: Unit normals at rest, of either sign, shape (Q, 3).
+        area: Areas at rest [m²], shape (Q,).
+        point: The material point of each, shape (Q,).
+        count: Number of material points P.
+    """
+
+    def __init__(self, normal: Tensor, area: Tensor, point: Tensor, count: int) -> None:
+        super().__init__()
+        check_shape("normal", normal, None, 3, batches=False)
+        check_shape("area", area, len(normal), batches=False)
+        check_shape("point", point, len(normal), batches=False)
+        self.count = int(count)
+        self.register_buffer("normal", normal, persistent=False)
+        self.register_buffer("area", area, persistent=False)
+        self.register_buffer("point", point, persistent=False)
+        self.normal: Tensor
+        self.area: Tensor
+        self.point: Tensor
+
+    def areas(self) -> Tensor:
+        """Area of the patches of each material point at rest [m²], shape (P,)."""
+        return self.area.new_zeros(self.count).index_add(0, self.point, self.area)
+
+
+class PatchSums(nn.Module):
+    """The constant sums over the patches of each material point.
+
+    Args:
+        patches: The patches.
+
+    Attributes:
+        tensor: Sum of A N N^T [m²], shape (P, 3, 3).
+        vector: Area vectors A N at rest [m²], joined with those of like direction, sorted by point, shape (V, 3).
+        point: The material point of each, shape (V,).
+        single: Whether no point has patches of more than one direction.
+    """
+
+    def __init__(self, patches: Patches) -> None:
+        super().__init__()
+        with torch.no_grad():
+            normal, area = patches.normal.double(), patches.area.double()
+            whole = patches.point.new_zeros(0) if patches.count == 0 else torch.arange(patches.count)
+            point = torch.cat([patches.point.cpu(), whole])  # so that every point has a sum
+            weighted = area[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            tensor = sums(torch.cat([weighted.cpu(), weighted.new_zeros(patches.count, 3, 3).cpu()]), point)
+            vector, owner = joined_directions(normal.cpu(), area.cpu(), patches.point.cpu(), tensor)
+        like = patches.area
+        self.register_buffer("tensor", tensor.to(like), persistent=False)
+        self.register_buffer("vector", vector.to(like), persistent=False)
+        self.register_buffer("point", owner.to(like.device), persistent=False)
+        self.single = len(owner) == 0 or int(owner.bincount().amax()) <= 1
+        self.tensor: Tensor
+        self.vector: Tensor
+        self.point: Tensor
+
+    @property
+    def area(self) -> Tensor:
+        """Area of the patches of each point at rest [m²], shape (P,)."""
+        return self.tensor.diagonal(dim1=-2, dim2=-1).sum(-1)
+
+    def normals(self) -> Tensor:
+        """Unit normal of each point, if it has patches of one direction, shape (P, 3); z where it has none."""
+        normal = self.tensor.new_tensor([0.0, 0.0, 1.0]).repeat(len(self.tensor), 1)
+        return normal.index_copy(0, self.point, torch.nn.functional.normalize(self.vector, dim=-1))
+
+
+def joined_directions(normal: Tensor, area: Tensor, point: Tensor, tensor: Tensor) -> tuple[Tensor, Tensor]:
+    """Area vectors of the patches of each point, joined where the directions are alike.
+
+    Directions are sorted into cells of 0.003 rad around the main direction of the point, or of more until at most
+    :data:`MOST` cells are used.
+
+    Args:
+        normal: Unit normals, shape (Q, 3).
+        area: Areas, shape (Q,).
+        point: The point of each, shape (Q,).
+        tensor: Sum of A N N^T of each point, shape (P, 3, 3).
+
+    Returns:
+        Vectors as long as the sum of their areas, shape (V, 3), and their points, ascending, shape (V,).
+    """
+    axes = torch.linalg.eigh(tensor)[1].flip(-1)  # the main direction first
+    local = (axes[point].mT @ normal[..., None])[..., 0]
+    major = local.abs().argmax(-1, keepdim=True)  # the face of a cube that the direction points to
+    sign = torch.where(local.gather(-1, major) < 0, -1.0, 1.0)
+    on_face = local * sign / local.gather(-1, major).abs()
+    pending = torch.arange(len(point))
+    cell = torch.zeros(len(point), 5, dtype=torch.long)
+    for level, angle in enumerate(_ANGLES):
+        rows = torch.cat([(on_face[pending] / angle).round().long(), major[pending]], -1)
+        cell[pending] = torch.cat([rows, torch.full_like(rows[:, :1], level)], -1)
+        used = torch.unique(torch.cat([point[pending, None], rows], -1), dim=0)[:, 0].bincount(minlength=len(tensor))
+        pending = pending[used[point[pending]] > MOST]
+    group = torch.unique(torch.cat([point[:, None], cell], -1), dim=0, return_inverse=True)[1]
+    total = sums(sign * area[:, None] * normal, group)
+    size = sums(area, group)
+    owner = torch.zeros(len(size), dtype=torch.long).index_put((group,), point)
+    return torch.nn.functional.normalize(total, dim=-1) * size[:, None], owner
+
+
+def grouped_force(
+    wind: Tensor,
+    velocity: Tensor,
+    deformation_gradient: Tensor,
+    patches: PatchSums,
+    *,
+    drag: Tensor | float,
+    friction: Tensor | float,
+    lift: Tensor | float,
+    air_density: float = 1.225,
+    law: str = "paper",
+    lift_direction: str = "side",
+    unit_tangent: bool = False,
+    max_area_ratio: float = math.inf,
+) -> tuple[Tensor, Tensor]:
+    r"""Force on the patches of each point, see the top of this file, and their area now.
+
+    Args:
+        wind: Air velocity [m/s], broadcastable to (P, 3).
+        velocity: Velocity of the points [m/s], shape (P, 3).
+        deformation_gradient: Total deformation gradient of the points, shape (P, 3, 3).
+        patches: The sums over the patches.
+        drag: C_D.
+        friction: C_F.
+        lift: C_L.
+        air_density: Density of the air [kg/m³].
+        law: As in :func:`~gaussian_swaying.aero.force.aero_force`.
+        lift_direction: As there.
+        unit_tangent: As there.
+        max_area_ratio: Largest ratio of the area to that at rest (see
+            :func:`~gaussian_swaying.aero.force.capped_area`).
+
+    Returns:
+        Force [N], shape (P, 3), and area [m²], shape (P,).
+    """
+    relative = wind.to(velocity.dtype) - velocity
+    speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
+    cof = cofactor(deformation_gradient)
+    pulled = (cof * relative[..., None]).sum(-2)  # w
+    turned = (cof[..., :, :, None] * patches.tensor[..., None, :, :]).sum(-2)  # cof(F) A N N^T
+    rest = patches.area
+    grown = ((turned * cof).sum((-2, -1)) / rest.clamp(min=torch.finfo(rest.dtype).tiny)).clamp(min=0)
+    growth = grown.clamp(min=torch.finfo(rest.dtype).tiny).sqrt()
+    across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
+    dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
+    sign = torch.where(dots < 0, -1.0, 1.0)
+    signed = sums_at(sign * patches.vector, patches.point, relative)
+    facing = (cof * signed[..., None, :]).sum(-1)  # s
+    area = growth * rest
+    pressure = drag * (speed * speed * facing if law == "paper" else speed * across)
+    if unit_tangent:
+        size = torch.linalg.vector_norm(patches.vector, dim=-1, keepdim=True)
+        unit = patches.vector / size
+        along = dots / size
+        tangent = pulled[patches.point] - along * unit
+        length = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
+        tangent = size * tangent / length.clamp(min=torch.finfo(size.dtype).tiny)
+        tangents = (cof * sums_at(tangent, patches.point, relative)[..., None, :]).sum(-1)
+        shear = friction * speed.square() * tangents
+    else:
+        shear = friction * speed * (area[..., None] * relative - across)
+    side = torch.linalg.cross(relative, facing, dim=-1)
+    lifting = lift * (speed * side if lift_direction == "side" else torch.linalg.cross(side, relative, dim=-1))
+    scale = 0.5 * air_density * (rest > 0).to(rest)
+    if max_area_ratio < math.inf:
+        cap = (max_area_ratio / growth).clamp(max=1.0)
+        scale, area = scale * cap, area * cap
+    return scale[..., None] * (pressure + shear + lifting), area
+
+
+def sums_at(values: Tensor, point: Tensor, like: Tensor) -> Tensor:
+    """Sum of values (V, 3) over the rows of each point, shape of ``like`` (P, 3)."""
+    return torch.zeros_like(like).index_add(0, point, values)

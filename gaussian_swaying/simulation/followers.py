@@ -1,0 +1,130 @@
+"""How Gaussians follow the material: each reads displacement and deformation where it is at rest."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
+from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
+
+
+class Followers(nn.Module):
+    """Places of the material that are read from a state.
+
+    Args:
+        arm: From the place that is read to the place that follows, at rest [m], shape (M, 3); it turns and stretches
+            with the material. None if they are the same.
+    """
+
+    def __init__(self, arm: Tensor | None) -> None:
+        super().__init__()
+        self.register_buffer("arm", arm, persistent=False)
+        self.arm: Tensor | None
+
+    def motion(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        """Displacement [m], shape (M, 3), and deformation gradient, shape (M, 3, 3), in a state of one scene."""
+        move, F = self._read(state)
+        if self.arm is not None:
+            eye = torch.eye(3, dtype=F.dtype, device=F.device)
+            move = move + ((F - eye) * self.arm.to(F)[..., None, :]).sum(-1)
+        return move, F
+
+    def velocity(self, state: MPMState) -> Tensor:
+        """Velocity of the places that are read [m/s], shape (M, 3)."""
+        raise NotImplementedError
+
+    def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError
+
+
+class PointFollowers(Followers):
+    """Followers of material points.
+
+    Args:
+        source: The point that each follows, shape (M,).
+        arm: See :class:`Followers`.
+        rest: Rest positions of the points [m], shape (P, 3).
+    """
+
+    def __init__(self, source: Tensor, arm: Tensor | None, rest: Tensor) -> None:
+        super().__init__(arm)
+        self.register_buffer("source", source, persistent=False)
+        self.register_buffer("rest", rest, persistent=False)
+        self.source: Tensor
+        self.rest: Tensor
+
+    def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        return (state.position - self.rest)[self.source], state.F_total[self.source]
+
+    def velocity(self, state: MPMState) -> Tensor:
+        """Velocity of the points [m/s], shape (M, 3)."""
+        return state.velocity[self.source]
+
+
+class GridFollowers(Followers):
+    """Followers of the nodal fields of the ``total`` formulation, each with its own stencil.
+
+    Args:
+        place: Rest positions that are read [m], shape (M, 3).
+        arm: See :class:`Followers`.
+    """
+
+    def __init__(self, place: Tensor, arm: Tensor | None) -> None:
+        super().__init__(arm)
+        self.register_buffer("place", place, persistent=False)
+        self.place: Tensor
+        self._known: tuple[GridSpec, torch.device, Stencil] | None = None
+
+    def stencil(self, grid: GridSpec) -> Stencil:
+        """The 27 nodes of each follower."""
+        known = self._known
+        if known is None or known[0] != grid or known[1] != self.place.device:
+            with torch.inference_mode(False):  # it outlives the call
+                known = (grid, self.place.device, follower_stencil(self.place, grid))
+            self._known = known
+        return known[2]
+
+    def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
+        rows = gather(_nodal(state.node_displacement), self.stencil(state.grid))
+        return rows[..., 0, :], rows[..., 1:4, :].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
+
+    def velocity(self, state: MPMState) -> Tensor:
+        """Velocity of the material [m/s], shape (M, 3)."""
+        return gather(_nodal(state.node_velocity), self.stencil(state.grid))[..., 0, :]
+
+
+def follower_stencil(place: Tensor, grid: GridSpec) -> Stencil:
+    """The stencil of followers (M, 3) [m], as that of the material in ``total``."""
+    return bspline_stencil(place, grid, moments=False, snap=torch.finfo(place.dtype).eps ** 0.5)
+
+
+def _nodal(field: Tensor | None) -> Tensor:
+    if field is None:
+        raise ValueError(
+            "The Gaussians follow grid nodes, which only the total formulation keeps: set `scene.points` to gaussian."
+        )
+    return field
+
+
+@torch.no_grad()
+def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: float) -> Tensor:
+    """Places that can be read: their own if all their nodes have mass, otherwise those of a material point.
+
+    A group's nodes are those of all its members, except where the centre of mass lies on the border of its cell.
+
+    Args:
+        place: Rest positions [m], shape (M, 3), float64.
+        nearest: A material point close to each, shape (M,).
+        points: The material.
+        dx: Grid spacing [m].
+
+    Returns:
+        Shape (M, 3).
+    """
+    position = points.position
+    grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
+    mass = scatter(follower_stencil(position, grid), points.mass[:, None, None])[:, 0]
+    own = follower_stencil(place.to(position), grid)
+    empty = gather((mass <= 0).to(mass)[:, None], own)[:, 0, 0]
+    return torch.where((own.inside & (empty == 0))[:, None], place, position[nearest].to(place))

@@ -1,0 +1,165 @@
+"""The wind on groups of patches equals the sum over their patches."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce, aero_force, capped_area
+from gaussian_swaying.aero.patches import MOST, Patches, PatchSums, grouped_force
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.mpm.state import MaterialPoints
+
+LAWS = {
+    "paper": {"drag": 0.5, "friction": 0.4, "lift": 0.01, "law": "paper"},
+    "projected": {"drag": 1.28, "friction": 0.0, "lift": 0.0, "law": "projected"},
+    "projected with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "projected"},
+    "paper with lift": {"drag": 0.5, "friction": 0.1, "lift": 0.5, "law": "paper", "lift_direction": "lift"},
+    "unit tangent": {"drag": 0.5, "friction": 0.4, "lift": 0.1, "law": "paper", "unit_tangent": True},
+}
+POINTS = 40
+
+
+def random_patches(spread, each=30, seed=0):
+    """Patches of random areas whose normals spread around that of their point; one point has none."""
+    generator = torch.Generator().manual_seed(seed)
+    main = torch.nn.functional.normalize(torch.randn(POINTS, 3, generator=generator, dtype=torch.float64), dim=-1)
+    point = torch.randint(1, POINTS, (each * POINTS,), generator=generator)
+    noise = spread * torch.randn(len(point), 3, generator=generator, dtype=torch.float64)
+    normal = torch.nn.functional.normalize(main[point] + noise, dim=-1)
+    normal = normal * torch.where(torch.rand(len(point), generator=generator) < 0.5, -1.0, 1.0)[:, None]
+    area = 1e-4 * torch.rand(len(point), generator=generator, dtype=torch.float64)
+    return normal, area, point
+
+
+def each_patch(wind, velocity, F, normal, area, point, cap=math.inf, **law):
+    """The definition: the force of ``aero_force`` on every patch, summed."""
+    now, grown = deform_patch(F[point], normal, area)
+    force = aero_force(wind, velocity[point], now, capped_area(grown, area, cap), **law)
+    return torch.zeros_like(velocity).index_add(0, point, force)
+
+
+def winds(count=60):
+    generator = torch.Generator().manual_seed(1)
+    return 5 * torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1)
+
+
+def turned(stretch=0.0):
+    """Rotations of the points, with some stretch."""
+    generator = torch.Generator().manual_seed(2)
+    quats = torch.randn(POINTS, 4, generator=generator, dtype=torch.float64)
+    strain = stretch * torch.randn(POINTS, 3, 3, generator=generator, dtype=torch.float64)
+    return quat_to_rotation(quats) @ (torch.eye(3, dtype=torch.float64) + 0.5 * (strain + strain.mT))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("spread", [0.005, 0.1, 3.0])
+def test_force_is_the_sum_over_the_patches(law, spread):
+    """Of a flat, a noisy and an arbitrary group, in any direction, whatever its rotation: within 1 %."""
+    normal, area, point = random_patches(spread)
+    sums, F = PatchSums(Patches(normal, area, point, POINTS)), turned()
+    velocity = torch.zeros(POINTS, 3, dtype=torch.float64)
+    for wind in winds():
+        expected = each_patch(wind, velocity, F, normal, area, point, **LAWS[law])
+        found, now = grouped_force(wind, velocity, F, sums, **LAWS[law])
+        assert float((found - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
+        assert float((found - expected).sum(0).norm()) < 0.01 * float(expected.norm(dim=-1).sum())
+        assert not bool(found[0].any())
+        torch.testing.assert_close(now.sum(), area.sum())
+
+
+@pytest.mark.parametrize("law", ["projected", "projected with all terms", "paper"])
+def test_strain_costs_less_than_itself(law):
+    """The mean growth of area stands for that of each patch: exact for one direction, else no worse than the strain."""
+    velocity = torch.zeros(POINTS, 3, dtype=torch.float64)
+    for spread, bound in ((0.0, 1e-9), (0.1, 0.01), (3.0, 0.05)):
+        normal, area, point = random_patches(spread)
+        sums, F = PatchSums(Patches(normal, area, point, POINTS)), turned(0.05)
+        for wind in winds(20):
+            expected = each_patch(wind, velocity, F, normal, area, point, **LAWS[law])
+            found, _ = grouped_force(wind, velocity, F, sums, **LAWS[law])
+            assert float((found - expected).norm(dim=-1).sum()) <= bound * float(expected.norm(dim=-1).sum())
+
+
+def test_one_direction_takes_the_path_of_single_patches():
+    normal, area, point = random_patches(0.0)
+    force = WindForce(AeroForce(), WindField([3.0, 1.0, 0.0]), Patches(normal, area, point, POINTS))
+    assert force.sums is None
+    torch.testing.assert_close(force.area.sum(), area.sum())
+    assert float((force.normal[point] * normal).sum(-1).abs().min()) > 1 - 1e-12
+    assert not bool(force.area[0])
+    several = WindForce(AeroForce(), WindField([3.0, 1.0, 0.0]), Patches(*random_patches(0.1), POINTS))
+    assert several.sums is not None
+
+
+def test_the_area_is_capped_and_resists():
+    normal, area, point = random_patches(0.0)
+    F = 2 * torch.eye(3, dtype=torch.float64).expand(POINTS, 3, 3)
+    velocity, wind = torch.zeros(POINTS, 3, dtype=torch.float64), torch.tensor([4.0, 0.0, 0.0], dtype=torch.float64)
+    sums = PatchSums(Patches(normal, area, point, POINTS))
+    expected = each_patch(wind, velocity, F, normal, area, point, cap=1.5, **LAWS["paper"])
+    found, now = grouped_force(wind, velocity, F, sums, max_area_ratio=1.5, **LAWS["paper"])
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(now, 1.5 * sums.area)
+
+
+def test_a_state_in_wind(make_points):
+    """WindForce on patches is the sum of the forces, and of the resistances, of a WindForce on single patches."""
+    normal, area, point = random_patches(0.2)
+    aero = AeroForce(drag_step="semi_implicit")
+    from gaussian_swaying.mpm.solver import MPMSolver
+
+    state = MPMSolver(dx=0.1).init_state(make_points)
+    state = state.replace(velocity=torch.randn_like(state.velocity), F_total=turned())
+    wind = torch.tensor([4.0, 1.0, 0.5], dtype=torch.float64)
+    force, resistance = WindForce(aero, WindField([4.0, 1.0, 0.5]), Patches(normal, area, point, POINTS)).force(
+        state, wind
+    )
+    law = {"drag": 0.5, "friction": 0.4, "lift": 0.01}
+    expected = each_patch(wind, state.velocity, state.F_total, normal, area, point, **law)
+    assert float((force - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
+    alone = aero.resistance(wind, state.velocity[point], area)
+    torch.testing.assert_close(resistance, torch.zeros_like(resistance).index_add(0, point, alone), rtol=1e-9, atol=0)
+
+
+@pytest.fixture
+def make_points():
+    position = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return MaterialPoints.create(position, volume=1e-5, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+
+
+def test_gradients():
+    normal, area, point = random_patches(0.3, each=3)
+    sums = PatchSums(Patches(normal, area, point, POINTS))
+    wind = torch.tensor([3.0, -1.0, 0.4], dtype=torch.float64)
+    velocity = torch.zeros(POINTS, 3, dtype=torch.float64, requires_grad=True)
+    F = turned(0.05).requires_grad_()
+
+    def function(velocity, F):
+        return grouped_force(wind, velocity, F, sums, **LAWS["projected with all terms"])[0]
+
+    assert torch.autograd.gradcheck(function, (velocity, F), fast_mode=True)
+
+
+def test_directions_are_joined_up_to_a_number():
+    normal, area, point = random_patches(3.0, each=400)
+    sums = PatchSums(Patches(normal, area, point, POINTS))
+    assert int(sums.point.bincount().max()) <= MOST
+    assert bool((sums.point.diff() >= 0).all())
+    total = torch.zeros(POINTS, dtype=torch.float64).index_add(0, sums.point, sums.vector.norm(dim=-1))
+    torch.testing.assert_close(total, sums.area)
+    assert not PatchSums(Patches(normal, area, point, POINTS)).single
+    nothing = PatchSums(Patches(normal[:0], area[:0], point[:0], 3))
+    assert nothing.single
+    assert nothing.area.tolist() == [0.0] * 3
+
+
+def test_bad_patches():
+    normal, area, point = random_patches(0.0)
+    with pytest.raises(ValueError, match="`area`"):
+        Patches(normal, area[:5], point, POINTS)
+    with pytest.raises(ValueError, match="`area`"):
+        WindForce(AeroForce(), WindField([1.0, 0.0, 0.0]), normal)

@@ -1,0 +1,221 @@
+"""``scene.points: grid``: as many points as the grid can use, and all Gaussians follow its nodes."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.solid import SolidScene
+from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.preview.picture import classify
+from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
+
+HALF = Box([0.0451, None, None], [None] * 3)
+
+
+def fine_flag():
+    cloud = FlagScene(spacing=0.02).generate()
+    cloud.opacities[::7] = -6.0  # some are faint
+    return cloud
+
+
+def both(make_scene, **settings):
+    return (make_scene(fine_flag(), dx=0.15, points=points, **settings) for points in ("gaussian", "grid"))
+
+
+@pytest.mark.parametrize("per_cell", [1, 2, 3])
+def test_mass_centre_volume_and_area_are_kept_by_few_points(per_cell, make_scene):
+    full, scene = both(make_scene, dtype=torch.float64, points_per_cell=per_cell)
+    assert torch.equal(scene.simulated, full.simulated)
+    assert scene.points.count < len(full.simulated) / 2 * (2 / per_cell) ** 2
+    for name in ("mass", "volume"):
+        torch.testing.assert_close(getattr(scene.points, name).sum(), getattr(full.points, name).sum())
+    centre = [(s.points.mass[:, None] * s.points.position).sum(0) / s.points.mass.sum() for s in (scene, full)]
+    torch.testing.assert_close(*centre, rtol=0, atol=1e-12)
+    torch.testing.assert_close(scene.patches.area, full.patches.area)
+    for k in range(scene.points.count):  # and by each group
+        own = scene.owner[: len(scene.simulated)] == k
+        torch.testing.assert_close(scene.points.mass[k], full.points.mass[own].sum())
+    everyone = torch.cat([scene.simulated, scene.carried]).sort().values
+    assert torch.equal(everyone, torch.arange(len(scene.model.means)))
+
+
+def test_groups_do_not_cross_borders(make_scene):
+    """Of materials, laws and the regions of pins and edits."""
+    stiff = MaterialRegion(HALF, E=9e4, law=NeoHookean())
+    edge, corner = Box([None] * 3, [0.031, None, None]), Box([None, None, 0.3051], [None] * 3)
+    scene = SimulatedScene(
+        Scene(generator=FlagScene(spacing=0.02)), Material(regions=[stiff]), 0.15, apart=(edge, corner)
+    )
+    means = scene.model.means[scene.simulated]
+    for region in (HALF, edge, corner):
+        inside = region.contains(means)
+        assert bool(inside.any())
+        of_points = region.contains(scene.frame.point_to_scene(scene.points.position.double()))
+        assert torch.equal(of_points[scene.owner], inside)
+    assert torch.equal(scene.points.youngs_modulus[scene.owner] == 9e4, HALF.contains(means))
+    assert torch.equal(scene.points.law_index[scene.owner] == 1, HALF.contains(means))
+    plain = SimulatedScene(Scene(generator=FlagScene(spacing=0.02)), Material(), 0.15)
+    assert scene.points.count > plain.points.count
+
+
+def test_a_group_whose_centre_leaves_its_region_is_not_made(make_scene):
+    """What lies around a thin region would have its centre in it."""
+    ring = Box([None, None, -0.005], [None, None, 0.005])
+    scene = SimulatedScene(Scene(generator=FlagScene(spacing=0.01)), Material(), 0.3, apart=(ring,))
+    inside = ring.contains(scene.frame.point_to_scene(scene.points.position.double()))[scene.owner]
+    assert torch.equal(inside, ring.contains(scene.model.means))
+
+
+def test_regions_of_pins_and_edits_reach_the_scene(make_simulation):
+    edit = Edit(region=HALF, E=1e4)
+    simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": "grid"}, parts={"edits": [edit]})
+    scene = simulation.scene
+    own = scene.owner[: len(scene.simulated)]
+    for region in (HALF, simulation.solver.boundaries[0].region):
+        inside = region.contains(scene.frame.point_to_scene(scene.points.position.double()))
+        assert torch.equal(inside[own], region.contains(scene.model.means[scene.simulated]))
+
+
+def test_everything_follows_a_linear_motion_and_stays_at_rest(make_scene):
+    """A linear field of the nodes takes every Gaussian, faint ones too, where it takes its place."""
+    scene = make_scene(fine_flag(), dx=0.15, points="grid", up=[0.0, -1.0, 0.0], metres_per_unit=0.5)
+    state = MPMSolver(dx=0.15).init_state(scene.points)
+    assert torch.equal(scene.deformed(state).means, scene.rest().means)
+    assert torch.equal(scene.surface(state)[0], scene.track.place)
+    F = torch.tensor([[1.1, 0.2, 0.0], [0.0, 0.9, 0.3], [-0.1, 0.0, 1.0]])
+    nodes = state.grid.node_positions(F)
+    moved = state.replace(node_displacement=nodes @ F.T - nodes, node_velocity=nodes)
+    found = scene.deformed(moved)
+    expected = scene.frame.point_to_scene(scene.frame.point_to_sim(scene.model.means.double()) @ F.double().T)
+    torch.testing.assert_close(found.means.double(), expected, atol=1e-5, rtol=0)
+    turn = scene.frame.gradient_to_scene(F)
+    torch.testing.assert_close(found.covariances, turn @ scene.rest_covariances @ turn.T, atol=1e-7, rtol=1e-4)
+    torch.testing.assert_close(scene.surface(moved)[0], scene.track.place @ F.T, atol=1e-5, rtol=0)
+    torch.testing.assert_close(scene.follow.velocity(moved), scene.follow.place, atol=1e-5, rtol=0)
+
+
+def test_no_gaussian_follows_a_node_without_mass(make_cloud):
+    """A random cloud of very unequal masses: wherever the material goes, all of it goes."""
+    cloud = make_cloud(3000)
+    cloud = dataclasses.replace(cloud, scales=cloud.scales - 4 * torch.rand(3000, 1))
+    dx = 0.11
+    scene = SimulatedScene(Scene(generator=Given(cloud), points="grid"), Material(), dx)
+    solver = MPMSolver(dx=dx)
+    state = solver.init_state(scene.points)
+    shift = torch.where(solver.bound.node_mass[:, None] > 0, torch.tensor([0.3, -0.2, 0.1]), 0.0)
+    moved = scene.deformed(state.replace(node_displacement=shift)).means - scene.rest().means
+    torch.testing.assert_close(moved, torch.tensor([0.3, -0.2, 0.1]).expand_as(moved), rtol=0, atol=1e-5)
+
+
+class Given(FlagScene):
+    def __init__(self, cloud):
+        self.cloud = cloud
+
+    def generate(self):
+        return self.cloud
+
+
+def test_it_moves_as_with_all_points(make_simulation):
+    """A flag of 11 points a cell: half a second of wind, within a tenth of the distance moved."""
+    ends = {}
+    for points in ("gaussian", "grid"):
+        simulation = make_simulation(cloud=FlagScene(spacing=0.03).generate(), dx=0.2, scene={"points": points})
+        with torch.inference_mode():
+            state = simulation.start()
+            for _ in range(12):
+                state, _ = simulation.advance(state)
+            ends[points] = simulation.scene.deformed(state).means - simulation.scene.rest().means
+    moved = ends["gaussian"].norm(dim=-1)
+    assert float(moved.max()) > 0.1
+    assert float((ends["grid"] - ends["gaussian"]).norm(dim=-1).mean()) < 0.1 * float(moved.mean())
+
+
+def test_holes_get_further_points(make_scene):
+    """Gaussians three cells apart, each as wide: without further points they would hang on nothing."""
+    few = FlagScene(spacing=0.3).generate()
+    scene = make_scene(few, dx=0.1, points="grid")
+    assert scene.further > 50
+    where = scene.points.position[:, ::2]
+    inner = torch.cartesian_prod(torch.linspace(-0.4, 0.4, 30), torch.linspace(-0.2, 0.2, 20))
+    assert float(torch.cdist(inner, where).amin(1).max()) < 0.1  # no cell of the flag is empty
+    dense = make_scene(FlagScene(spacing=0.04).generate(), dx=0.1, points="grid")
+    assert dense.further == 0
+    assert make_scene(few, dx=0.1, points="grid", particle_spacing=0.02).further > 2 * scene.further
+
+
+def test_three_layers_share_the_normal_of_their_group(make_scene):
+    """The faces lie on both sides of the middle plane, though the normals of the Gaussians have any sign."""
+    cloud = FlagScene(spacing=0.02, ripple=0.0).generate()
+    half = math.pi * (torch.arange(len(cloud)) % 2)  # half of them turned upside down about x
+    w, x, y, z = cloud.quats.unbind(-1)
+    c, s = (half / 2).cos(), (half / 2).sin()
+    turned = torch.stack([w * c - x * s, w * s + x * c, y * c + z * s, z * c - y * s], -1)
+    cloud = dataclasses.replace(cloud, quats=turned)
+    scene = make_scene(cloud, Material(thickness=0.02), dx=0.15, points="grid", layers=3)
+    assert float(scene.rest_normals[0] @ scene.rest_normals[1]) < -0.99
+    count = scene.on_surface
+    assert scene.points.count == 3 * count
+    height = scene.points.position[count:, 1].abs()
+    torch.testing.assert_close(height, torch.full_like(height, 0.01), rtol=1e-3, atol=0)
+    torch.testing.assert_close(scene.points.volume[count:], scene.points.volume[:count].repeat(2) / 4)
+
+
+def test_a_solid_is_grouped_too():
+    """Surface and inside are never mixed, and mass and wind stay the same."""
+    settings = {
+        "generator": SolidScene(shape="ball", size=0.6, spacing=0.03, gaussians="shell"),
+        "filling": InteriorFilling(),
+    }
+    full, scene = (SimulatedScene(Scene(points=p, **settings), Material(), 0.12) for p in ("gaussian", "grid"))
+    assert scene.points.count < full.points.count / 2
+    assert 0 < scene.filled <= full.filled
+    torch.testing.assert_close(scene.points.mass.sum(), full.points.mass.sum())
+    torch.testing.assert_close(scene.patches.area, full.patches.area)
+    assert int(scene.patches.point.max()) < scene.on_surface
+
+
+def test_what_is_drawn_as_held_and_simulated_are_all_gaussians(make_simulation):
+    simulation = make_simulation(cloud=FlagScene(spacing=0.02).generate(), dx=0.2, scene={"points": "grid"})
+    parts = classify(simulation)
+    assert bool(parts.simulated.all())
+    assert not bool(parts.carried.any())
+    assert torch.equal(parts.pinned, simulation.scene.model.means[:, 0] <= 0.11)
+
+
+def test_the_force_is_known_for_every_gaussian(make_simulation):
+    """The picture of the wind's pressure does not depend on which points carry the material."""
+    found = {}
+    for points in ("gaussian", "grid"):
+        simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": points})
+        found[points] = simulation.wind_pressure(simulation.start())
+    torch.testing.assert_close(found["grid"], found["gaussian"])
+    assert float(found["grid"].amin()) > 0
+
+
+def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
+    cloud = FlagScene(spacing=0.03).generate()
+    for formulation, few in (("total", True), ("updated", False)):
+        simulation = make_simulation(cloud=cloud, scene={"points": None}, formulation=formulation)
+        assert (simulation.scene.points.count < len(cloud)) is few
+    with pytest.raises(ValueError, match=r"`scene.points: grid` needs `solver.formulation: total`"):
+        make_simulation(cloud=cloud, scene={"points": "grid"}, formulation="updated")
+    with pytest.raises(ValueError, match=r"`scene.points`"):
+        Scene(generator=FlagScene(), points="few")
+    with pytest.raises(ValueError, match=r"`scene.points_per_cell`"):
+        Scene(generator=FlagScene(), points_per_cell=0)
+
+
+def test_a_single_gaussian():
+    one = FlagScene(spacing=0.5).generate().select(torch.tensor([0]))
+    cloud = GaussianCloud(one.means, one.quats, one.scales - 3, one.opacities, one.sh)
+    scene = SimulatedScene(Scene(generator=Given(cloud)), Material(), 0.5)
+    assert scene.points.count == 1
+    assert torch.equal(scene.points.position.double(), scene.frame.point_to_sim(cloud.means.double()).float().double())
