@@ -350,7 +350,7 @@ class PointHolds:
                 clamp = kinds[k] == "clamp"
                 start, release = boundary.holds_from, release.detach()
                 parts.append(rows_at(place, corner, grid, massive, clamp, k, start, release))
-            scenes.append(Rows.join(parts))
+            scenes.append(Rows.join(parts[::-1]))  # of two boundaries at the same place the last one counts
         later = torch.cat([rows.start for rows in scenes])
         starts = sorted(set(later[later > 0].tolist()))
         kept, factors = [], []

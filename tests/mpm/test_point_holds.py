@@ -286,6 +286,30 @@ def test_a_handle_moves_its_points_exactly(kind):
         assert (float(error) < 1e-9) == (kind == "clamp")
 
 
+def test_of_two_boundaries_at_the_same_place_the_last_one_counts():
+    points = _sheet()
+    for boundaries, speed in (
+        ([PinnedRegion(TOP), Handle(TOP, [0, 1, 0])], 1.0),
+        ([Handle(TOP, [0, 1, 0]), PinnedRegion(TOP)], 0.0),
+    ):
+        solver = MPMSolver(DX, boundaries=boundaries)
+        state = _run(solver, points, 2)[-1]
+        found = _read(solver, _own_places(solver.bound.point_holds), state.node_velocity, state)[:, 0]
+        torch.testing.assert_close(found, torch.tensor([[0.0, speed, 0.0]], dtype=torch.float64).expand_as(found))
+
+
+def test_a_pin_that_opens_lets_go():
+    """Its window may change during a run, as that of a pin that holds nodes."""
+    pin = PinnedRegion(TOP)
+    solver = MPMSolver(DX, boundaries=[pin])
+    state = _run(solver, _sheet(), 5, every=5)[-1]
+    places = _own_places(solver.bound.point_holds)
+    pin.end = 0.0055
+    for _ in range(3):
+        state = solver.step(state, 1e-3)
+    assert bool((_read(solver, places, state.node_velocity, state)[:, 0, 2] < -0.015).all())
+
+
 def test_pins_act_within_their_windows():
     """One from the start, one for some time, one that starts later: three phases and two releases."""
     points = _sheet()
