@@ -149,6 +149,7 @@ _HOMES = {
         "GridSpec",
         "MPMState",
         "MaterialPoints",
+        "support_force",
     ),
     "rendering.cameras.camera": ("Camera",),
     "rendering.cameras.camera_path": (

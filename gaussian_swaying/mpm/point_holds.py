@@ -44,6 +44,9 @@ place, or a slope along a held line. The condition is then below 50 for hinges a
 any angle and for patches (tested).
 """
 
+LEAST_APART = 0.5
+"""Least distance between the points that a region holds [cells]: a strip up to one cell wide is a line of points."""
+
 _NO_WEIGHT = 1e-6  # of a node that a particle on the border of its cell does not reach
 
 
@@ -79,27 +82,42 @@ class Rows:
         return Rows(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Rows)))
 
 
-def centres(
-    position: Tensor, mass: Tensor, cell: Tensor, release: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The centre of mass of the particles of each cell.
+def means(values: Tensor, mass: Tensor, group: Tensor) -> Tensor:
+    """The mean of values (P, n) over each group, weighted with masses (P,); groups are numbered from 0, shape (P,)."""
+    weighted = torch.cat([mass[:, None] * values, mass[:, None]], dim=-1)
+    count = int(group.max()) + 1 if len(group) else 0
+    sums = weighted.new_zeros(count, weighted.shape[1]).index_add(0, group, weighted)
+    return sums[:, :-1] / sums[:, -1:]
+
+
+@torch.no_grad()
+def groups(position: Tensor, mass: Tensor, cell: Tensor, apart: float) -> Tensor:
+    """Group particles by cell, and join groups with close centres until all are some distance apart.
+
+    A strip or a sheet that is thinner than a cell may cross the border of two. Two rows so close together would hold
+    its slope; joined they are the line, or the middle plane, that is meant.
 
     Args:
-        position: Rest positions [m], shape (P, 3).
-        mass: Masses [kg], shape (P,), zero for particles that are not held.
-        cell: Flat index of the first node of the cell of each particle, shape (P,).
-        release: Time at which each particle is released [s], shape (P,), or None.
+        position: Positions [m], shape (P, 3).
+        mass: Masses [kg], shape (P,).
+        cell: A number for the cell of each, shape (P,).
+        apart: Least distance between centres [m].
 
     Returns:
-        First nodes (N,), centres (N, 3), and mean times of release (N,) or None.
+        The number of the group of each particle, shape (P,).
     """
-    some = (mass > 0).nonzero()[:, 0]
-    found, place = torch.unique(cell[some], return_inverse=True)
-    columns = [position[some]] if release is None else [position[some], release[some, None]]
-    weighted = mass[some, None] * torch.cat([*columns, torch.ones_like(mass[some, None])], dim=-1)
-    sums = weighted.new_zeros(len(found), weighted.shape[1]).index_add(0, place, weighted)
-    means = sums[:, :-1] / sums[:, -1:]
-    return found, means[:, :3], None if release is None else means[:, 3]
+    group = torch.unique(cell, return_inverse=True)[1]
+    while len(group):
+        centre = means(position, mass, group)
+        distance = torch.cdist(centre, centre, compute_mode="donot_use_mm_for_euclid_dist").fill_diagonal_(math.inf)
+        own = torch.arange(len(centre))
+        least, nearest = distance.min(-1)
+        # pairs that are nearest to each other; the first of equals, so that there always is one
+        pair = (nearest[nearest] == own) & (least < apart)
+        if not bool(pair.any()):
+            break
+        group = torch.unique(torch.where(pair, own.minimum(nearest), own)[group], return_inverse=True)[1]
+    return group
 
 
 def cells_of_places(place: Tensor, grid: GridSpec, massive: Tensor) -> Tensor:
@@ -319,14 +337,20 @@ class PointHolds:
                 else:
                     assert own is not None
                     mass = own.mass.reshape(-1, count)[s].cpu().double()
-                    when = None if own.release is None else own.release.reshape(-1, count)[s].cpu()
-                    corner, place, release = centres(points[s], mass, cell[s], when)
+                    some = (mass > 0).nonzero()[:, 0]
+                    group = groups(points[s][some], mass[some], cell[s][some], LEAST_APART * grid.dx)
+                    place = means(points[s][some], mass[some], group)
+                    corner = cells_of_places(place.detach(), grid, massive)
+                    release = None
+                    if own.release is not None:
+                        when = own.release.reshape(-1, count)[s, :, None].cpu()
+                        release = means(when[some], mass[some], group)[:, 0]
                 if release is None:
                     release = torch.full((len(corner),), boundary.end, dtype=torch.float64)
                 clamp = kinds[k] == "clamp"
                 start, release = boundary.holds_from, release.detach()
                 parts.append(rows_at(place, corner, grid, massive, clamp, k, start, release))
-            scenes.append(Rows.join(parts))
+            scenes.append(Rows.join(parts[::-1]))  # of two boundaries at the same place the last one counts
         later = torch.cat([rows.start for rows in scenes])
         starts = sorted(set(later[later > 0].tolist()))
         kept, factors = [], []

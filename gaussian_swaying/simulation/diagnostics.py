@@ -269,7 +269,7 @@ def measure(
 def _supports(before: MPMState, after: MPMState) -> Tensor:
     """Force on each boundary [N], summed over the scenes, float64, shape (3 * boundaries,)."""
     force = support_force(before, after)
-    return force.reshape(-1, *force.shape[-2:]).sum(0).reshape(-1)
+    return force.reshape(force.shape[:-2].numel(), *force.shape[-2:]).sum(0).reshape(-1)
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

@@ -15,12 +15,19 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.validation.settings import Axial, Result, Settings, block, fit_sinusoid, follow
 
 LENGTH, YOUNG, DENSITY = 25.0, 100.0, 1.0  # [m], [Pa], [kg/m³]: the vibrating bar of Buzzi et al. 2008, c = 10 m/s
 _CLAMP = 2  # cells of material inside a clamp: no stencil extends beyond it
+
+
+def wall_of(points: MaterialPoints, *places: float) -> PinnedPoints:
+    """Walls across a bar at some x [m]: a held place for each row of points along it."""
+    across = torch.unique(points.position[:, 1:], dim=0).tolist()
+    return PinnedPoints([[x, *row] for x in places for row in across])
 
 
 def vibrating_bar(
@@ -32,6 +39,7 @@ def vibrating_bar(
     periods: int = 4,
     strain: float = 0.1,
     shift: float = 0.0,
+    hold: str = "nodes",
 ) -> Result:
     r"""The lowest standing wave of a bar, started with its velocity.
 
@@ -43,23 +51,27 @@ def vibrating_bar(
     Args:
         cells: Cells along the bar.
         settings: The numerics.
-        ends: ``free``, ``fixed-free`` or ``fixed``; a fixed end is a :class:`PinnedRegion` of two cells beyond it.
+        ends: ``free``, ``fixed-free`` or ``fixed``.
         confined: Prevent all motion across the bar; needed unless ``poisson_ratio`` is 0.
         poisson_ratio: Poisson's ratio.
         periods: Number of periods to simulate.
         strain: Amplitude of the strain.
         shift: How far the bar is moved off the planes of the nodes [cells].
+        hold: A fixed end is a :class:`PinnedRegion` of two cells beyond it (``nodes``), or :class:`PinnedPoints` at it
+            (``points``).
 
     Returns:
         ``error`` (of the frequency, relative), ``frequency`` [Hz], ``loss`` (share of the amplitude lost per period),
         ``end_shift`` (by how many cells each fixed end appears farther out than it is) and the common quantities.
     """
     check_choice("ends", ends, ("free", "fixed-free", "fixed"))
+    check_choice("hold", hold, ("nodes", "points"))
     nu, dx = poisson_ratio, LENGTH / cells
     speed = math.sqrt(YOUNG * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / DENSITY)
     wave = math.pi / LENGTH / (2 if ends == "fixed-free" else 1)
     omega = wave * speed
-    first, last = -_CLAMP if ends != "free" else 0, cells + (_CLAMP if ends == "fixed" else 0)
+    beyond = _CLAMP if hold == "nodes" else 0
+    first, last = -beyond if ends != "free" else 0, cells + (beyond if ends == "fixed" else 0)
     across = 0 if confined else 1
     points = block(
         dx,
@@ -72,10 +84,13 @@ def vibrating_bar(
         shift=shift,
     )
     boundaries: list[Boundary] = [Axial((1, 2))] if confined else []
-    if ends != "free":
-        boundaries.append(PinnedRegion(Box([None] * 3, [shift * dx, None, None])))
-    if ends == "fixed":
-        boundaries.append(PinnedRegion(Box([LENGTH + shift * dx, None, None], [None] * 3)))
+    walls = [shift * dx, LENGTH + shift * dx][: {"free": 0, "fixed-free": 1, "fixed": 2}[ends]]
+    if hold == "points" and walls:
+        boundaries.append(wall_of(points, *walls))
+    else:
+        boxes = [Box([None] * 3, [walls[0], None, None])] if walls else []
+        boxes += [Box([walls[1], None, None], [None] * 3)] if len(walls) == 2 else []
+        boundaries += [PinnedRegion(box, "nodes") for box in boxes]
     rest = points.position[:, 0] - shift * dx
     inside = (rest > 0) & (rest < LENGTH)
     mode = torch.where(inside, torch.cos(wave * rest) if ends == "free" else torch.sin(wave * rest), 0.0)
@@ -116,7 +131,8 @@ def hanging_bar(
         cells: Cells along the bar.
         settings: The numerics.
         clamp: ``mirror`` pulls both halves of a bar of twice the length away from its middle, which is at rest by
-            symmetry: an ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end.
+            symmetry: an ideal clamp. ``pin`` is a :class:`PinnedRegion` of two cells beyond the end that holds nodes,
+            ``points`` are :class:`PinnedPoints` at the end.
         strain: Strain at the top, rho g L / E; twice the stretch of the bar as a whole.
         settle: Time to simulate, in units of 1 / circular frequency of the lowest mode.
         shift: How far the bar is moved off the planes of the nodes [cells].
@@ -127,10 +143,10 @@ def hanging_bar(
         farther up than it is), ``residual`` (speed of the tip, relative to its displacement and frequency) and the
         common quantities.
     """
-    check_choice("clamp", clamp, ("mirror", "pin"))
+    check_choice("clamp", clamp, ("mirror", "pin", "points"))
     dx, speed = LENGTH / cells, math.sqrt(YOUNG / DENSITY)
     gravity = strain * YOUNG / (DENSITY * LENGTH)
-    first = -cells if clamp == "mirror" else -_CLAMP
+    first = {"mirror": -cells, "pin": -_CLAMP, "points": 0}[clamp]
     points = block(
         dx,
         (first, 0, 0),
@@ -142,7 +158,12 @@ def hanging_bar(
         shift=shift,
     )
     omega = math.pi * speed / (2 * LENGTH)
-    pins: list[Boundary] = [] if clamp == "mirror" else [PinnedRegion(Box([None] * 3, [shift * dx, None, None]))]
+    wall = shift * dx
+    pins: list[Boundary] = []
+    if clamp == "pin":
+        pins.append(PinnedRegion(Box([None] * 3, [wall, None, None]), "nodes"))
+    elif clamp == "points":
+        pins.append(wall_of(points, wall))
     solver = settings.solver(dx, boundaries=pins, damping=2 * omega)
     along = points.position[:, 0] - shift * dx
     weight = torch.zeros_like(points.position)

@@ -107,7 +107,7 @@ def cantilever(
     )
     boundaries: list[Boundary] = [Axial((1,))]
     if clamp == "pin":
-        boundaries.append(PinnedRegion(Box([None] * 3, [0.0, None, None])))
+        boundaries.append(PinnedRegion(Box([None] * 3, [0.0, None, None]), "nodes"))
     # first root of the clamped-free beam: 1.875104² = 3.516015 (textbook)
     omega = 3.516015 / length**2 * math.sqrt(YOUNG / DENSITY * HEIGHT**2 / 12)
     solver = settings.solver(dx, boundaries=boundaries, damping=2 * omega)

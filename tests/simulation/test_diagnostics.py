@@ -6,11 +6,14 @@ import warnings
 import pytest
 import torch
 
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge, check_state, diagnose
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge, check_state, diagnose, entry_names
 
 
 def _solver(**settings):
@@ -57,7 +60,23 @@ def test_numbers_of_a_known_state():
     # c = sqrt(2 mu / rho) = 10 m/s, twice that in a cell stretched by 2, and 2 m/s of motion
     assert health.cfl == pytest.approx(1e-3 * (2 * 10.0 + 2.0) / 0.2)
     assert health.as_dict()["kinetic"] == health.kinetic
-    assert set(health.as_dict()) == set(health.__slots__ if hasattr(health, "__slots__") else vars(health))
+    assert list(health.as_dict()) == entry_names(0)
+
+
+def test_forces_on_supports(make_simulation):
+    """The momentum that each boundary took in the frame over its time; a plane far away takes none."""
+    pin, plane = PinnedRegion(Box([None, None, None], [0.11, None, None])), Plane([0, 0, -9], [0, 0, 1])
+    simulation = make_simulation(pinned=False, boundaries=[pin, plane])
+    before = simulation.start()
+    after, health = simulation.advance(before)
+    force = (after.impulse - before.impulse) / 0.04
+    torch.testing.assert_close(torch.tensor(health.support, dtype=torch.float64), force)
+    assert health.support[1] == (0.0, 0.0, 0.0)
+    assert health.support[0][2] < 0 < health.support[0][0]
+    row = health.as_dict()
+    assert list(row) == entry_names(2)
+    assert [row[f"support_0_{axis}"] for axis in "xyz"] == list(health.support[0])
+    assert diagnose(simulation.solver, before, 0, 0.0).support == ((0.0, 0.0, 0.0),) * 2
 
 
 def test_extremes_are_those_of_single_particles():

@@ -78,6 +78,20 @@ def test_pinned_end_in_updated_holds_all_that_it_touches():
     assert run["end_shift"] == pytest.approx(-0.75, abs=0.05)
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.45])
+def test_points_of_the_wall_hold_where_they_are(shift):
+    """Wherever the wall lies on the grid: within half a percent and of second order, without material beyond it."""
+    runs = [vibrating_bar(cells, TOTAL, ends="fixed-free", periods=2, shift=shift, hold="points") for cells in (8, 16)]
+    assert runs[1]["error"] < 0.002
+    assert runs[0]["error"] / runs[1]["error"] > 2**1.8
+    assert abs(runs[1]["end_shift"]) < 0.05
+    assert abs(runs[1]["loss"]) < 1e-4
+    run = hanging_bar(16, TOTAL, clamp="points", shift=shift)
+    assert run["error"] < 0.001
+    both = vibrating_bar(16, TOTAL, ends="fixed", periods=2, shift=shift, hold="points")
+    assert both["error"] < 0.01
+
+
 def test_hanging_bar_stretches_as_it_should():
     """Strain up to 0.3: the tip within 1 % at 32 cells, and second order."""
     runs = [hanging_bar(cells, TOTAL) for cells in (8, 16, 32)]

@@ -67,19 +67,26 @@ class Total(Formulation):
             held if held is None or self.kinds[k] != "nodes" else self._on_nodes(k, held)
             for k, held in enumerate(body.held)
         )
-        self._point_holds: PointHolds | None = None
-        self._windows: tuple[tuple[float, float], ...] = ()
-        assert self.point_holds is not None or all(kind == "nodes" for kind in self.kinds)
+        self._windows = self._point_windows()
+        self._point_holds = self._hold_points()
 
     @property
     def point_holds(self) -> PointHolds | None:
         """The points that boundaries hold, or None; made again if a boundary got another time window."""
-        pairs = zip(self.body.boundaries, self.kinds, strict=True)
-        windows = tuple((b.holds_from, b.end) for b, kind in pairs if kind != "nodes")
+        windows = self._point_windows()
         if windows != self._windows:
-            self._windows = windows
-            self._point_holds = PointHolds(self.body, self.kinds, self.stencil.first, self.grid, self.node_inverse_mass)
+            self._windows, self._point_holds = windows, self._hold_points()
         return self._point_holds
+
+    def _point_windows(self) -> tuple[tuple[float, float], ...]:
+        """The time windows of the boundaries that hold points [s]."""
+        pairs = zip(self.body.boundaries, self.kinds, strict=True)
+        return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind != "nodes")
+
+    def _hold_points(self) -> PointHolds | None:
+        if all(kind == "nodes" for kind in self.kinds):
+            return None
+        return PointHolds(self.body, self.kinds, self.stencil.first, self.grid, self.node_inverse_mass)
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:

@@ -121,8 +121,8 @@ def _held(region: dict[str, Any], take: Fields, space: Turned, notes: Notes) -> 
     velocity, window = space.vector(take.vector("velocity")), _window(take, required=True)
     notes.add(f"`enforce_particle_translation`: {_HOLDS}")
     if any(velocity):
-        return part("Handle", region=region, velocity=velocity, **window)
-    return part("PinnedRegion", region=region, **window)
+        return part("Handle", region=region, velocity=velocity, kind="nodes", **window)
+    return part("PinnedRegion", region=region, kind="nodes", **window)
 
 
 def _rotation(take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
@@ -137,13 +137,14 @@ def _rotation(take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
     window = _window(take, required=True)
     notes.add(f"`enforce_particle_velocity_rotation`: {_HOLDS}")
     if rate == 0 and speed == 0:
-        return part("PinnedRegion", region=region, **window)
+        return part("PinnedRegion", region=region, kind="nodes", **window)
     return part(
         "Handle",
         region=region,
         velocity=space.vector([speed * c for c in normal]),
         angular_velocity=space.vector([-rate * c for c in normal]),  # PhysGaussian turns clockwise about its normal
         pivot=list(point),
+        kind="nodes",
         **window,
     )
 
@@ -202,6 +203,7 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
     return part(
         "SequentialRelease",
         region=box(low, high),
+        kind="nodes",
         direction=direction,
         start=0.0,
         end=end,

@@ -112,6 +112,7 @@ def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int,
 {_comment(s.hold.reason, 4)}
     - class_path: PinnedRegion
       init_args:
+        kind: {_kind(s)}
         region: {json.dumps(region_dict(s.pin))}"""
     falls = s.sheet or s.pin is None
     gravity = "[0.0, 0.0, -9.8]" if falls else "[0.0, 0.0, 0.0] "
@@ -179,6 +180,15 @@ camera:
 recorder:
   trajectory: false             # positions of all particles in each frame
 """
+
+
+def _kind(s: Suggestion) -> str:
+    """What a pin holds, with the reason: the edge of a sheet is thin enough to turn about its points."""
+    if s.sheet:
+        return "hinge             # points: cloth turns where it is held; `updated` needs nodes"
+    return (
+        "nodes             # all of the grid in the region, which cannot turn; hinge: points, for the edge of a sheet"
+    )
 
 
 def _padded(text: str, width: int) -> str:

@@ -13,7 +13,7 @@ import torch
 
 from bench import record
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.validation import bars, beams, flags, plates, surfaces, vortex
+from gaussian_swaying.validation import bars, beams, flags, plates, strips, surfaces, vortex
 from gaussian_swaying.validation.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
 from gaussian_swaying.validation.granular.columns import column_collapse
 from gaussian_swaying.validation.granular.layers import angle_of_repose
@@ -27,6 +27,14 @@ VARIANTS = {
     "MLS": Settings(formulation="updated", mls=True),
 }
 SINGLE = {"total, float32": Settings(dtype=torch.float32)}
+
+
+def _bar_at_points(cells: int, settings: Settings) -> dict[str, float]:
+    return bars.vibrating_bar(cells, settings, ends="fixed-free", hold="points")
+
+
+def _hanging_at_points(cells: int, settings: Settings) -> dict[str, float]:
+    return bars.hanging_bar(cells, settings, clamp="points")
 
 
 def _plate(k: float, law: str, settings: Settings) -> dict[str, float]:
@@ -74,6 +82,14 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
         for clamp in ("mirror", "pin"):
             for cells in (8, 16, 32):
                 yield case("hanging bar", bars.hanging_bar, variant, cells=cells, clamp=clamp)
+    for variant in ("total", "total, float32"):
+        for cells in (8, 16, 32, 64):
+            yield case("bar held at points", _bar_at_points, variant, cells=cells)
+        for cells in (8, 16, 32):
+            yield case("hanging bar held at points", _hanging_at_points, variant, cells=cells)
+    for hold in ("hinge", "clamp", "nodes"):
+        for cells in (8, 16, 32):
+            yield case("hinged strip", strips.hinged_strip, "total", cells=cells, hold=hold)
     for variant in VARIANTS:
         for cells in (1, 2, 3, 4) if thorough else (1, 2):
             yield case("cantilever", beams.cantilever, variant, cells=cells, b=1.0)

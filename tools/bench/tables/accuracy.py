@@ -75,6 +75,8 @@ CONVERGENCE: dict[str, tuple[str, dict[str, str], dict[str, str]]] = {
     "accuracy.unconfined_bar": ("unconfined bar", _SHIFT, {}),
     "accuracy.hanging_bar": ("hanging bar", {}, {"clamp": "mirror"}),
     "accuracy.hanging_pinned_bar": ("hanging bar", _SHIFT, {"clamp": "pin"}),
+    "accuracy.bar_at_points": ("bar held at points", _LOSS | _SHIFT, {}),
+    "accuracy.hanging_bar_at_points": ("hanging bar held at points", _SHIFT, {}),
     "accuracy.vortex": ("vortex", {}, {}),
 }
 """Slots of the tables of convergence: problem, further columns, and parameters."""
@@ -101,6 +103,21 @@ def free_block(rows: list[Row]) -> list[str]:
             for row in select(rows, "free block")
         ],
     )
+
+
+@rows_table("accuracy.hinged_strip")
+def hinged_strip(rows: list[Row]) -> list[str]:
+    """The sag of a strip on hinges, and of strips that are held in other ways."""
+    shown = []
+    for hold in ("hinge", "clamp", "nodes"):
+        found = sorted(select(rows, "hinged strip", hold=hold), key=lambda row: row["parameters"]["cells"])
+        for k, row in enumerate(found):
+            observed = f"{order(found[k - 1], row):.2f}" if k and hold == "hinge" else ""
+            result = row["result"]
+            numbers = [f"{result['error']:.2e}", observed, f"{result['slope']:.4f}", _value(result["moment"])]
+            shown.append([f"`{hold}`", str(row["parameters"]["cells"]), *numbers])
+    names = ["slope at the end / exact", "error of the moment in the last cell / moment in the middle"]
+    return grid(["kind of the pins", "cells", "error of the sag", "order", *names], shown)
 
 
 @rows_table("accuracy.hinged_plate")

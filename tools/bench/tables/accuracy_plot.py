@@ -23,11 +23,12 @@ def _plot(rows: list[Row], path: Path) -> None:
 
     panels = {
         "confined bar (frequency)": ("vibrating bar", {"ends": "free"}),
-        "pinned bar (frequency)": ("vibrating bar", {"ends": "fixed-free"}),
+        "bar held at points (frequency)": ("bar held at points", {}),
+        "bar held by nodes (frequency)": ("vibrating bar", {"ends": "fixed-free"}),
         "hanging bar (tip)": ("hanging bar", {"clamp": "mirror"}),
         "vortex (displacement)": ("vortex", {}),
     }
-    figure, axes = plt.subplots(1, 4, figsize=(13, 3.4), layout="constrained")
+    figure, axes = plt.subplots(1, 5, figsize=(16, 3.4), layout="constrained")
     for axis, (title, (problem, parameters)) in zip(axes, panels.items(), strict=True):
         for variant, marker in zip((*VARIANTS, *SINGLE), "osd.", strict=True):
             found = sorted(select(rows, problem, variant=variant, **parameters), key=lambda r: r["parameters"]["cells"])
