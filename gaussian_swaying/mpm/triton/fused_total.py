@@ -187,7 +187,7 @@ class FusedTotal(Fused):
 
     def _hold_points(self, points: DenseHolds, offset: int) -> None:
         """Stop the held points: their velocities, then those of the nodes around them."""
-        rows, block = points.node.shape[1], 32
+        rows, block = points.node.shape[1], 4
         kernels.total_rows[(-(-rows // block),)](
             points.node, points.weight, rows, self.fields, self.residual, BLOCK=block, num_warps=1
         )

@@ -274,15 +274,14 @@ def total_rows(node, weight, rows, fields, residual, BLOCK: tl.constexpr):
     """``total``: velocities of the held points, and their sums since the start of the rollout."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < rows
-    r0 = tl.zeros([BLOCK], tl.float32)
-    r1 = tl.zeros([BLOCK], tl.float32)
-    r2 = tl.zeros([BLOCK], tl.float32)
-    for o in range(27):
-        place = fields + tl.load(node + o * rows + k, mask, 0) * 8 + 4
-        w = tl.load(weight + o * rows + k, mask, 0.0)
-        r0 += w * tl.load(place, mask, 0.0)
-        r1 += w * tl.load(place + 1, mask, 0.0)
-        r2 += w * tl.load(place + 2, mask, 0.0)
+    o = tl.arange(0, 32)[None, :]  # all 27 at once: one after the other would wait 27 times for the memory
+    each = o * rows + k[:, None]
+    known = mask[:, None] & (o < 27)
+    place = fields + tl.load(node + each, known, 0) * 8 + 4
+    w = tl.load(weight + each, known, 0.0)
+    r0 = tl.sum(w * tl.load(place, known, 0.0), 1)
+    r1 = tl.sum(w * tl.load(place + 1, known, 0.0), 1)
+    r2 = tl.sum(w * tl.load(place + 2, known, 0.0), 1)
     out = residual + k * 4
     tl.store(out, r0, mask)
     tl.store(out + 1, r1, mask)
