@@ -5,6 +5,7 @@
 ``python tools/bench.py sim``        the main job end to end; writes docs/results/sim_<device>.json
 ``python tools/bench.py accuracy``   errors against exact solutions; writes docs/results/accuracy_<device>.json
 ``python tools/bench.py pareto``     speed against error; writes docs/results/pareto_<device>.json
+``python tools/bench.py points``     error and time against points per cell; writes docs/results/points_<device>.json
 ``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
 ``python tools/bench.py train``      training on a capture and a generated flag; writes docs/results/train_cuda.json
 ``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json

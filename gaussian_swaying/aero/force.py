@@ -185,6 +185,12 @@ class AeroForce(nn.Module):
         """Whether the force is zero in any wind, so that it need not be computed."""
         return self.air_density == 0 or not any(float(c) for c in (self.C_D, self.C_F, self.C_L))
 
+    @property
+    def mostly_linear(self) -> bool:
+        """Whether less than a tenth of the force depends on the side of the patch that the flow meets."""
+        sided = float(self.C_L.abs()) / max(float(self.C_D + self.C_F + self.C_L.abs()), 1e-30)
+        return self.law == "projected" and not self.unit_tangent and sided < 0.1
+
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
         """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component."""
         coefficient = (self.C_D + self.C_F + self.C_L.abs()).to(speed.dtype)
@@ -238,7 +244,7 @@ class AeroForce(nn.Module):
     def on_groups(
         self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums
     ) -> tuple[Tensor, Tensor]:
-        """:func:`~gaussian_swaying.aero.patches.grouped_force` with these coefficients: force [N] (P, 3), area [m²] (P,)."""
+        """The result of :func:`~gaussian_swaying.aero.patches.grouped_force` with the numbers of this component."""
         return grouped_force(
             wind,
             velocity,

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import cross3, dot3
+from gaussian_swaying.geometry.linalg_triton import cofactor, cross3, dot3, load3
 from gaussian_swaying.geometry.patches_triton import deform_patch
 
 
@@ -71,4 +71,116 @@ def wind_force(F, velocity, patch, wind, numbers, OPTIONS: tl.constexpr):
         resistance = half_density * area * (drag + friction + tl.abs(lift)) * speed
     else:
         resistance = area * 0
+    return force, resistance
+
+
+@triton.jit
+def _times(a, x):
+    """A matrix in nine parts times a vector."""
+    return (
+        a[0] * x[0] + a[1] * x[1] + a[2] * x[2],
+        a[3] * x[0] + a[4] * x[1] + a[5] * x[2],
+        a[6] * x[0] + a[7] * x[1] + a[8] * x[2],
+    )
+
+
+@triton.jit
+def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
+    """Triton twin of ``WindForce`` on groups of patches; the reference is ``aero.patches.grouped_force``.
+
+    ``place``: first row in the table of ``PatchSums`` and number of vectors there. ``numbers`` and ``OPTIONS`` as in
+    :func:`wind_force`, and the table after eight numbers.
+    """
+    first = 8 + 4 * place[0].to(tl.int32)
+    count = place[1].to(tl.int32)
+    real = count > 0
+    relative = (
+        tl.load(wind) - velocity[0],
+        tl.load(wind + 1) - velocity[1],
+        tl.load(wind + 2) - velocity[2],
+    )
+    drag = tl.load(numbers)
+    friction = tl.load(numbers + 1)
+    lift = tl.load(numbers + 2)
+    half_density = tl.load(numbers + 3)
+    widest = tl.load(numbers + 4)
+    speed = tl.sqrt(dot3(relative, relative))
+    c = cofactor(F)
+    w = (
+        c[0] * relative[0] + c[3] * relative[1] + c[6] * relative[2],
+        c[1] * relative[0] + c[4] * relative[1] + c[7] * relative[2],
+        c[2] * relative[0] + c[5] * relative[1] + c[8] * relative[2],
+    )
+    t0 = tl.load(numbers + first, real, 0.0)
+    t1 = tl.load(numbers + first + 1, real, 0.0)
+    t2 = tl.load(numbers + first + 2, real, 0.0)
+    t3 = tl.load(numbers + first + 3, real, 0.0)
+    t4 = tl.load(numbers + first + 4, real, 0.0)
+    t5 = tl.load(numbers + first + 5, real, 0.0)
+    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
+    rest = t0 + t3 + t5
+    r0 = _times(tensor, (c[0], c[1], c[2]))
+    r1 = _times(tensor, (c[3], c[4], c[5]))
+    r2 = _times(tensor, (c[6], c[7], c[8]))
+    grown = c[0] * r0[0] + c[1] * r0[1] + c[2] * r0[2]
+    grown += c[3] * r1[0] + c[4] * r1[1] + c[5] * r1[2]
+    grown += c[6] * r2[0] + c[7] * r2[1] + c[8] * r2[2]
+    growth = tl.sqrt(tl.maximum(grown / tl.maximum(rest, 1.2e-38), 1.2e-38))
+    across = _times(c, _times(tensor, w))
+    across = (across[0] / growth, across[1] / growth, across[2] / growth)
+    zero = rest * 0
+    s0, s1, s2, u0, u1, u2 = zero, zero, zero, zero, zero, zero
+    for k in range(0, tl.max(count)):
+        b = load3(numbers, 1, first + 8 + 4 * k, k < count)
+        along = dot3(b, w)
+        sign = tl.where(along < 0, -1.0, 1.0)
+        s0 += sign * b[0]
+        s1 += sign * b[1]
+        s2 += sign * b[2]
+        if OPTIONS[2]:
+            squared = tl.maximum(dot3(b, b), 1.2e-38)
+            share = along / squared
+            x0 = w[0] - share * b[0]
+            x1 = w[1] - share * b[1]
+            x2 = w[2] - share * b[2]
+            scale = tl.sqrt(squared) / tl.maximum(tl.sqrt(x0 * x0 + x1 * x1 + x2 * x2), 1.2e-38)
+            scale = tl.where(k < count, scale, 0.0)
+            u0 += scale * x0
+            u1 += scale * x1
+            u2 += scale * x2
+    facing = _times(c, (s0, s1, s2))
+    area = growth * rest
+    if OPTIONS[0]:
+        pressure = (drag * speed * across[0], drag * speed * across[1], drag * speed * across[2])
+    else:
+        square = drag * speed * speed
+        pressure = (square * facing[0], square * facing[1], square * facing[2])
+    if OPTIONS[2]:
+        tangent = _times(c, (u0, u1, u2))
+        square = friction * speed * speed
+        shear = (square * tangent[0], square * tangent[1], square * tangent[2])
+    else:
+        rub = friction * speed
+        shear = (
+            rub * (area * relative[0] - across[0]),
+            rub * (area * relative[1] - across[1]),
+            rub * (area * relative[2] - across[2]),
+        )
+    side = cross3(relative, facing)
+    if OPTIONS[1]:
+        side = cross3(side, relative)
+        lifting = lift + zero
+    else:
+        lifting = lift * speed
+    cap = tl.minimum(widest / growth, 1.0)
+    scale = tl.where(real, half_density * cap, 0.0)
+    force = (
+        scale * (pressure[0] + shear[0] + lifting * side[0]),
+        scale * (pressure[1] + shear[1] + lifting * side[1]),
+        scale * (pressure[2] + shear[2] + lifting * side[2]),
+    )
+    if OPTIONS[3]:
+        resistance = scale * area * (drag + friction + tl.abs(lift)) * speed
+    else:
+        resistance = zero
     return force, resistance

@@ -31,6 +31,9 @@ MOST = 75
 
 _ANGLES = (0.003, 0.01, 0.03, 0.1, 0.25, 0.5)  # [rad] of the cells of directions; the coarsest make 3 x 5 x 5 of them
 
+_COARSE = 0.25
+"""Smallest cell of directions [rad] where the sum of signs is a small part of the force."""
+
 
 class Patches(nn.Module):
     """Surface patches that feel the wind, and the material points that they belong to.
@@ -65,6 +68,8 @@ class PatchSums(nn.Module):
 
     Args:
         patches: The patches.
+        coarse: Whether directions up to 14 degrees apart may be joined: for the projected law, where only the lift
+            depends on the sum of signs.
 
     Attributes:
         tensor: Sum of A N N^T [m²], shape (P, 3, 3).
@@ -73,7 +78,7 @@ class PatchSums(nn.Module):
         single: Whether no point has patches of more than one direction.
     """
 
-    def __init__(self, patches: Patches) -> None:
+    def __init__(self, patches: Patches, coarse: bool = False) -> None:
         super().__init__()
         with torch.no_grad():
             normal, area = patches.normal.double(), patches.area.double()
@@ -81,7 +86,7 @@ class PatchSums(nn.Module):
             point = torch.cat([patches.point.cpu(), whole])  # so that every point has a sum
             weighted = area[:, None, None] * normal[:, :, None] * normal[:, None, :]
             tensor = sums(torch.cat([weighted.cpu(), weighted.new_zeros(patches.count, 3, 3).cpu()]), point)
-            vector, owner = joined_directions(normal.cpu(), area.cpu(), patches.point.cpu(), tensor)
+            vector, owner = joined_directions(normal.cpu(), area.cpu(), patches.point.cpu(), tensor, coarse)
         like = patches.area
         self.register_buffer("tensor", tensor.to(like), persistent=False)
         self.register_buffer("vector", vector.to(like), persistent=False)
@@ -96,13 +101,35 @@ class PatchSums(nn.Module):
         """Area of the patches of each point at rest [m²], shape (P,)."""
         return self.tensor.diagonal(dim1=-2, dim2=-1).sum(-1)
 
+    @property
+    def rows(self) -> int:
+        """Length of the :meth:`table` in rows of four numbers."""
+        return len(self.vector) + 2 * len(self.tensor)
+
+    def lists(self) -> Tensor:
+        """First row of each point in the :meth:`table`, and its number of vectors, shape (P, 2)."""
+        count = self.point.bincount(minlength=len(self.tensor))
+        first = count.cumsum(0) - count + 2 * torch.arange(len(count), device=count.device)
+        return torch.stack([first, count], -1).to(self.tensor)
+
+    def table(self) -> Tensor:
+        """For each point two rows with the six numbers of its tensor, and a row for each vector; shape (4 rows,)."""
+        first = self.lists()[:, 0].long()
+        found = self.tensor.new_zeros(self.rows, 4)
+        upper = self.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        found[first], found[first + 1, :2] = upper[:, :4], upper[:, 4:]
+        found[torch.arange(len(self.point), device=first.device) + 2 * (self.point + 1), :3] = self.vector
+        return found.reshape(-1)
+
     def normals(self) -> Tensor:
         """Unit normal of each point, if it has patches of one direction, shape (P, 3); z where it has none."""
         normal = self.tensor.new_tensor([0.0, 0.0, 1.0]).repeat(len(self.tensor), 1)
         return normal.index_copy(0, self.point, torch.nn.functional.normalize(self.vector, dim=-1))
 
 
-def joined_directions(normal: Tensor, area: Tensor, point: Tensor, tensor: Tensor) -> tuple[Tensor, Tensor]:
+def joined_directions(
+    normal: Tensor, area: Tensor, point: Tensor, tensor: Tensor, coarse: bool = False
+) -> tuple[Tensor, Tensor]:
     """Area vectors of the patches of each point, joined where the directions are alike.
 
     Directions are sorted into cells of 0.003 rad around the main direction of the point, or of more until at most
@@ -113,6 +140,7 @@ def joined_directions(normal: Tensor, area: Tensor, point: Tensor, tensor: Tenso
         area: Areas, shape (Q,).
         point: The point of each, shape (Q,).
         tensor: Sum of A N N^T of each point, shape (P, 3, 3).
+        coarse: Start with cells of 0.25 rad.
 
     Returns:
         Vectors as long as the sum of their areas, shape (V, 3), and their points, ascending, shape (V,).
@@ -124,7 +152,7 @@ def joined_directions(normal: Tensor, area: Tensor, point: Tensor, tensor: Tenso
     on_face = local * sign / local.gather(-1, major).abs()
     pending = torch.arange(len(point))
     cell = torch.zeros(len(point), 5, dtype=torch.long)
-    for level, angle in enumerate(_ANGLES):
+    for level, angle in enumerate(angle for angle in _ANGLES if not coarse or angle >= _COARSE):
         rows = torch.cat([(on_face[pending] / angle).round().long(), major[pending]], -1)
         cell[pending] = torch.cat([rows, torch.full_like(rows[:, :1], level)], -1)
         used = torch.unique(torch.cat([point[pending, None], rows], -1), dim=0)[:, 0].bincount(minlength=len(tensor))

@@ -54,7 +54,7 @@ class WindForce(Force):
         super().__init__()
         self.sums: PatchSums | None = None
         if isinstance(normal, Patches):
-            found = PatchSums(normal)
+            found = PatchSums(normal, coarse=aero.mostly_linear)
             self.sums = None if found.single else found
             normal, area = found.normals(), found.area
         if area is None:
@@ -213,16 +213,27 @@ class WindForce(Force):
 
     @property
     def has_twin(self) -> bool:
-        """Whether the kernels can compute the force: only if the wind is uniform."""
-        return self.uniform
+        """Whether the kernels can compute the force: only if the wind is uniform, and the lists are not too long."""
+        return self.uniform and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
 
     def twin(self) -> ForceTwin:
         """See ``Force.twin``; for a uniform wind only."""
-        from gaussian_swaying.aero.force_triton import wind_force
+        from gaussian_swaying.aero.force_triton import wind_force, wind_on_groups
 
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
         half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
+        if self.sums is not None:
+            return ForceTwin(
+                function=wind_on_groups,
+                options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
+                implicit=implicit,
+                sources=(self.sums.tensor, self.sums.vector),
+                values=self.sums.lists,
+                numbers=torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest]),
+                vectors=self.winds,
+                table=self.sums.table,
+            )
         return ForceTwin(
             function=wind_force,
             options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),

@@ -31,8 +31,7 @@ def grid_groups(
     """Group points for a grid: those in the same cube of side ``dx / per_cell``, with the same label, on one sheet.
 
     Cubes are parts of the cells whose points share their 27 nodes in a quadratic B-spline. So the centre of a group
-    touches the same nodes as its points, and no point follows a node without mass. Two points per cell and direction
-    integrate the square of a linear function, the strain of such a cell, to a quarter of its smallest term.
+    touches the same nodes as its points, and no point follows a node without mass.
 
     Sheets that lie close to each other in a cube stay apart: a group whose normals agree is split in two if the points
     spread across the sheet as those of two sheets do that are 0.24 cells apart.

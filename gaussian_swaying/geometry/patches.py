@@ -139,6 +139,11 @@ def deform_all(
     return drawn, deform_normal(deformation_gradient, normals), turns
 
 
+def compiles() -> bool:
+    """Whether kernels can be compiled on this machine's GPU."""
+    return _kernels() is not None
+
+
 @functools.cache
 def _kernels() -> ModuleType | None:
     """The kernels, if triton is installed and finds a compiler; tested on one patch."""

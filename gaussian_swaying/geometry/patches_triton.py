@@ -62,14 +62,11 @@ def _limited(drawn, rest, turn, solid, square):
 
 
 @triton.jit
-def _deform(
-    F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, count,
-    TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr,
+def deform_and_store(
+    f, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask,
+    TURN: tl.constexpr, LIMIT: tl.constexpr,
 ):  # fmt: skip
-    """One patch per lane."""
-    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = index < count
-    f = load9(F, 1, 9 * index, mask)
+    """Covariance, normal and rotation of some patches after a deformation ``f``, as ``patches.deform_all``."""
     a = load9(covariance, 1, 9 * index, mask)
     drawn = matmul(matmul(f, a), transpose(f))
     if LIMIT:
@@ -87,6 +84,20 @@ def _deform(
     store3(normal_out, 1, 3 * index, (v[0] / size, v[1] / size, v[2] / size), mask)
     if TURN:
         store9(rotation_out, 1, 9 * index, polar_rotation(f), mask)
+
+
+@triton.jit
+def _deform(
+    F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, count,
+    TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One patch per lane."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    f = load9(F, 1, 9 * index, mask)
+    deform_and_store(
+        f, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask, TURN, LIMIT
+    )
 
 
 def deform_all(

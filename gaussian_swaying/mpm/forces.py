@@ -18,7 +18,7 @@ MOST_STEPS = 256
 """Largest number of substeps for which a :class:`ForceTwin` computes its vectors at once."""
 
 TWIN_VALUES, TWIN_NUMBERS = 4, 8
-"""Largest number of values per particle, and of shared numbers, in a :class:`ForceTwin`."""
+"""Largest number of values per particle, and of shared numbers before the table, in a :class:`ForceTwin`."""
 
 Given = Tensor | tuple[Tensor, Tensor | None]
 """A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
@@ -42,6 +42,8 @@ class ForceTwin:
             or changed in place.
         values: Returns up to four numbers for each particle, shape (..., P, n).
         numbers: Up to eight numbers, shape (n,).
+        table: Returns more numbers, shape (m,), float32, which follow eight places after the first of ``numbers``, such
+            as lists that the values point to; called when ``values`` is. None for none.
         vectors: ``vectors(time, dt, steps)`` returns what depends only on time: a vector for the start of each of
             ``steps`` (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3),
             or (steps, B, 1, 3) for a batch of scenes.
@@ -54,6 +56,7 @@ class ForceTwin:
     values: Callable[[], Tensor]
     numbers: Tensor
     vectors: Callable[[Tensor, Tensor, int], Tensor]
+    table: Callable[[], Tensor] | None = None
 
 
 class Force(Recordable, nn.Module, ABC):

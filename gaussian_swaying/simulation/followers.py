@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.patches import compiles
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 
@@ -88,6 +90,47 @@ class GridFollowers(Followers):
     def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
         rows = gather(_nodal(state.node_displacement), self.stencil(state.grid))
         return rows[..., 0, :], rows[..., 1:4, :].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
+
+    def drawn(
+        self,
+        state: MPMState,
+        frame: SimFrame,
+        means: Tensor,
+        covariances: Tensor,
+        normals: Tensor,
+        rotations: bool,
+        max_stretch: float | None,
+        solid: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None] | None:
+        """Means, covariances, normals and rotations in scene units, in one kernel; None where it cannot run.
+
+        The definition is :meth:`~Followers.motion` with :func:`~gaussian_swaying.geometry.patches.deform_all`. The
+        kernel runs on a GPU in float32, without gradients.
+        """
+        displacement = _nodal(state.node_displacement)
+        given = (displacement, means, covariances, normals, self.place)
+        wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
+        single = all(tensor.dtype == torch.float32 for tensor in given)
+        if not displacement.is_cuda or not single or wanted or not compiles():
+            return None
+        from gaussian_swaying.simulation.followers_triton import follow
+
+        _, ny, nz = state.grid.resolution
+        return follow(
+            displacement,
+            self.stencil(state.grid),
+            (ny * nz, nz),
+            state.grid.dx,
+            self.arm,
+            frame.direction_to_sim(torch.eye(3, device=means.device)).mT,
+            1 / frame.metres_per_unit,
+            means,
+            covariances,
+            normals,
+            rotations,
+            max_stretch,
+            solid,
+        )
 
     def velocity(self, state: MPMState) -> Tensor:
         """Velocity of the material [m/s], shape (M, 3)."""

@@ -159,7 +159,7 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 def grouped(
     samples: Samples, dx: float, per_cell: int, apart: Sequence[Region], frame: SimFrame, dtype: torch.dtype
 ) -> tuple[Samples, Tensor]:
-    """Samples for a grid: one for each group, at its centre of mass, with the sums of masses, volumes and areas.
+    """Samples for a grid: one or a few for each group, which keep its mass, centre of mass and volume.
 
     A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not, or
     the two sides of the border of a region in ``apart``.
@@ -167,53 +167,109 @@ def grouped(
     Args:
         samples: The samples.
         dx: Grid spacing [m].
-        per_cell: As in :func:`~gaussian_swaying.gaussians.grouping.grid_groups`.
+        per_cell: Points along the side of a cell. An even number makes groups of twice that size, see
+            :func:`matched_points`.
         apart: Regions in scene units: those of pins and edits.
         frame: Conversion from scene units to metres.
         dtype: Precision of the solver.
 
     Returns:
-        The groups as samples, those on the surface first, and the group of each sample, shape (N,).
+        The points as samples, those on the surface first, and the point that each sample belongs to, shape (N,).
     """
     kinds = torch.stack([getattr(samples, name) for name in _PROPERTIES], -1)
     kind = torch.unique(kinds, dim=0, return_inverse=True)[1]
     where = frame.point_to_scene(samples.position)
     masks = [region.contains(where) for region in apart]
     label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks], -1).long()
-    place = samples.position.to(dtype)
-    group = grid_groups(place, dx, per_cell, samples.mass, samples.normal, label)
-    found = _joined(samples, group, dx, dtype)
-    centre = frame.point_to_scene(found.position)
-    astray = torch.zeros(len(centre), dtype=torch.bool)
-    for region, mask in zip(apart, masks, strict=True):
-        astray |= region.contains(centre) != torch.zeros_like(astray).index_put((group,), mask)
-    if bool(astray.any()):  # a centre across a border: these samples stay alone
-        alone = astray[group]
-        group = torch.where(alone, len(centre) + torch.arange(len(group)), group)
-    group = torch.unique(group + (~samples.surface) * 2 * len(group), return_inverse=True)[1]
-    return _joined(samples, group, dx, dtype), group
+    matched = per_cell % 2 == 0
+    cubes = per_cell // 2 if matched else per_cell
+    group = grid_groups(samples.position.to(dtype), dx, cubes, samples.mass, samples.normal, label)
+    parts = torch.full((int(group.max()) + 1,), 3 if matched else 0)  # along how many directions a group is divided
+    while True:
+        points, owner, of = _points_of(samples, group, parts, 0.05 * dx / cubes)
+        astray = torch.zeros(len(points.position), dtype=torch.bool)
+        centre = frame.point_to_scene(points.position)
+        for region, mask in zip(apart, masks, strict=True):
+            own = torch.zeros(len(parts), dtype=torch.bool).index_put((group,), mask)
+            astray |= region.contains(centre) != own[of]
+        if not bool(astray.any()):
+            break
+        wrong = torch.zeros(len(parts), dtype=torch.bool).index_put((of[astray],), torch.tensor(True))
+        if bool((parts[wrong] == 0).any()):  # even its centre lies across a border: the samples stay alone
+            alone = (wrong & (parts == 0))[group]
+            new = torch.where(alone, len(parts) + torch.arange(len(group)), group)
+            kept, group = torch.unique(new, return_inverse=True)
+            parts = torch.cat([parts, torch.zeros(len(new), dtype=torch.long)])[kept]
+        else:
+            parts[wrong] = 0
+    order = (~points.surface).long().argsort(stable=True)
+    rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
+    return points.choose(order), rank[owner]
 
 
-def _joined(samples: Samples, group: Tensor, dx: float, dtype: torch.dtype) -> Samples:
-    """One sample for each group, whose normal is the main direction of its normals."""
+def _points_of(samples: Samples, group: Tensor, parts: Tensor, smallest: float) -> tuple[Samples, Tensor, Tensor]:
+    """The points of all groups, the point of each sample, (N,), and the group of each point."""
     mass = samples.mass
-    centre = sums(mass[:, None] * samples.position, group) / sums(mass, group)[:, None]
-    first = torch.full((len(centre),), len(group)).scatter_reduce_(0, group, torch.arange(len(group)), "amin")
-    alone = group.bincount() == 1
-    centre = torch.where(
-        alone[:, None], samples.position[first], _within_cell(centre, samples.position[first], dx, dtype)
-    )
+    position, owner, of = matched_points(samples.position, mass, group, parts, smallest)
+    count = len(position)
+    first = torch.full((len(parts),), len(group)).scatter_reduce_(0, group, torch.arange(len(group)), "amin")
+    found = samples.choose(first[of])
+    share = of.bincount()[of].double()
+    alone = group.bincount()[of] == 1
+    position = torch.where(alone[:, None], found.position, position)
     weight = samples.area.clamp_min(1e-9 * samples.body_area).clamp_min(torch.finfo(torch.float64).tiny)
-    normal = samples.normal
-    axis = torch.linalg.eigh(sums(weight[:, None, None] * normal[:, :, None] * normal[:, None, :], group))[1][..., 2]
-    solid = sums(normal.square().sum(-1), group) == 0
-    axis = torch.where(solid[:, None], 0.0, torch.where(alone[:, None], normal[first], axis))
-    added = {name: sums(getattr(samples, name), group) for name in ("body_area", "area", "volume")}
-    return replace(samples.choose(first), position=centre, normal=axis, **added)
+    moment = weight[:, None, None] * samples.normal[:, :, None] * samples.normal[:, None, :]
+    of_group = sums(moment, group)[of]
+    own = torch.zeros(count, 3, 3, dtype=moment.dtype).index_add_(0, owner, moment)
+    empty = own.diagonal(dim1=1, dim2=2).sum(-1) == 0
+    axis = torch.linalg.eigh(torch.where(empty[:, None, None], of_group, own))[1][..., 2]
+    solid = of_group.diagonal(dim1=1, dim2=2).sum(-1) == 0
+    normal = torch.where(solid[:, None], 0.0, torch.where(alone[:, None], found.normal, axis))
+    areas = {
+        name: torch.zeros(count, dtype=mass.dtype).index_add_(0, owner, getattr(samples, name))
+        for name in ("body_area", "area")
+    }
+    volume = sums(samples.volume, group)[of] / share
+    return replace(found, position=position, normal=normal, volume=volume, **areas), owner, of
 
 
-def _within_cell(centre: Tensor, member: Tensor, dx: float, dtype: torch.dtype) -> Tensor:
-    """Centres moved by round-off, if need be, so that the solver sees them in the same cell as a member."""
-    base = torch.floor(member.to(dtype) / dx - 0.5).double()
-    margin = 4 * torch.finfo(dtype).eps * (base.abs() + 2)
-    return (centre / dx).clamp(base + 0.5 + margin, base + 1.5 - margin) * dx
+def matched_points(
+    position: Tensor, mass: Tensor, group: Tensor, parts: Tensor, smallest: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Points of equal mass that have the centre of mass and the second moments of their group.
+
+    They are the corners of a box around the centre, along the principal axes of the group:
+    :math:`\pm \sqrt{\lambda_k}` from it with the eigenvalues of the covariance. For a group that fills a cell, or a
+    sheet across it, they are the points of Gauss' rule with two points along each direction, so that the strain energy
+    of a linear strain is exact; a point at the centre alone makes a thin cord, whose stiffness in bending is a second
+    moment, too soft.
+
+    Args:
+        position: Samples [m], shape (N, 3), float64.
+        mass: Their masses [kg], shape (N,).
+        group: The group of each, shape (N,).
+        parts: Along how many principal axes, largest first, each group is divided at most, shape (M,).
+        smallest: Axes with a smaller standard deviation [m] are left out.
+
+    Returns:
+        Positions of the points [m], shape (P, 3), the point that each sample is closest to, by the signs of its
+        principal coordinates, shape (N,), and the group of each point, shape (P,).
+    """
+    total = sums(mass, group)
+    centre = sums(mass[:, None] * position, group) / total[:, None]
+    arm = position - centre[group]
+    covariance = sums(mass[:, None, None] * arm[:, :, None] * arm[:, None, :], group) / total[:, None, None]
+    values, axes = torch.linalg.eigh(covariance)
+    size, axes = values.clamp(min=0).sqrt().flip(-1), axes.flip(-1)
+    divided = (size > smallest) & (torch.arange(3) < parts[:, None])
+    count = 2 ** divided.sum(-1)
+    start = count.cumsum(0) - count
+    of = torch.repeat_interleave(torch.arange(len(count)), count)
+    rank = torch.arange(len(of)) - start[of]
+    bit = 2 ** (divided.long().cumsum(-1) - divided.long())  # of each divided axis
+    sign = 2.0 * ((rank[:, None] // bit[of]) % 2) - 1
+    offset = torch.where(divided[of], sign * size[of], 0.0)
+    points = centre[of] + (axes[of] * offset[:, None, :]).sum(-1)
+    side = (axes[group] * arm[:, :, None]).sum(1) > 0
+    owner = start[group] + torch.where(divided[group] & side, bit[group], 0).sum(-1)
+    return points, owner, of

@@ -74,7 +74,8 @@ class Scene:
             much finer than the grid, and needs ``solver.formulation: total``. Null for ``grid`` in ``total`` and
             ``gaussian`` in ``updated``.
         points_per_cell: Points along the side of a cell with ``points: grid``: a sheet then has the square of it in a
-            cell, a solid the cube.
+            cell, a solid the cube, a cord as many. An even number keeps the second moments of a group too (see
+            :func:`~gaussian_swaying.simulation.sampling.matched_points`), so 2 is more accurate than 3.
     """
 
     def __init__(
@@ -334,19 +335,24 @@ class SimulatedScene(nn.Module):
         Returns:
             All Gaussians, the static ones at rest.
         """
-        rest = self.rest()
-        kind = rest.means.dtype
-        move, F = self.follow.motion(state)
-        move, F = self.frame.displacement_to_scene(move.to(kind)), self.frame.gradient_to_scene(F.to(kind))
+        rest, index = self.rest(), self.moving
+        own = rest.means, rest.covariances, rest.normals
+        if not self.all_move:
+            own = rest.means[index], rest.covariances[index], rest.normals[index]
+        solid = None if self.max_stretch is None else self._solid()
+        moved = None
+        if isinstance(self.follow, GridFollowers):
+            moved = self.follow.drawn(state, self.frame, *own, rotations, self.max_stretch, solid)
+        if moved is None:
+            kind = rest.means.dtype
+            move, F = self.follow.motion(state)
+            move, F = self.frame.displacement_to_scene(move.to(kind)), self.frame.gradient_to_scene(F.to(kind))
+            moved = own[0] + move, *deform_all(F, *own[1:], rotations, self.max_stretch, solid)
+        means, covariances, normals, turns = moved
         if self.all_move:
-            covariances, normals, turns = self._deform(F, rest.covariances, rest.normals, rotations)
-            return DeformedGaussians(
-                rest.means + move, covariances, normals, rest.rotations if turns is None else turns
-            )
-        index = self.moving
-        covariances, normals, turns = self._deform(F, rest.covariances[index], rest.normals[index], rotations)
+            return DeformedGaussians(means, covariances, normals, rest.rotations if turns is None else turns)
         return DeformedGaussians(
-            rest.means.index_add(0, index, move),
+            rest.means.index_copy(0, index, means),
             rest.covariances.index_copy(0, index, covariances),
             rest.normals.index_copy(0, index, normals),
             rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
@@ -362,13 +368,6 @@ class SimulatedScene(nn.Module):
         move, F = self.track.motion(state)
         rest = self.track.place if self.track.arm is None else self.track.place + self.track.arm
         return rest + move, F
-
-    def _deform(
-        self, F: Tensor, covariances: Tensor, normals: Tensor, rotations: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """``deform_all`` with the limit of the scene."""
-        solid = None if self.max_stretch is None else self._solid()
-        return deform_all(F, covariances, normals, rotations, self.max_stretch, solid)
 
     def _solid(self) -> Tensor:
         """Which moving Gaussians keep their shape because their law has no return map; bool, shape (M,)."""

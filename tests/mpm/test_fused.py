@@ -15,6 +15,7 @@ import torch
 
 from gaussian_swaying import _graphs
 from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.wind import FlowKey, SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Box, Everything
@@ -418,6 +419,35 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_every_kind_of_wind(kernel_device, formulation, settings):
     _agree(_wind_case(_points(kernel_device), formulation, aero=settings))
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "settings"),
+    _on(
+        {"drag_step": "semi_implicit", "max_area_ratio": 0.9},
+        {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        interpreted=[{"law": "projected"}],
+    ),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_wind_on_groups_of_patches(kernel_device, formulation, settings):
+    """Up to a dozen patches for each point, none for some, and a longer list the second time."""
+    points = _points(kernel_device)
+
+    def load(count):
+        normal = torch.nn.functional.normalize(_random(6, count, 3), dim=-1)
+        area = 0.01 * torch.rand(count, generator=torch.Generator().manual_seed(6))
+        which = torch.randint(0, points.count - 3, (count,), generator=torch.Generator().manual_seed(7))
+        aero = AeroForce(**{"C_L": 0.3, **settings})
+        return WindForce(aero, WIND, Patches(normal, area, which, points.count)).to(kernel_device)
+
+    def run(solver, state):
+        return [solver.rollout(state, DT, 1, load(count)) for count in (90, 130, 90)]
+
+    assert load(90).sums is not None
+    _agree(_both(points, run, formulation))
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import pages, record, show
-from bench.cases import accuracy, flags, gallery, gradients, pareto, runs, speed, training
+from bench.cases import accuracy, flags, gallery, gradients, pareto, points, runs, speed, training
 from bench.slots import SlotError
 
 
@@ -59,6 +59,7 @@ COMMANDS = {
                         accuracy.run, accuracy.add_arguments, page="validation.md"),
     "pareto": Command("Measure speed against error over the settings of the solver.",
                       pareto.run, pareto.add_arguments, page="validation.md"),
+    "points": Command("Measure error and time against the points of a cell.", points.run, points.add_arguments),
     "gradients": Command("Measure the memory of gradients through long rollouts, and fit a flag.",
                          gradients.run, device=False, page="validation.md"),
     "train": Command("Measure training: a bare gsplat loop and Lightning, and the effect of the surface losses.",

@@ -197,6 +197,13 @@ class Fused(ABC):
             self._values_of = sources
             values = twin.values()
             self._take_values(values.expand(*self.body.points.mass.shape, values.shape[-1]).flatten(0, -2))
+            if twin.table is not None:
+                table = twin.table()
+                if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `_repeat`
+                    check_indices(TWIN_NUMBERS + len(table))
+                    self.numbers = torch.zeros(TWIN_NUMBERS + len(table), device=self.device)
+                    self.numbers[: len(twin.numbers)].copy_(twin.numbers)
+                self.numbers[TWIN_NUMBERS : TWIN_NUMBERS + len(table)].copy_(table)
 
     # ---- forces in torch
 
@@ -262,7 +269,7 @@ class Fused(ABC):
             self.first_step.add_(count)
 
         recordable = all(boundary.recordable for boundary in self.body.boundaries)
-        self.repeater.run(steps, (key, self._asked_key()), several, recordable)
+        self.repeater.run(steps, (key, self.numbers.data_ptr(), self._asked_key()), several, recordable)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from gaussian_swaying.mpm.triton.shared import (
 
 
 @triton.jit
-def _gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr):
+def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr):
     """Columns 0 to 2 of rows of eight interpolated, their derivatives [component, axis], and (BOTH) columns 4 to 6."""
     zero = wz[0] * 0
     u0, u1, u2, v0, v1, v2 = zero, zero, zero, zero, zero, zero
@@ -118,12 +118,12 @@ def total_particles(
         lam = tl.load(material + 2 * count + index, mask, 0.0)
         wz, gz = axis_weights(f[2], inverse_dx)
         if VISCOUS:
-            u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-            v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+            u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+            v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
         elif LOADED:
-            u, F, v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
+            u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
         else:
-            u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+            u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
         F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
         if MULTI:
             row = law_table + ROW * tl.load(law + index, mask, 0)
@@ -336,8 +336,8 @@ def total_read(
     node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
     where = tl.load(order + index, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
-    u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
-    v, rate, _v = _gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
     if WORK:
         zero = f[0] * 0
         account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
@@ -361,7 +361,7 @@ def total_look(
     f = load3(fraction, count, index, mask)
     node = tl.load(cell_node + tl.load(particle_cell + index, mask, 0), mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
-    _u, F, _v = _gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
     mu = tl.load(material + count + index, mask, 0.0)
     lam = tl.load(material + 2 * count + index, mask, 0.0)

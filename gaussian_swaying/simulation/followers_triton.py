@@ -1,0 +1,111 @@
+"""What a picture needs of Gaussians that follow the nodes, in one kernel; the definitions are in ``followers``."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
+from gaussian_swaying.geometry.patches_triton import deform_and_store
+from gaussian_swaying.mpm.transfer import Stencil
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
+from gaussian_swaying.mpm.triton.total_kernels import gather
+
+BLOCK = 128
+
+
+@triton.jit(do_not_specialize=VARIES)
+def _follow(
+    fields, first, fraction, arm, axes, means, covariance, normal, solid,
+    means_out, covariance_out, normal_out, rotation_out, square, per_metre, count, sx, sy, inverse_dx,
+    ARM: tl.constexpr, TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One Gaussian per lane: its displacement and F from the nodes, in the axes of the scene."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    node = tl.load(first + index, mask, 0)
+    f = (
+        tl.load(fraction + index, mask, 1.0),
+        tl.load(fraction + count + index, mask, 1.0),
+        tl.load(fraction + 2 * count + index, mask, 1.0),
+    )
+    wz, gz = axis_weights(f[2], inverse_dx)
+    u, G, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
+    if ARM:
+        a = load3(arm, 1, 3 * index, mask)
+        u = (
+            u[0] + G[0] * a[0] + G[1] * a[1] + G[2] * a[2],
+            u[1] + G[3] * a[0] + G[4] * a[1] + G[5] * a[2],
+            u[2] + G[6] * a[0] + G[7] * a[1] + G[8] * a[2],
+        )
+    zero = 0 * index
+    R = load9(axes, 1, zero, mask)
+    F = matmul(matmul(transpose(R), G), R)  # zero at rest, so that nothing moves there
+    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    x = load3(means, 1, 3 * index, mask)
+    x = (
+        x[0] + per_metre * (R[0] * u[0] + R[3] * u[1] + R[6] * u[2]),
+        x[1] + per_metre * (R[1] * u[0] + R[4] * u[1] + R[7] * u[2]),
+        x[2] + per_metre * (R[2] * u[0] + R[5] * u[1] + R[8] * u[2]),
+    )
+    store3(means_out, 1, 3 * index, x, mask)
+    deform_and_store(
+        F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask, TURN, LIMIT
+    )
+
+
+def follow(
+    displacement: Tensor,
+    stencil: Stencil,
+    strides: tuple[int, int],
+    dx: float,
+    arm: Tensor | None,
+    axes: Tensor,
+    per_metre: float,
+    means: Tensor,
+    covariances: Tensor,
+    normals: Tensor,
+    rotations: bool,
+    max_stretch: float | None,
+    solid: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Means, covariances, normals and rotations of Gaussians that follow the nodes; float32, without gradients.
+
+    Args:
+        displacement: Nodal displacement [m], shape (G, 3).
+        stencil: Of the places that are read, with gradients.
+        strides: Nodes from one to the next along x and along y.
+        dx: Grid spacing [m].
+        arm: As in ``Followers``, shape (M, 3), or None.
+        axes: Rotation from scene axes to z up, shape (3, 3), on the device.
+        per_metre: Scene units in a metre.
+        means: Centres at rest [scene units], shape (M, 3).
+        covariances: Covariances at rest, shape (M, 3, 3).
+        normals: Unit normals at rest, shape (M, 3).
+        rotations: Whether to compute the rotations.
+        max_stretch: As in ``patches.deform_all``.
+        solid: As there.
+
+    Returns:
+        Shapes (M, 3), (M, 3, 3), (M, 3) and (M, 3, 3) or None.
+    """
+    count = len(means)
+    fields = displacement.new_zeros(len(displacement), 8)
+    fields[:, :3] = displacement
+    fraction = 1.5 + stencil.factors[1, :, 0] * dx  # from the slope of the first weight, (f - 1.5) / dx
+    given = [tensor.detach().contiguous() for tensor in (means, covariances, normals)]
+    made = [torch.empty_like(tensor) for tensor in given]
+    turns = torch.empty_like(given[1]) if rotations else given[1]
+    limit = max_stretch is not None and solid is not None
+    keeps = fields if solid is None or not limit else solid.contiguous().view(torch.uint8)
+    if count > 0:
+        with torch.cuda.device_of(fields):
+            _follow[(triton.cdiv(count, BLOCK),)](
+                fields, stencil.first, fraction.contiguous(), fields if arm is None else arm.contiguous(),
+                axes.contiguous(), *given, keeps, *made, turns,
+                float(max_stretch or 1) ** 2, per_metre, count, *strides, 1 / dx,
+                ARM=arm is not None, TURN=rotations, LIMIT=limit, BLOCK=BLOCK,
+            )  # fmt: skip
+    return made[0], made[1], made[2], turns if rotations else None
