@@ -44,8 +44,11 @@ place, or a slope along a held line. The condition is then below 50 for hinges a
 any angle and for patches (tested).
 """
 
-LEAST_APART = 0.5
-"""Least distance between the points that a region holds [cells]: a strip up to one cell wide is a line of points."""
+LEAST_APART = 0.6
+"""Least distance between the points that a region holds [cells].
+
+Two halves of a strip one cell wide are half a cell apart: such a strip is one line, wherever it lies on the grid.
+"""
 
 _NO_WEIGHT = 1e-6  # of a node that a particle on the border of its cell does not reach
 

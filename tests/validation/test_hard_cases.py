@@ -479,8 +479,13 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
     position = _lattice(round(length / h), 1, round(width / h), spacing=h)
     middle = [0.0, 0.025, width / 2]
     ends = [
-        PinnedRegion(Box([None, None, None], [0.11, None, None])),
-        Handle(Box([0.69, None, None], [None, None, None]), angular_velocity=[4 * math.pi, 0, 0], pivot=middle),
+        PinnedRegion(Box([None, None, None], [0.11, None, None]), "nodes"),
+        Handle(
+            Box([0.69, None, None], [None, None, None]),
+            kind="nodes",
+            angular_velocity=[4 * math.pi, 0, 0],
+            pivot=middle,
+        ),
     ]
     points = _points(position, density=100.0, youngs_modulus=1e4)
     simulation = _simulation(points, ends, formulation=formulation, frame_dt=0.04, damping=10.0, dx=0.1)
@@ -505,8 +510,8 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
     position = _lattice(3, 3, 6)
     fast = 0.9 * 0.3 / 2 / 0.1
     grips = [
-        Handle(Box([None, None, None], [None, None, 0.06]), velocity=[0, 0, fast], end=0.1),
-        Handle(Box([None, None, 0.24], [None, None, None]), velocity=[0, 0, -fast], end=0.1),
+        Handle(Box([None, None, None], [None, None, 0.06]), velocity=[0, 0, fast], kind="nodes", end=0.1),
+        Handle(Box([None, None, 0.24], [None, None, None]), velocity=[0, 0, -fast], kind="nodes", end=0.1),
     ]
     points = _points(position, law=law())
     simulation = _simulation(points, grips, formulation=formulation, frame_dt=5e-3, damping=60.0)
@@ -522,7 +527,7 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_pin_that_holds_everything(formulation):
     """Nothing moves, and the wind does no work, for half a second in a gale."""
-    pin = PinnedRegion(Everything())
+    pin = PinnedRegion(Everything(), "nodes")
     wind = WindField([20.0, 5.0, 0.0])
     simulation = _simulation(
         _points(_lattice(3, 3, 2)), [pin], wind, AeroForce(), formulation=formulation, gravity=UP, frame_dt=0.05
