@@ -87,13 +87,14 @@ def test_a_row_is_simulated_and_compared(tmp_path):
     options.dataset, options.device, options.frames, options.points = tmp_path / "data", "cpu", 2, 500
     options.more = "--scene.generator.init_args.spacing=0.1 --solver.dx=0.2 --solver.gravity=[0,0,0] "
     options.more += "--solver.boundaries=[]"
-    row = flags.run_row(1, "ours", options, None, tmp_path)
+    ours = flags.VARIANTS["ours"]
+    row = flags.run_row(1, ours, options, None, tmp_path / "ours_1")
     assert row["status"] == "complete"
     assert row["frames"] == 2
     assert row["mean"]["chamfer_m"] < 0.1  # the spacing
     assert row["chamfer_share"] == pytest.approx(row["mean"]["chamfer_m"] / 1.2)
     options.more = "--solver.dx=nonsense"
-    assert "solver.dx" in flags.run_row(1, "ours", options, None, tmp_path / "again")["failed"]
+    assert "solver.dx" in flags.run_row(1, ours, options, None, tmp_path / "again" / "ours_1")["failed"]
 
 
 def test_the_line_that_names_the_error():

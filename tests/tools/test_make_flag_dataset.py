@@ -139,6 +139,26 @@ def test_patterns_have_the_parameters_of_the_paper(reference):
         assert pattern.damping == material.air_rate == (2.0 if number == 1 else 1.0)
 
 
+def test_two_flags_leave_their_held_edge_at_an_angle(reference):
+    """A curtain and a light stiff flag, hung by their top edge in a wind at 60 degrees to their plane."""
+    expected = {4: ((1.0, 1.4), 1.8, 0.2, 30.0), 5: ((1.2, 0.8), 3.0, 0.15, 80.0)}  # sides, speed, kg/m², E h
+    assert set(reference.PATTERNS) - set(reference.PAPER) == set(expected)
+    for number, (sides, speed, areal, membrane) in expected.items():
+        pattern = reference.PATTERNS[number]
+        assert (pattern.width, pattern.height) == sides
+        assert math.hypot(*pattern.flow) == pytest.approx(speed)
+        assert pattern.normal() @ pattern.flow == pytest.approx(-speed * math.sin(math.radians(60)))
+        assert pattern.material().areal_density == pytest.approx(areal)
+        assert pattern.material().membrane == pytest.approx(membrane)
+        assert pattern.pressure() == pytest.approx(0.5 * 1.225 * 1.28 * speed**2)
+        held = pattern.grid().uv()[pattern.pins(pattern.grid().uv())]
+        assert len(held) == pattern.grid().columns + 1
+        np.testing.assert_array_equal(held[:, 1], 1)
+        # at rest the wind would hold a flat sheet at atan(p sin 60 / weight) from the vertical
+        tilt = math.atan(pattern.pressure() * math.sin(math.radians(60)) / (areal * 9.8))
+        assert math.radians(45) < tilt < math.radians(80)
+
+
 def test_blender_is_asked_in_its_own_units(reference, cloth):
     """The relations, turned round: whatever the mesh, the same mass, springs, damping, bending and wind in SI units."""
     for cells in (30, 60, 120):
@@ -162,7 +182,7 @@ def test_blender_is_asked_in_its_own_units(reference, cloth):
 
 def test_steps_follow_the_mesh(reference, cloth):
     """Blender's bending is explicit: its number grows with 1 / cell^4 and falls with the square of the steps."""
-    for number in (1, 2, 3):
+    for number in reference.PATTERNS:
         pattern = reference.PATTERNS[number]
         assert reference.least_quality(pattern) == pattern.quality
         finer = replace(pattern, cells=2 * pattern.cells)
@@ -170,6 +190,7 @@ def test_steps_follow_the_mesh(reference, cloth):
         assert of[0] < cloth.BENDING_LIMIT
         assert of[1] / of[0] == pytest.approx(16, rel=0.05)
         assert reference.least_quality(finer) == 4 * pattern.quality
+    pattern = reference.PATTERNS[3]
     grid, rough = pattern.grid(), replace(pattern, quality=8).run()
     with pytest.raises(ValueError, match="`quality` of at least 38"):
         cloth.solve_cloth(grid, grid.flat(), [], pattern.material(), rough)
@@ -533,7 +554,7 @@ def test_options_reach_the_flag_and_the_pictures(tool, reference):
     assert flag.quality == reference.least_quality(flag) == 64  # cells of 1 cm
     assert (pictures.size, pictures.samples, pictures.views) == ((640, 360), 4, 200)
     default = tool.parse([])
-    for number in (1, 2, 3):
+    for number in reference.PATTERNS:
         assert tool.flag_of(number, default) == reference.PATTERNS[number]
     assert tool.pictures_of(default) == tool.Pictures()
     preview = tool.parse(["--preview", "--views", "3"])

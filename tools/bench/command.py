@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import pages, record, show
-from bench.cases import accuracy, flags, gallery, gradients, pareto, points, runs, speed, training
+from bench.cases import accuracy, flags, gallery, gradients, pareto, pins, points, runs, speed, training
 from bench.slots import SlotError
 
 
@@ -66,6 +66,8 @@ COMMANDS = {
                      _going_on("train", training.measure), training.add_arguments),
     "flags": Command("Train, simulate and compare the flags of the paper with Blender's cloth.",
                      _going_on("flags", flags.measure), flags.add_arguments),
+    "pins": Command("Compare ways to hold an edge on flags made in code, with Blender's cloth.",
+                    _going_on("pins", pins.measure), pins.add_arguments),
     "gallery": Command("Run the paper's scenes and make pictures of them.",
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),

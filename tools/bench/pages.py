@@ -17,6 +17,7 @@ from bench.tables import (
     long_flag,
     pareto,
     pareto_plot,
+    pins,
     runs,
     speed,
     speed_plot,
@@ -24,7 +25,7 @@ from bench.tables import (
 )
 from gaussian_swaying._files import write_text
 
-TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, runs, speed, training)
+TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, pins, runs, speed, training)
 """The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {

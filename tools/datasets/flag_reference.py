@@ -1,9 +1,9 @@
-"""The three flags of the paper's benchmark as an independent cloth solver sees them.
+"""The three flags of the paper's benchmark, and two more, as an independent cloth solver sees them.
 
-Parameters are those of the paper's table; values that it does not give are chosen here and marked. Nothing in this file
-needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders, ``make_flag_dataset.py`` combines them.
-Motions and their files are in ``flag_motion.py``, textures and cameras in ``flag_pictures.py``, comparisons in
-``flag_difference.py``.
+Parameters of the paper's flags are those of its table; values that it does not give are chosen here and marked.
+Nothing in this file needs Blender: ``blender_cloth.py`` solves, ``blender_images.py`` renders,
+``make_flag_dataset.py`` combines them. Motions and their files are in ``flag_motion.py``, textures and cameras in
+``flag_pictures.py``, comparisons in ``flag_difference.py``.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ from blender_cloth import BENDING_LIMIT, ClothMaterial, ClothRun, Grid, bending_
 
 PINNED = ("left", "corners", "top")
 
+PAPER = (1, 2, 3)
+"""The numbers of the paper's flags in ``PATTERNS``."""
+
 
 @dataclass(frozen=True)
 class FlagPattern:
@@ -26,7 +29,7 @@ class FlagPattern:
     ``yaw`` turns it about z. Its initial normal, towards the reference camera, is -y turned by ``yaw``.
 
     Attributes:
-        youngs_modulus: E [Pa]; paper.
+        youngs_modulus: E [Pa]; paper, as is all that is marked so below (in patterns 1 to 3).
         poisson_ratio: nu; paper. Blender's springs have 0.32 to 0.33.
         density: [kg/m³]; paper.
         flow: Velocity of the air [m/s], constant and uniform; paper.
@@ -208,7 +211,17 @@ PATTERNS = {
     ),
     2: FlagPattern(3e3, 0.3, 30.0, (2.5, 0.5, 0.0), "corners", drag=0.8),
     3: FlagPattern(3e3, 0.3, 20.0, (2.0, 0.0, 0.0), "top", width=2.0, height=1.2, yaw=-35.0, cells=140, quality=64),
+    4: FlagPattern(
+        3e3, 0.3, 20.0, (1.8, 0.0, 0.0), "top", width=1.0, height=1.4, yaw=-60.0, cells=112, paper_drag=None
+    ),
+    5: FlagPattern(8e3, 0.3, 15.0, (3.0, 0.0, 0.0), "top", yaw=-60.0, cells=100, quality=128, paper_drag=None),
 }
-"""The paper's three patterns. The wind of pattern 3 would blow along the flag's plane, so this flag is turned by 35
-degrees. In patterns 2 and 3, the air then comes from the camera's side. Drag and damping are chosen so that the motion
-converges with the mesh, see docs/flag_dataset.md."""
+"""The paper's three patterns, and two more.
+
+The wind of pattern 3 would blow along the flag's plane, so this flag is turned by 35 degrees. In patterns 2 and 3, the
+air then comes from the camera's side. Drag and damping are chosen so that the motion converges with the mesh, see
+docs/flag_dataset.md.
+
+Pattern 4 is a curtain of the cloth of pattern 3. Pattern 5 is light (0.15 kg/m²) and stiff (E h = 80 N/m). Both hang by
+their top edge in a wind at 60 degrees to their plane and leave that edge at an angle, so they show how well a held edge
+is modelled. All of their numbers are chosen here."""

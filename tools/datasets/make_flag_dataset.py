@@ -1,13 +1,14 @@
-"""Make the flag data set: the motion of three flags from Blender's cloth solver, photos of them, and a video.
+"""Make the flag data set: the motion of flags from Blender's cloth solver, photos of them, and a video.
 
-``python tools/datasets/make_flag_dataset.py --preview``      all three, small, in two minutes on two cores
+``python tools/datasets/make_flag_dataset.py --preview``      the paper's three, small, in two minutes on two cores
 ``python tools/datasets/make_flag_dataset.py --pattern 2``    one, at full size
+``python tools/datasets/make_flag_dataset.py --pattern 1 2 3 4 5 --only cloth``  the motions for ``bench.py pins``
 ``python tools/datasets/make_flag_dataset.py --check``        measures how Blender's settings relate to SI units
 ``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from other solutions of it
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 
-For each pattern the folder ``pattern1`` to ``pattern3`` holds ``cloth.npz`` (the motion, see ``flag_motion.py``),
+For each pattern a folder, ``pattern1`` and so on, holds ``cloth.npz`` (the motion, see ``flag_motion.py``),
 ``mesh.ply`` and ``truth.npz`` (the rest shape with its normals), ``train/`` (photographs of the rest shape from all
 around, with ``transforms.json``) and ``video/`` (``frames/``, ``camera.json``, ``reference.mp4``). The same settings
 give the same files. What is there is not made again, so an interrupted run is continued by the same command; where
@@ -33,7 +34,7 @@ from blender_images import TRANSFERS, Studio
 from flag_difference import VARIANTS, difference, variants
 from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
-from flag_reference import PATTERNS, FlagPattern, least_quality
+from flag_reference import PAPER, PATTERNS, FlagPattern, least_quality
 
 from gaussian_swaying._files import atomic, write_json
 
@@ -260,16 +261,16 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     add = parser.add_argument
     add("--out", type=Path, default=Path("outputs/flags"), help="folder to write (default: %(default)s)")
-    add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), default=sorted(PATTERNS), help="which flags")
+    add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), default=list(PAPER), help="which flags (1 2 3)")
     add("--only", nargs="+", choices=PARTS, default=list(PARTS), help="which parts")
     add("--preview", action="store_true", help="coarse mesh, small pictures, every tenth frame")
-    add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140)")
+    add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140, 112, 100)")
     add("--quality", type=int, help="solver steps per frame, a power of two (default: what the mesh needs)")
     add("--frames", type=int, help="number of frames, the first being the rest shape (250)")
     add("--flag-size", type=float, nargs=2, metavar=("WIDTH", "HEIGHT"), help="sides of the flag [m]")
     add("--texture", help="white, stripes, or the path of an image")
     add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (0.8 in pattern 2, else 1.28)")
-    add("--damping", type=float, help="rate at which every velocity decays [1/s] (2, 1, 1)")
+    add("--damping", type=float, help="rate at which every velocity decays [1/s] (2 in pattern 1, else 1)")
     add("--self-collision", action="store_true", default=None, help="turn self-contact on")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="size of the video [pixels] (1920x1080)")
     add("--samples", type=int, help="light paths per pixel (16)")

@@ -21,12 +21,11 @@ from gaussian_swaying.evaluation.compare import compare_run
 
 sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts that import each other from their own folder
 
+from flag_reference import PAPER as PATTERNS
 from flag_reference import PATTERNS as REFERENCES
 
 BENCH = ROOT / "configs" / "bench"
 Row = dict[str, Any]
-
-PATTERNS = (1, 2, 3)
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Variant:
     true_normals: bool = False
 
 
-def _grid(dx: float) -> tuple[str, ...]:
+def grid_options(dx: float) -> tuple[str, ...]:
     """Options for a grid spacing [m], with the same number of particles per cell."""
     return (f"--solver.dx={dx:g}", f"--scene.particle_spacing={0.45 * dx:g}")
 
@@ -66,13 +65,13 @@ VARIANTS: dict[str, Variant] = {
     "membrane": Variant("one layer (no bending stiffness)", options=("--scene.layers=1",)),
     "true_normals": Variant("with the reference's normals at rest", patterns=(2, 3), true_normals=True),
     "one_point": Variant("one point per Gaussian", options=("--scene.particle_spacing=null",)),
-    "total_04": Variant("`total`, dx = 0.04 m", options=_grid(0.04)),
-    "total_03": Variant("`total`, dx = 0.03 m", options=_grid(0.03)),
-    "total_02": Variant("`total`, dx = 0.02 m", options=_grid(0.02)),
-    "total_01": Variant("`total`, dx = 0.01 m", options=_grid(0.01), patterns=(1, 2)),
-    "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",), _grid(0.04)),
-    "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), _grid(0.03)),
-    "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), _grid(0.02)),
+    "total_04": Variant("`total`, dx = 0.04 m", options=grid_options(0.04)),
+    "total_03": Variant("`total`, dx = 0.03 m", options=grid_options(0.03)),
+    "total_02": Variant("`total`, dx = 0.02 m", options=grid_options(0.02)),
+    "total_01": Variant("`total`, dx = 0.01 m", options=grid_options(0.01), patterns=(1, 2)),
+    "updated_04": Variant("`updated`, dx = 0.04 m", ("updated",), grid_options(0.04)),
+    "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), grid_options(0.03)),
+    "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), grid_options(0.02)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
     "stiffness_damping": Variant("stiffness damping, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
@@ -95,9 +94,16 @@ VARIANTS: dict[str, Variant] = {
 _TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
 
 
+def matched_configs(pattern: int) -> list[Path]:
+    """The configuration files that match a reference, each on top of those before it."""
+    base = pattern if pattern in PATTERNS else 3  # the others hang by their top edge like pattern 3
+    files = [ROOT / "configs" / "sim" / f"flag{base}.yaml", BENCH / f"flag{base}.yaml"]
+    return files if base == pattern else [*files, BENCH / f"flag{pattern}.yaml"]
+
+
 def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None) -> list[str]:
     """Command line of tools/sim.py for a row."""
-    configs = [ROOT / "configs" / "sim" / f"flag{pattern}.yaml", BENCH / f"flag{pattern}.yaml"]
+    configs = matched_configs(pattern)
     configs += [BENCH / "variants" / f"{name}.yaml" for name in variant.overlays]
     arguments = [part for path in configs for part in ("--config", str(path))]
     if splat is not None:
@@ -167,20 +173,19 @@ def what_failed(told: str) -> str:
     return (named or lines or ["no message"])[-1]
 
 
-def run_row(pattern: int, name: str, options: argparse.Namespace, splat: Path | None, folder: Path) -> Row:
-    """Simulate a row and compare it with the reference."""
+def run_row(
+    pattern: int, variant: Variant, options: argparse.Namespace, splat: Path | None, output: Path, pictures: bool = True
+) -> Row:
+    """Simulate a row into the folder ``output`` and compare it with the reference, with ``pictures`` if it has all."""
     dataset = Path(options.dataset)
     reference = dataset / f"pattern{pattern}"
-    output = folder / f"{name}_{pattern}"
     command = [sys.executable, str(ROOT / "tools" / "sim.py")]
-    command += sim_arguments(pattern, VARIANTS[name], dataset, splat)
+    command += sim_arguments(pattern, variant, dataset, splat)
     command += ["--device", options.device, "--output", str(output)]
     command += [f"--frames={options.frames}"] if options.frames else []
     command += options.more.split() if options.more else []
-    pictures = len(list((reference / "video" / "frames").glob("*.png")))
-    with_pictures = pictures == 250
-    if not with_pictures:  # they may not be finished yet
-        bare = folder / f"surface_{pattern}"
+    if not pictures or len(list((reference / "video" / "frames").glob("*.png"))) != 250:  # they may not be finished yet
+        bare = output.parent / f"surface_{pattern}"
         bare.mkdir(parents=True, exist_ok=True)
         if not (bare / "cloth.npz").exists():
             (bare / "cloth.npz").symlink_to((reference / "cloth.npz").resolve())
@@ -268,26 +273,31 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
 
 
+def open_dataset(dataset: Path, patterns: list[int], result: Row) -> None:
+    """Check that the references exist, and copy what is known of their uncertainty into the record."""
+    for pattern in patterns:
+        folder = dataset / f"pattern{pattern}"
+        if not (folder / "cloth.npz").exists():
+            raise SystemExit(
+                f"{dataset} has no pattern{pattern}/cloth.npz: make it with tools/datasets/make_flag_dataset.py"
+            )
+        path = folder / "uncertainty.json"
+        if path.exists():
+            known = json.loads(path.read_text())["variants"]
+            kept = {name: {k: v for k, v in found.items() if k != "chamfer_per_frame"} for name, found in known.items()}
+            result.setdefault("uncertainty", {})[str(pattern)] = kept
+
+
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
     """Fill ``result["rows"]``, saving it after each run; existing rows that are not selected are kept."""
     names = options.rows.split(",")
     if unknown := set(names) - set(VARIANTS):
         raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
     patterns = [int(p) for p in options.patterns.split(",")]
-    for pattern in patterns:
-        if not (Path(options.dataset) / f"pattern{pattern}" / "cloth.npz").exists():
-            raise SystemExit(
-                f"{options.dataset} has no pattern{pattern}/cloth.npz: make it with tools/datasets/make_flag_dataset.py"
-            )
+    open_dataset(Path(options.dataset), patterns, result)
     result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
     result["more"] = options.more or ""
     rows = result.setdefault("rows", {})
-    for pattern in patterns:
-        path = Path(options.dataset) / f"pattern{pattern}" / "uncertainty.json"
-        if path.exists():
-            known = json.loads(path.read_text())["variants"]
-            kept = {name: {k: v for k, v in found.items() if k != "chamfer_per_frame"} for name, found in known.items()}
-            result.setdefault("uncertainty", {})[str(pattern)] = kept
     with tempfile.TemporaryDirectory() as scratch:
         for name in names:
             variant = VARIANTS[name]
@@ -305,7 +315,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
                         turn_to_reference(own, Path(options.dataset) / f"pattern{pattern}" / "cloth.npz", splat)
                 elif variant.training or variant.true_normals:
                     continue  # there is nothing to train, and the normals are right
-                row |= run_row(pattern, name, options, splat, Path(scratch))
+                row |= run_row(pattern, variant, options, splat, Path(scratch) / f"{name}_{pattern}")
                 rows.setdefault(name, {})[str(pattern)] = row
                 shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
                 print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)

@@ -13,7 +13,8 @@ Row = dict[str, Any]
 PAGE = "flag_benchmark.md"
 
 
-def _chamfer(row: Row | None) -> str:
+def chamfer(row: Row | None) -> str:
+    """A cell of a table: the mean distance as a share of the longer side, or why there is none."""
     if row is None:
         return "-"
     if row.get("failed"):
@@ -39,21 +40,27 @@ _OTHER = {  # variants of the reference that are different flags, or have a mesh
 _SHARE = 0.03  # goal for Chamfer distances, as a share of the longer side
 
 
-def _complete(rows: Row, name: str, pattern: int) -> Row | None:
+def complete(rows: Row, name: str, pattern: int) -> Row | None:
+    """A row that ran to its end and was compared."""
     row = rows.get(name, {}).get(str(pattern))
     return row if row and row.get("status") == "complete" and "chamfer_share" in row else None
+
+
+def doubt(result: Row, pattern: int) -> str:
+    """How far the reference is from itself at most, in brackets, or nothing."""
+    known = {n: v for n, v in result.get("uncertainty", {}).get(str(pattern), {}).items() if n not in _OTHER}
+    return f" (reference itself: {100 * max(v['chamfer'] for v in known.values()):.2f} %)" if known else ""
 
 
 def goals(result: Row) -> list[tuple[str, str, bool]]:
     """The goals, the measured values, and whether each goal is reached."""
     rows, found = result["rows"], []
     for pattern in PATTERNS:
-        ours = _complete(rows, "ours", pattern)
+        ours = complete(rows, "ours", pattern)
         if ours is None:
             continue
         share = ours["chamfer_share"]
-        doubt = {n: v for n, v in result.get("uncertainty", {}).get(str(pattern), {}).items() if n not in _OTHER}
-        known = f" (reference itself: {100 * max(v['chamfer'] for v in doubt.values()):.2f} %)" if doubt else ""
+        known = doubt(result, pattern)
         found.append(
             (
                 f"pattern {pattern}: Chamfer distance within {100 * _SHARE:g} % of the longer side",
@@ -62,7 +69,7 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
             )
         )
         decibels, factor = _GAIN[pattern]
-        other = _complete(rows, "particle", pattern)
+        other = complete(rows, "particle", pattern)
         if other is not None:
             ratio = share / other["chamfer_share"]
             goal = f"pattern {pattern}: Chamfer distance {factor:g} times that of PhysGaussian's way"
@@ -71,12 +78,12 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
                 gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
                 goal = f"pattern {pattern}: PSNR {decibels:+g} dB over PhysGaussian's way"
                 found.append((goal, f"{gain:+.2f} dB", gain >= decibels))
-        other = _complete(rows, "no_surface", pattern)
+        other = complete(rows, "no_surface", pattern)
         if other is not None:
             ratio = other["chamfer_share"] / share
             goal = f"pattern {pattern}: Chamfer distance at least twice as large without surface modelling"
             found.append((goal, f"{ratio:.2f} times", ratio >= 2))
-        other = _complete(rows, "no_shading", pattern)
+        other = complete(rows, "no_shading", pattern)
         if other is not None and "psnr_db" in ours["mean"]:
             gain = ours["mean"]["psnr_db"] - other["mean"]["psnr_db"]
             found.append((f"pattern {pattern}: lower PSNR without shading", f"{-gain:+.2f} dB", gain > 0))
@@ -85,7 +92,7 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
 
 def pattern_lines(rows: Row, pattern: int) -> list[str]:
     """When a flag leaves its reference, and which changes move it closer or further away."""
-    ours = _complete(rows, "ours", pattern)
+    ours = complete(rows, "ours", pattern)
     if ours is None:
         return []
     distances = [value for value in ours.get("chamfer_per_frame_m", []) if value is not None]
@@ -99,7 +106,7 @@ def pattern_lines(rows: Row, pattern: int) -> list[str]:
     changes = {
         VARIANTS[name].title: row["chamfer_share"] - ours["chamfer_share"]
         for name in rows
-        if name not in ("ours", "particle", "no_surface") and (row := _complete(rows, name, pattern))
+        if name not in ("ours", "particle", "no_surface") and (row := complete(rows, name, pattern))
     }
     if changes:
         order = sorted(changes, key=lambda name: changes[name])
@@ -122,7 +129,7 @@ def rows_table(result: Row) -> list[str]:
     head = ["", *(column for p in PATTERNS for column in (f"pattern {p}: Chamfer", "PSNR [dB]"))]
     rows = result["rows"]
     shown = [
-        [variant.title, *(cell(rows[name].get(str(p))) for p in PATTERNS for cell in (_chamfer, _psnr))]
+        [variant.title, *(cell(rows[name].get(str(p))) for p in PATTERNS for cell in (chamfer, _psnr))]
         for name, variant in VARIANTS.items()
         if name in rows
     ]
@@ -163,8 +170,13 @@ def costs(result: Row) -> list[str]:
 @table(PAGE, "flags.reference", "flags_*", together=True)
 def reference(results: list[Row]) -> list[str]:
     """Uncertainty of the reference, from the first record that has it."""
+    return uncertainty_lines(_uncertainty(results))
+
+
+def uncertainty_lines(known: Row) -> list[str]:
+    """A line or two for each pattern: the reference solved otherwise, compared with itself."""
     lines = []
-    for pattern, found in sorted(_uncertainty(results).items()):
+    for pattern, found in sorted(known.items()):
         shown = [
             f"{name} ({v['cells']} cells, {v['quality']} steps, {v['frames_compared']} frames) "
             f"{100 * v['chamfer']:.2f} %"

@@ -1,0 +1,95 @@
+"""Tables of ``bench.py pins``: how well a held edge is modelled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench.cases.flags import PATTERNS as PAPER
+from bench.cases.pins import PATTERNS, ROWS
+from bench.slots import table
+from bench.tables import flags
+from bench.tables.markdown import grid, source, yes_no
+
+Row = dict[str, Any]
+PAGE = "flag_benchmark.md"
+
+_NAMES = {4: " (curtain)", 5: " (light, stiff)"}
+_SHARE = 0.015  # goal for the flags that are not the paper's, as a share of the longer side
+
+
+def goals(result: Row) -> list[tuple[str, str, bool | None]]:
+    """The goals, the measured values, and whether each goal is reached; None for what was not measured."""
+    found: list[tuple[str, str, bool | None]] = []
+    for pattern in PATTERNS:
+        hinge = flags.complete(result["rows"], "hinge_04", pattern)
+        named = f"pattern {pattern}{_NAMES.get(pattern, '')}: hinges at dx = 0.04 m"
+        if pattern in PAPER:
+            nodes = flags.complete(result["rows"], "nodes", pattern)
+            goal = f"{named} no farther than held nodes on the finer grid"
+            if hinge is None or nodes is None:
+                found.append((goal, "-", None))
+                continue
+            one, other = hinge["chamfer_share"], nodes["chamfer_share"]
+            found.append((goal, f"{100 * one:.2f} %, {100 * other:.2f} % at {nodes['dx_m']:g} m", one <= other))
+        else:
+            goal = f"{named} within {100 * _SHARE:g} % of the longer side"
+            if hinge is None:
+                found.append((goal, "-", None))
+                continue
+            share = hinge["chamfer_share"]
+            found.append((goal, f"{100 * share:.2f} %{flags.doubt(result, pattern)}", share <= _SHARE))
+    return found
+
+
+@table(PAGE, "pins.device", "pins_*")
+def device(result: Row) -> list[str]:
+    """The device and versions of the runs, and notes about them."""
+    lines = [source(result)]
+    lines += [f"Other options of `tools/sim.py`: `{result['more']}`."] if result.get("more") else []
+    return [*lines, result["note"]] if result.get("note") else lines
+
+
+@table(PAGE, "pins.rows", "pins_*")
+def rows_table(result: Row) -> list[str]:
+    """Distance of each row and pattern."""
+    rows = result["rows"]
+    return grid(
+        ["", *(f"pattern {p}{_NAMES.get(p, '')}" for p in PATTERNS)],
+        [
+            [pin.title(), *(flags.chamfer(rows[name].get(str(p))) for p in PATTERNS)]
+            for name, pin in ROWS.items()
+            if name in rows
+        ],
+    )
+
+
+@table(PAGE, "pins.goals", "pins_*")
+def goal_table(result: Row) -> list[str]:
+    """The goals."""
+    rows = [[goal, measured, yes_no(reached)] for goal, measured, reached in goals(result)]
+    return grid(["goal", "measured", "reached"], rows)
+
+
+@table(PAGE, "pins.costs", "pins_*")
+def costs(result: Row) -> list[str]:
+    """Points and time of each row."""
+    rows = result["rows"]
+
+    def cell(row: Row | None) -> str:
+        return f"{row['particles']:,}; {row['ms_per_frame']:.1f}" if row and "particles" in row else "-"
+
+    return grid(
+        ["points; time per frame [ms]", *(f"pattern {p}" for p in PATTERNS)],
+        [
+            [pin.title(), *(cell(rows[name].get(str(p))) for p in PATTERNS)]
+            for name, pin in ROWS.items()
+            if name in rows
+        ],
+    )
+
+
+@table(PAGE, "pins.reference", "pins_*", together=True)
+def reference(results: list[Row]) -> list[str]:
+    """Uncertainty of the references that only these rows use."""
+    found = next((result["uncertainty"] for result in results if result.get("uncertainty")), {})
+    return flags.uncertainty_lines({p: v for p, v in found.items() if int(p) not in PAPER})
