@@ -48,7 +48,9 @@ def _flag(**changes):
 # ---- Python
 
 
-@pytest.mark.parametrize(("example", "output"), EXAMPLES, ids=["three lines", "by hand", "wind", "forces", "batches"])
+@pytest.mark.parametrize(
+    ("example", "output"), EXAMPLES, ids=["three lines", "by hand", "wind", "forces", "supports", "batches"]
+)
 def test_examples_of_the_page_print_what_it_shows(example, output, capsys):
     exec(compile(example, "docs/python.md", "exec"), {})
     printed, number = capsys.readouterr().out, r"[+-]?\d+\.\d+"
@@ -59,7 +61,7 @@ def test_examples_of_the_page_print_what_it_shows(example, output, capsys):
 
 
 def test_the_page_has_an_example_for_each_heading():
-    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 5
+    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 6
 
 
 def test_a_file_its_gaussians_and_what_made_them_are_the_same(tmp_path):
