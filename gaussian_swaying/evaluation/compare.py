@@ -331,7 +331,8 @@ class _Surface:
         self.points, self.seed, self.device = points, seed, device
         self.frame = _sim_frame(run, summary)
         recorded = len(load_trajectory(self.trajectory, 0)[0])
-        surface = summary.get("surface_particles") or summary.get("simulated_gaussians")
+        names = ("recorded_surface", "surface_particles", "simulated_gaussians")
+        surface = next((summary[name] for name in names if summary.get(name)), None)
         self.particles = min(int(surface or recorded), recorded)  # the other particles follow them
         generator = torch.Generator().manual_seed(seed)
         self.chosen = torch.randperm(self.particles, generator=generator)[:points].sort().values

@@ -265,6 +265,7 @@ class Run:
             "simulated_gaussians": len(scene.simulated),
             "loose_gaussians": scene.loose,
             "surface_particles": scene.on_surface,
+            "recorded_surface": scene.on_surface if scene.track is None else scene.tracked,
             "filled_particles": scene.filled,
             "mass_kg": float(solver.points.mass.sum()),
             "patch_area_m2": float(scene.patches.area.sum()),

@@ -46,6 +46,8 @@ from gaussian_swaying.simulation.defaults import (
 )
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
+    Gauge,
+    Measurement,
     SimulationDiverged,
     TearingGauge,
     check_spacing,
@@ -176,6 +178,7 @@ class Simulation(nn.Module):
         self._wind_parts: tuple[object, ...] = ()
         self._idle: tuple[tuple[object, ...], bool] | None = None
         self._tearing: TearingGauge | None = None
+        self._gauge = Gauge()
         self._started = 0  # how often; a loop over frames ends when another one begins
         self._text, self._changed, self._given = "", set(given), given
 
@@ -262,7 +265,8 @@ class Simulation(nn.Module):
         """The wind on the patches of the scene."""
         parts = (self.aero, self.wind, self.scene.patches)
         if not self._wind_force or any(a is not b for a, b in zip(parts, self._wind_parts, strict=True)):
-            self._wind_force, self._wind_parts = [WindForce(*parts)], parts
+            with torch.inference_mode(False), torch.no_grad():  # it outlives the call
+                self._wind_force, self._wind_parts = [WindForce(*parts)], parts
         return self._wind_force[0]
 
     @property
@@ -438,7 +442,7 @@ class Simulation(nn.Module):
                 end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
                 work = (end.work - state.work).sum()
                 # everything is launched before the host waits for the first time
-                health = measure(self.solver, end, steps, courant, work, self._tearing, state)
+                health = self._measured(end, steps, courant, work, state)
                 outran = (end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any()
                 cfl, outrun = torch.stack([courant.double(), outran.double()]).tolist()
                 too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
@@ -460,6 +464,12 @@ class Simulation(nn.Module):
                 end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
             )
         return end, measured
+
+    def _measured(self, end: MPMState, steps: int, courant: Tensor, work: Tensor, state: MPMState) -> Measurement:
+        """Start the measurements of a frame from ``state`` to ``end``."""
+        if self._tearing is None:
+            return self._gauge(self.solver, end, steps, courant, work, state)
+        return measure(self.solver, end, steps, courant, work, self._tearing, state)
 
     def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, naming the particle with the largest deformation."""

@@ -15,8 +15,11 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
+from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.preview.picture import classify
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.sampling import matched_points
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
 
@@ -298,3 +301,29 @@ def test_a_single_gaussian():
     scene = SimulatedScene(Scene(generator=Given(cloud)), Material(), 0.5)
     assert scene.points.count == 1
     assert torch.equal(scene.points.position.double(), scene.frame.point_to_sim(cloud.means.double()).float().double())
+
+
+def test_a_comparison_uses_all_recorded_gaussians(make_simulation, tmp_path):
+    """The trajectory has every Gaussian, however few points carry them, and the summary says so."""
+    simulation = make_simulation(cloud=FlagScene(spacing=0.02).generate(), dx=0.2, scene={"points": "grid"})
+    summary = simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(images=False, video=False))
+    assert summary["recorded_surface"] == len(FlagScene(spacing=0.02).generate()) > 4 * summary["surface_particles"]
+    assert len(load_trajectory(tmp_path / "run" / "trajectory.npz", 0)[0]) == summary["recorded_surface"]
+
+
+@pytest.mark.gpu
+def test_recorded_measurements_are_those_of_the_frame(make_simulation):
+    """From the second frame on they are replayed from a graph, also after an edit."""
+    simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": "grid"}).to("cuda")
+    with torch.inference_mode():
+        state = simulation.start()
+        for k in range(5):
+            if k == 3:
+                state = simulation.edit(state, Edit(density=50.0))
+            end, found = simulation.advance(state)
+            steps = found.substeps
+            expected = measure(simulation.solver, end, steps, found.cfl, found.wind_work, None, state).read()
+            for name, value in expected.as_dict().items():
+                assert getattr(found, name) == pytest.approx(value, rel=1e-6), name
+            state = end
+    assert simulation._gauge._graph is not None
