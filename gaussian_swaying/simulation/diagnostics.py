@@ -278,9 +278,9 @@ def measure(
 
 
 class Gauge:
-    """:func:`measure`, replayed from a CUDA graph where possible: some 150 small kernels take longer to start than to run.
+    """:func:`measure` from a CUDA graph, where possible: some 150 small kernels take longer to start than to run.
 
-    That is on a GPU, for a solver whose grid does not move, and for at most :data:`RECORDED` particles, as a graph keeps
+    That is on a GPU, for a solver whose grid does not move, and at most :data:`RECORDED` particles, as a graph keeps
     its memory. The first call with a body runs without recording.
     """
 

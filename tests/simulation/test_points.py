@@ -7,6 +7,7 @@ import os
 import pytest
 import torch
 
+from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.patches import deform_all
@@ -166,10 +167,12 @@ class Given(FlagScene):
 
 
 def test_it_moves_as_with_all_points(make_simulation):
-    """A flag of 16 Gaussians a cell: half a second of wind, within a twentieth of the distance moved."""
+    """A flag of 16 Gaussians a cell: half a second of wind, within 3 % of the distance moved."""
     ends = {}
     for points in ("gaussian", "grid"):
-        simulation = make_simulation(cloud=FlagScene(spacing=0.03).generate(), dx=0.12, scene={"points": points})
+        simulation = make_simulation(
+            cloud=FlagScene(spacing=0.03).generate(), dx=0.12, aero=AeroForce(law="projected"), scene={"points": points}
+        )
         with torch.inference_mode():
             state = simulation.start()
             for _ in range(12):
@@ -177,7 +180,7 @@ def test_it_moves_as_with_all_points(make_simulation):
             ends[points] = simulation.scene.deformed(state).means - simulation.scene.rest().means
     moved = ends["gaussian"].norm(dim=-1)
     assert float(moved.max()) > 0.1
-    assert float((ends["grid"] - ends["gaussian"]).norm(dim=-1).mean()) < 0.05 * float(moved.mean())
+    assert float((ends["grid"] - ends["gaussian"]).norm(dim=-1).mean()) < 0.03 * float(moved.mean())
 
 
 def test_holes_get_further_points(make_scene):
