@@ -187,9 +187,9 @@ class AeroForce(nn.Module):
 
     @property
     def mostly_linear(self) -> bool:
-        """Whether less than a tenth of the force depends on the side of the patch that the flow meets."""
+        """Whether less than 5 % of the force depends on the side of the patch that the flow meets."""
         sided = float(self.C_L.abs()) / max(float(self.C_D + self.C_F + self.C_L.abs()), 1e-30)
-        return self.law == "projected" and not self.unit_tangent and sided < 0.1
+        return self.law == "projected" and not self.unit_tangent and sided < 0.05
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
         """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component."""

@@ -31,7 +31,7 @@ MOST = 75
 
 _ANGLES = (0.003, 0.01, 0.03, 0.1, 0.25, 0.5)  # [rad] of the cells of directions; the coarsest make 3 x 5 x 5 of them
 
-_COARSE = 0.25
+_COARSE = 0.5
 """Smallest cell of directions [rad] where the sum of signs is a small part of the force."""
 
 
@@ -68,7 +68,7 @@ class PatchSums(nn.Module):
 
     Args:
         patches: The patches.
-        coarse: Whether directions up to 14 degrees apart may be joined: for the projected law, where only the lift
+        coarse: Whether directions up to 0.25 rad from their mean may be joined: for the projected law, where only the lift
             depends on the sum of signs.
 
     Attributes:
@@ -140,7 +140,7 @@ def joined_directions(
         area: Areas, shape (Q,).
         point: The point of each, shape (Q,).
         tensor: Sum of A N N^T of each point, shape (P, 3, 3).
-        coarse: Start with cells of 0.25 rad.
+        coarse: Start with cells of 0.5 rad.
 
     Returns:
         Vectors as long as the sum of their areas, shape (V, 3), and their points, ascending, shape (V,).
