@@ -17,6 +17,7 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import Material
 
+_FLAT, _BULK = 0.01, 0.15  # standard deviations [cubes] below which a group has no extent, and is thin
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness")
 
@@ -184,9 +185,11 @@ def grouped(
     matched = per_cell % 2 == 0
     cubes = per_cell // 2 if matched else per_cell
     group = grid_groups(samples.position.to(dtype), dx, cubes, samples.mass, samples.normal, label)
-    parts = torch.full((int(group.max()) + 1,), 3 if matched else 0)  # along how many directions a group is divided
+    parts = torch.full((int(group.max()) + 1,), matched)  # which groups are divided into several points
+    of = matched_points(samples.position, samples.mass, group, parts, dx / cubes)[2]
+    group, parts = _parted(group, parts, group.bincount() <= of.bincount())  # no more points than there were
     while True:
-        points, owner, of = _points_of(samples, group, parts, 0.05 * dx / cubes)
+        points, owner, of = _points_of(samples, group, parts, dx / cubes)
         astray = torch.zeros(len(points.position), dtype=torch.bool)
         centre = frame.point_to_scene(points.position)
         for region, mask in zip(apart, masks, strict=True):
@@ -195,22 +198,26 @@ def grouped(
         if not bool(astray.any()):
             break
         wrong = torch.zeros(len(parts), dtype=torch.bool).index_put((of[astray],), torch.tensor(True))
-        if bool((parts[wrong] == 0).any()):  # even its centre lies across a border: the samples stay alone
-            alone = (wrong & (parts == 0))[group]
-            new = torch.where(alone, len(parts) + torch.arange(len(group)), group)
-            kept, group = torch.unique(new, return_inverse=True)
-            parts = torch.cat([parts, torch.zeros(len(new), dtype=torch.long)])[kept]
+        if not bool(parts[wrong].all()):  # even its centre lies across a border: the samples stay alone
+            group, parts = _parted(group, parts, wrong & ~parts)
         else:
-            parts[wrong] = 0
+            parts[wrong] = False
     order = (~points.surface).long().argsort(stable=True)
     rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
     return points.choose(order), rank[owner]
 
 
-def _points_of(samples: Samples, group: Tensor, parts: Tensor, smallest: float) -> tuple[Samples, Tensor, Tensor]:
+def _parted(group: Tensor, parts: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
+    """The groups (N,) and whether each is divided (M,), where the samples of some groups (M,) stay alone."""
+    new = torch.where(which[group], len(parts) + torch.arange(len(group)), group)
+    kept, group = torch.unique(new, return_inverse=True)
+    return group, torch.cat([parts, torch.zeros(len(new), dtype=torch.bool)])[kept]
+
+
+def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> tuple[Samples, Tensor, Tensor]:
     """The points of all groups, the point of each sample, (N,), and the group of each point."""
     mass = samples.mass
-    position, owner, of = matched_points(samples.position, mass, group, parts, smallest)
+    position, owner, of = matched_points(samples.position, mass, group, parts, side)
     count = len(position)
     first = torch.full((len(parts),), len(group)).scatter_reduce_(0, group, torch.arange(len(group)), "amin")
     found = samples.choose(first[of])
@@ -234,22 +241,23 @@ def _points_of(samples: Samples, group: Tensor, parts: Tensor, smallest: float) 
 
 
 def matched_points(
-    position: Tensor, mass: Tensor, group: Tensor, parts: Tensor, smallest: float
+    position: Tensor, mass: Tensor, group: Tensor, parts: Tensor, side: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Points of equal mass that have the centre of mass and the second moments of their group.
 
-    They are the corners of a box around the centre, along the principal axes of the group:
-    :math:`\pm \sqrt{\lambda_k}` from it with the eigenvalues of the covariance. For a group that fills a cell, or a
-    sheet across it, they are the points of Gauss' rule with two points along each direction, so that the strain energy
-    of a linear strain is exact; a point at the centre alone makes a thin cord, whose stiffness in bending is a second
-    moment, too soft.
+    They are corners of a box around the centre, :math:`\pm \sqrt{\lambda_k}` from it along the principal axes, with the
+    eigenvalues of the covariance: all eight, or four of them, no two side by side, if the group is thinner than 0.3
+    cubes (twice :data:`_BULK`), or the two ends of a line. Four have the same second moments as eight. For a group that
+    fills a cell, or a flat sheet across it, they are the points of Gauss' rule with two points along each direction, so
+    that the strain energy of a linear strain is exact. A point at the centre alone makes a thin cord or a curved leaf
+    too soft, whose stiffness in bending is a second moment.
 
     Args:
         position: Samples [m], shape (N, 3), float64.
         mass: Their masses [kg], shape (N,).
         group: The group of each, shape (N,).
-        parts: Along how many principal axes, largest first, each group is divided at most, shape (M,).
-        smallest: Axes with a smaller standard deviation [m] are left out.
+        parts: Which groups are divided; the others get one point at their centre, bool, shape (M,).
+        side: Side of the cubes [m].
 
     Returns:
         Positions of the points [m], shape (P, 3), the point that each sample is closest to, by the signs of its
@@ -261,14 +269,17 @@ def matched_points(
     covariance = sums(mass[:, None, None] * arm[:, :, None] * arm[:, None, :], group) / total[:, None, None]
     values, axes = torch.linalg.eigh(covariance)
     size, axes = values.clamp(min=0).sqrt().flip(-1), axes.flip(-1)
-    divided = (size > smallest) & (torch.arange(3) < parts[:, None])
+    smallest = torch.tensor([_FLAT, _FLAT, _BULK], dtype=size.dtype) * side
+    divided = (size > smallest) & parts[:, None]
     count = 2 ** divided.sum(-1)
     start = count.cumsum(0) - count
     of = torch.repeat_interleave(torch.arange(len(count)), count)
     rank = torch.arange(len(of)) - start[of]
     bit = 2 ** (divided.long().cumsum(-1) - divided.long())  # of each divided axis
     sign = 2.0 * ((rank[:, None] // bit[of]) % 2) - 1
+    thin = divided[:, 1] & ~divided[:, 2]
     offset = torch.where(divided[of], sign * size[of], 0.0)
+    offset[:, 2] = torch.where(thin[of], sign[:, 0] * sign[:, 1] * size[of, 2], offset[:, 2])
     points = centre[of] + (axes[of] * offset[:, None, :]).sum(-1)
     side = (axes[group] * arm[:, :, None]).sum(1) > 0
     owner = start[group] + torch.where(divided[group] & side, bit[group], 0).sum(-1)

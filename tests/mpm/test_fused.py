@@ -182,6 +182,7 @@ def _agree(ends, tolerance=TOLERANCE, names=FIELDS):
         # what is taken is a part of the momentum of the body
         assert found.impulse.dtype == torch.float64
         scale = float(expected.velocity.abs().max()) * 0.01 * expected.position.shape[-2]
+        scale = max([scale, *expected.impulse.abs().reshape(-1).tolist()])
         torch.testing.assert_close(
             found.impulse, expected.impulse, rtol=0, atol=tolerance * scale, msg=lambda m: "impulse " + m
         )
