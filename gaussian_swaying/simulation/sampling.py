@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import Material
 
-_FLAT, _BULK = 0.01, 0.15  # standard deviations [cubes] below which a group has no extent, and is thin
+_FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness")
 
@@ -245,12 +245,12 @@ def matched_points(
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Points of equal mass that have the centre of mass and the second moments of their group.
 
-    They are corners of a box around the centre, :math:`\pm \sqrt{\lambda_k}` from it along the principal axes, with the
-    eigenvalues of the covariance: all eight, or four of them, no two side by side, if the group is thinner than 0.3
-    cubes (twice :data:`_BULK`), or the two ends of a line. Four have the same second moments as eight. For a group that
-    fills a cell, or a flat sheet across it, they are the points of Gauss' rule with two points along each direction, so
-    that the strain energy of a linear strain is exact. A point at the centre alone makes a thin cord or a curved leaf
-    too soft, whose stiffness in bending is a second moment.
+    They are the corners of a box around the centre, :math:`\pm \sqrt{\lambda_k}` from it along the principal axes, with
+    the eigenvalues of the covariance: eight, four for a flat group, two for a line. For a group that fills a cell, or a
+    flat sheet across it, they are the points of Gauss' rule with two points along each direction, so that the strain
+    energy of a linear strain is exact. A point at the centre alone makes a thin cord or a curved leaf too soft, whose
+    stiffness in bending is a second moment. Four corners of the eight, no two side by side, have the same second
+    moments, but some motions of a thin stalk strain none of them.
 
     Args:
         position: Samples [m], shape (N, 3), float64.
@@ -269,17 +269,14 @@ def matched_points(
     covariance = sums(mass[:, None, None] * arm[:, :, None] * arm[:, None, :], group) / total[:, None, None]
     values, axes = torch.linalg.eigh(covariance)
     size, axes = values.clamp(min=0).sqrt().flip(-1), axes.flip(-1)
-    smallest = torch.tensor([_FLAT, _FLAT, _BULK], dtype=size.dtype) * side
-    divided = (size > smallest) & parts[:, None]
+    divided = (size > _FLAT * side) & parts[:, None]
     count = 2 ** divided.sum(-1)
     start = count.cumsum(0) - count
     of = torch.repeat_interleave(torch.arange(len(count)), count)
     rank = torch.arange(len(of)) - start[of]
     bit = 2 ** (divided.long().cumsum(-1) - divided.long())  # of each divided axis
     sign = 2.0 * ((rank[:, None] // bit[of]) % 2) - 1
-    thin = divided[:, 1] & ~divided[:, 2]
     offset = torch.where(divided[of], sign * size[of], 0.0)
-    offset[:, 2] = torch.where(thin[of], sign[:, 0] * sign[:, 1] * size[of, 2], offset[:, 2])
     points = centre[of] + (axes[of] * offset[:, None, :]).sum(-1)
     side = (axes[group] * arm[:, :, None]).sum(1) > 0
     owner = start[group] + torch.where(divided[group] & side, bit[group], 0).sum(-1)

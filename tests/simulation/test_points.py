@@ -66,7 +66,7 @@ def test_points_of_a_group_have_its_moments(case):
     group = torch.randint(0, 5, (600,), generator=generator)
     points, owner, of = matched_points(place, mass, group, torch.full((5,), True), 1.0)
     assert torch.equal(of[owner], group)
-    assert len(points) == 5 * {"cloud": 8, "thin": 4, "sheet": 4, "line": 2, "point": 1}[case]
+    assert len(points) == 5 * {"cloud": 8, "thin": 8, "sheet": 4, "line": 2, "point": 1}[case]
     for k in range(5):
         own, x = mass[group == k], place[group == k]
         centre = (own[:, None] * x).sum(0) / own.sum()
@@ -220,7 +220,7 @@ def test_a_solid_is_grouped_too():
         "filling": InteriorFilling(),
     }
     full, scene = (SimulatedScene(Scene(points=p, **settings), Material(), 0.12) for p in ("gaussian", "grid"))
-    assert scene.points.count < full.points.count / 2
+    assert scene.points.count < 0.7 * full.points.count
     assert scene.filled > 0
     torch.testing.assert_close(scene.points.mass.sum(), full.points.mass.sum())
     torch.testing.assert_close(scene.patches.area, full.patches.area)
