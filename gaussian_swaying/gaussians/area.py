@@ -114,7 +114,9 @@ def coverage_area(
             rows = slice(start, start + 8192)
             # g of every candidate at this site, the site's own Gaussians first
             exponent = -0.5 * math.pi * distance[rows].square() / disc[index[rows]]
-            density = torch.cat([total[rows, None], torch.where(same[rows], total[index[rows]] * exponent.exp(), 0)], dim=1)
+            density = torch.cat(
+                [total[rows, None], torch.where(same[rows], total[index[rows]] * exponent.exp(), 0)], dim=1
+            )
             part = density * (cell[rows] / density.sum(1))[:, None]
             share[rows] += part[:, 0]
             share.index_add_(0, index[rows].reshape(-1), part[:, 1:].reshape(-1))
