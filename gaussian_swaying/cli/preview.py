@@ -140,7 +140,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     if options.minutes is not None:
         wish, finest = 60 * options.minutes, finest_spacing(found)
         costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
-        found = replace(found, dx=costs["starter"].dx, quality=f"for --minutes {options.minutes:g}")
+        found = replace(found, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
     simulation = made[found.dx]
     texts = {
         "draft": draft_yaml(found, options.scene),

@@ -205,7 +205,7 @@ def test_minutes_choose_the_grid_of_the_starter(
     assert data["cost"]["dx"] == data["run"]["dx_m"] == dx
     assert set(data["qualities"]) == {"draft", "normal", "fine"}
     assert len(measured) <= 5  # the draft, the starter, and a few more
-    assert f"quality for --minutes {minutes:g}" in (out / "starter.yaml").read_text()
+    assert f"Quality: --minutes {minutes:g}." in (out / "starter.yaml").read_text()
 
 
 @pytest.mark.usefixtures("untried")

@@ -74,8 +74,8 @@ def test_the_wind_of_the_vase_turns():
 def test_the_preset_is_a_small_version(name):
     """Fewer Gaussians on a coarser grid in a smaller picture; pins and regions still hold some.
 
-    A coarse grid is stiffer, so thicknesses, which the paper leaves open, may be smaller. Some are half as long; nothing
-    else differs.
+    A coarse grid is stiffer, so thicknesses, which the paper leaves open, may be smaller. Some are half as long.
+    Nothing else differs.
     """
     parser = Simulation.parser()
     full, small = (parser.parse_args(arguments) for arguments in (files(name)[:2], files(name)))

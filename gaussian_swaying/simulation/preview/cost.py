@@ -16,6 +16,7 @@ from gaussian_swaying._provenance import describe_device
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.recording.writer import WORKERS
 from gaussian_swaying.simulation.simulation import Simulation
 
 BUDGET = 2.5  # s; for the frames that are timed
@@ -149,14 +150,16 @@ def _timed_frames(simulation: Simulation, state: MPMState, at_rest: int) -> tupl
 def _picture_seconds(simulation: Simulation, state: MPMState, frame: float) -> float:
     """Time that the pictures of a frame add to the ``frame`` seconds without [s].
 
-    Two further threads and ffmpeg write the files and the video. They use other cores, if there are more than two.
+    Further threads and ffmpeg write the files and the video. If there are more than two cores, they use the others, and
+    the run waits only for what they cannot write in the time of a frame.
     """
     painter = simulation.painter
     count = (1 + len(painter.cameras)) * len(simulation.recorder.renders)  # as if all were the first
     image = painter.render(state, 0).color
     draw = count * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
     write = count * min(_seconds(simulation, lambda: _encode(image)) for _ in range(2))
-    return draw + write if _cores() <= 2 else max(draw, write - frame)
+    cores = _cores()
+    return draw + write if cores <= 2 else max(draw, write / min(WORKERS, cores - 1) - frame)
 
 
 def _cores() -> int:
@@ -194,6 +197,9 @@ def finest_within(
         draft: The same scene on another grid; its frames and pictures do not count.
         finest: Smallest grid spacing [m].
         coarsest: Largest grid spacing [m].
+
+    Raises:
+        ValueError: If the run cannot start on a grid that is coarser than the first; finer ones are passed over.
     """
     tried = {first.dx: first}
     for _ in range(3):
@@ -207,7 +213,12 @@ def finest_within(
         dx = min(_rounded_up(high), coarsest)
         if dx in tried:
             break
-        tried[dx] = measure(dx)
+        try:
+            tried[dx] = measure(dx)
+        except ValueError:  # a finer grid than the first may need too many nodes or points
+            if dx > first.dx:
+                raise
+            finest = min(1.25 * dx, first.dx)
     fitting = [cost for cost in tried.values() if cost.total_seconds <= seconds and cost.dx >= finest]
     if fitting:
         return min(fitting, key=lambda cost: cost.dx)

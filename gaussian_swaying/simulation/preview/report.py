@@ -89,7 +89,7 @@ def cost_lines(cost: Cost) -> list[str]:
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep at rest",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep",
         f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
 

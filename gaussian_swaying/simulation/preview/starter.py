@@ -74,7 +74,7 @@ def region_dict(region: Region) -> dict[str, Any]:
 
 def draft_yaml(suggestion: Suggestion, ply: str | Path) -> str:
     """A configuration for a first look: like :func:`starter_yaml`, of quality draft, with 2 s and a small picture."""
-    title = "# A first look, of quality draft: the same motion on a coarser grid, 2 s, a small picture."
+    title = "# A first look: 2 s, a small picture. Quality: draft."
     return _yaml(at_quality(suggestion, "draft"), ply, DRAFT_FRAMES, DRAFT_PICTURE, title)
 
 
@@ -89,7 +89,7 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
     Returns:
         YAML for ``--config`` of a simulation.
     """
-    title = f"# A first configuration, of quality {suggestion.quality}."
+    title = f"# A first configuration. Quality: {suggestion.quality}."
     return _yaml(suggestion, ply, frames, STARTER_PICTURE, title)
 
 

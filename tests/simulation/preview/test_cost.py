@@ -11,6 +11,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.vase import VaseScene
+from gaussian_swaying.simulation.preview import cost as cost_module
 from gaussian_swaying.simulation.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds
 from gaussian_swaying.simulation.scene import Material
 from gaussian_swaying.simulation.simulation import Simulation
@@ -68,8 +69,32 @@ def test_the_finest_grid_for_a_time_is_found(power, seconds):
     assert all(0.01 <= dx <= 0.06 and dx == float(f"{dx:.2g}") for dx in tried)
 
 
+def test_a_grid_that_is_too_fine_to_start_is_passed_over():
+    def measure(dx):
+        if dx < 0.018:
+            raise ValueError("too many nodes")
+        return cost(dx)
+
+    assert 0.018 <= finest_within(measure, 1e6, cost(0.04), cost(0.06), 0.01, 0.06).dx < 0.04
+    with pytest.raises(ValueError, match="too many nodes"):
+        finest_within(measure, 1e-6, cost(0.012), cost(0.06), 0.01, 0.015)
+
+
 def test_the_coarsest_grid_is_the_answer_if_none_is_fast_enough():
     assert finest_within(cost, 3.0, cost(0.04), cost(0.06), 0.01, 0.06).dx == 0.06
+
+
+def test_files_are_written_beside_the_simulation_where_there_are_cores(monkeypatch):
+    """A picture of 1 s, and 4 s for its files: two more threads write them, and a frame takes 0.5 s without it."""
+    simulation, clock = flag("cpu"), iter([1.0, 1.0, 4.0, 4.0] * 2)
+    state = simulation.start()
+    monkeypatch.setattr(cost_module, "_seconds", lambda simulation, work: next(clock))
+    monkeypatch.setattr(cost_module, "WORKERS", 2)
+    found = {}
+    for cores in (2, 4):
+        monkeypatch.setattr(cost_module, "_cores", lambda cores=cores: cores)
+        found[cores] = cost_module._picture_seconds(simulation, state, 0.5)
+    assert found == {2: 1 + 4, 4: 4 / 2 - 0.5}
 
 
 def flag(device):

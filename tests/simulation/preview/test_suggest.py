@@ -153,7 +153,7 @@ def test_a_quality_is_a_grid_and_nothing_else():
         same = dataclasses.replace(one, dx=0.042, quality="normal")
         assert starter_yaml(same, "flag.ply") == starter_yaml(found["normal"], "flag.ply")
         text = starter_yaml(one, "flag.ply")
-        assert text.startswith(f"# A first configuration, of quality {name}.\n")
+        assert text.startswith(f"# A first configuration. Quality: {name}.\n")
         assert f"# m; quality {name}: " in text
         assert yaml.safe_load(text)["solver"]["dx"] == one.dx
         assert draft_yaml(one, "flag.ply") == draft_yaml(found["normal"], "flag.ply")
