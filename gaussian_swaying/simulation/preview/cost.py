@@ -218,7 +218,7 @@ def finest_within(
         except ValueError:  # a finer grid than the first may need too many nodes or points
             if dx > first.dx:
                 raise
-            finest = min(1.25 * dx, first.dx)
+            finest = math.sqrt(dx * first.dx)
     fitting = [cost for cost in tried.values() if cost.total_seconds <= seconds and cost.dx >= finest]
     if fitting:
         return min(fitting, key=lambda cost: cost.dx)
