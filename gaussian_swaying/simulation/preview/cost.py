@@ -219,7 +219,7 @@ def finest_within(
             if dx > first.dx:
                 raise
             finest = math.sqrt(dx * first.dx)
-    fitting = [cost for cost in tried.values() if cost.total_seconds <= seconds and cost.dx >= finest]
+    fitting = [cost for cost in tried.values() if cost.total_seconds <= seconds]
     if fitting:
         return min(fitting, key=lambda cost: cost.dx)
     return tried[coarsest] if coarsest in tried else measure(coarsest)
