@@ -68,8 +68,8 @@ class PatchSums(nn.Module):
 
     Args:
         patches: The patches.
-        coarse: Whether directions up to 0.25 rad from their mean may be joined: for the projected law, where only the lift
-            depends on the sum of signs.
+        coarse: Whether directions up to 0.25 rad from their mean may be joined: for the projected law, where only the
+            lift depends on the sum of signs.
 
     Attributes:
         tensor: Sum of A N N^T [m²], shape (P, 3, 3).

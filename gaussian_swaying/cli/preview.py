@@ -8,10 +8,12 @@ import sys
 import time
 from argparse import ArgumentError
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gaussian_swaying import _program as program
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
@@ -23,12 +25,19 @@ from gaussian_swaying.simulation.preview.calibration import (
     calibrated_suggestion,
     check_sway,
 )
-from gaussian_swaying.simulation.preview.cost import Stopwatch, estimate_cost
+from gaussian_swaying.simulation.preview.cost import (
+    Cost,
+    Stopwatch,
+    estimate_cost,
+    finest_within,
+    scaled_seconds,
+)
 from gaussian_swaying.simulation.preview.doubts import doubts
 from gaussian_swaying.simulation.preview.photos import captured_from
 from gaussian_swaying.simulation.preview.picture import preview_picture
 from gaussian_swaying.simulation.preview.report import (
     cost_lines,
+    quality_lines,
     run_lines,
     splat_lines,
     suggestion_lines,
@@ -37,7 +46,13 @@ from gaussian_swaying.simulation.preview.report import (
 from gaussian_swaying.simulation.preview.results import Preview, splat_name, write
 from gaussian_swaying.simulation.preview.shape import DIRECTIONS, bounds
 from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
-from gaussian_swaying.simulation.preview.suggest import gaussian_statistics, suggest
+from gaussian_swaying.simulation.preview.suggest import (
+    QUALITIES,
+    at_quality,
+    finest_spacing,
+    gaussian_statistics,
+    suggest,
+)
 from gaussian_swaying.simulation.progress import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -78,6 +93,8 @@ def build_options() -> argparse.ArgumentParser:
         help="largest displacement in that wind, as a share of the longest side; stiffness and thickness follow",
     )
     add("--frames", type=int, default=250, help="frames of the configuration")
+    add("--quality", metavar="Q", help=f"grid of the starter: {', '.join(QUALITIES)}; default: normal")
+    add("--minutes", type=float, metavar="N", help="instead: the finest grid whose run takes at most this long here")
     add("--height", type=int, default=540, help="height of the picture [pixels]")
     add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
     return parser
@@ -102,21 +119,37 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
     up = None if options.up is None else _up(options.up)
     region = None if options.region is None else (options.region[:3], options.region[3:])
     capture = None if options.capture is None else captured_from(options.capture)
-    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture)
+    quality = options.quality or "normal"
+    found = suggest(cloud, up, options.hold, region, options.longest_side, options.wind, capture, quality)
     begin = Stopwatch()
     draft, settings = _pipeline(["--device", options.device], draft_yaml(found, options.scene))
     startup = LOADED + begin.quiet
     if settings.scene.ply != str(Path(options.scene).resolve()):
         raise ValueError(f"The path {options.scene!r} has another meaning in YAML: rename the file, without a colon.")
     found = calibrated_suggestion(found, draft, options.sway)
+    costs = {"draft": estimate_cost(draft, settings.frames, startup, found.growth)}
+    made: dict[float, Simulation] = {}  # the starter with several grids
+
+    def measure(dx: float) -> Cost:
+        text = starter_yaml(replace(found, dx=dx), options.scene, options.frames)
+        made[dx] = _pipeline(["--device", options.device], text)[0]
+        return estimate_cost(made[dx], options.frames, startup, found.growth)
+
+    costs["starter"] = measure(found.dx)
+    grids = {name: at_quality(found, name).dx for name in QUALITIES}
+    if options.minutes is not None:
+        wish, finest = 60 * options.minutes, finest_spacing(found)
+        costs["starter"] = finest_within(measure, wish, costs["starter"], costs["draft"], finest, grids["draft"])
+        found = replace(found, dx=costs["starter"].dx, quality=f"--minutes {options.minutes:g}")
+    simulation = made[found.dx]
     texts = {
         "draft": draft_yaml(found, options.scene),
         "starter": starter_yaml(found, options.scene, options.frames),
     }
-    simulation, starter = _pipeline(["--device", options.device], texts["starter"])
-    costs = {
-        "draft": estimate_cost(draft, settings.frames, startup_seconds=startup),
-        "starter": estimate_cost(simulation, starter.frames, startup_seconds=startup),
+    others = {
+        name: scaled_seconds(costs["starter"], costs["draft"], dx)
+        for name, dx in grids.items()
+        if name != found.quality
     }
     data: dict[str, Any] = {
         "splat": str(options.scene),
@@ -126,13 +159,15 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "run": run_dict(simulation),
         "cost": cost_dict(costs["starter"]),
         "draft_cost": cost_dict(costs["draft"]),
+        "qualities": {name: {"dx_m": grids[name], "total_seconds": time} for name, time in others.items()},
     }
-    report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found)]
+    report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found, simulation.scene.further)]
     if simulation.scene.loose:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
         report.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")
     report += [f"  {line}" for line in doubts(found, options, build_options().parse_args([]))]
     report += cost_lines(costs["starter"])
+    report += quality_lines(found, costs["starter"], options.minutes, grids, others)
     output, stem = Path("outputs"), splat_name(options.scene)
     report.append("")
     for name, what, where in (
@@ -163,7 +198,7 @@ def preview_config(options: argparse.Namespace) -> Preview:
     begin = Stopwatch()
     simulation, settings = _pipeline(arguments)
     startup = LOADED + begin.quiet
-    cost = estimate_cost(simulation, settings.frames, picture=settings.recorder.images, startup_seconds=startup)
+    cost = estimate_cost(simulation, settings.frames, startup)
     cloud = simulation.scene.model.to_cloud().to("cpu")
     data: dict[str, Any] = {
         "config": options.config,
@@ -250,6 +285,13 @@ def _preview(options: argparse.Namespace) -> None:
         raise ValueError("There is nothing to preview: give SCENE.ply, or --config with a scene.")
     if options.capture is not None and options.config is not None:
         raise ValueError("`--capture` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
+    if options.quality is not None and options.minutes is not None:
+        raise ValueError("`--quality` and `--minutes` both choose the grid of the starter: leave out one of them.")
+    if options.config is not None and (options.quality is not None or options.minutes is not None):
+        one = "--quality" if options.minutes is None else "--minutes"
+        raise ValueError(f"`{one}` is for suggestions, and `--config` is shown unchanged: leave out one of them.")
+    if options.minutes is not None:
+        check_positive("--minutes", options.minutes)
     if options.frames < 1:
         raise ValueError(f"Expected `--frames` to be at least 1, but got {options.frames}.")
     if not 64 <= options.height <= 4320:

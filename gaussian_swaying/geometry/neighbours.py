@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 _CROWD = 16  # points in the cell of a point, on average, on the first grid; 8 to 32 take about as long
+_PAIRS = 200_000  # candidate pairs of a chunk: few enough for the cache of a processor
 
 
 def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -33,15 +34,18 @@ def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None
         return distance, index
     low = both.amin(0)
     extent = max(float((both.amax(0) - low).amax()), torch.finfo(points.dtype).tiny * 1e20)
-    shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
+    around = torch.arange(-1, 2)
     pending = torch.arange(len(places))
     level = _first_level(points, low, extent)
     while len(pending):
         size = extent * 2.0**-level
         key, order = _cell_key(((points - low) / size).floor().long()).sort(stable=True)
+        # cells along z follow each other in the order of keys, except where keys are shared
+        shifts = torch.cartesian_prod(around, around, around if level >= 20 else torch.zeros(1, dtype=torch.long))
         wanted = _cell_key(((places[pending] - low) / size).floor().long()[:, None] + shifts)
-        begin = torch.searchsorted(key, wanted)
-        length = torch.searchsorted(key, wanted, right=True) - begin
+        beside = 0 if level >= 20 else 1
+        begin = torch.searchsorted(key, wanted - beside)
+        length = torch.searchsorted(key, wanted + beside, right=True) - begin
         candidates = length.sum(-1)
         last = level <= 0
         keep = torch.nonzero(candidates >= count + own).squeeze(-1)
@@ -49,7 +53,7 @@ def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None
         settled = torch.zeros(len(pending), dtype=torch.bool)
         start = 0
         while start < len(keep):
-            width = max(1, 4_000_000 // int(candidates[keep[min(start + 20_000, len(keep) - 1)]]))
+            width = max(1, _PAIRS // int(candidates[keep[min(start + 20_000, len(keep) - 1)]]))
             rows = keep[start : start + min(width, 20_000)]
             start += len(rows)
             query = pending[rows]
@@ -85,10 +89,10 @@ def _cell_key(cells: Tensor) -> Tensor:
 def _nearest_among(
     points: Tensor, place: Tensor, itself: Tensor, order: Tensor, begin: Tensor, length: Tensor, count: int
 ) -> tuple[Tensor, Tensor]:
-    """The nearest of the points in 27 runs (B, 27) of ``order`` for each place (B, 3), other than ``itself`` (B,)."""
+    """The nearest of the points in runs (B, R) of ``order`` for each place (B, 3), other than ``itself`` (B,)."""
     ends = length.cumsum(-1)
     column = torch.arange(int(ends[:, -1].max()))
-    run = torch.searchsorted(ends, column.expand(len(place), -1).contiguous(), right=True).clamp_max(26)
+    run = torch.searchsorted(ends, column.expand(len(place), -1).contiguous(), right=True).clamp_max(ends.shape[-1] - 1)
     at = begin.gather(-1, run) + column - (ends - length).gather(-1, run)
     who = order[at.clamp_max(len(points) - 1)]
     squared = (points[who] - place[:, None]).square().sum(-1)

@@ -17,6 +17,7 @@ from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.preview.cost import Cost
 from gaussian_swaying.simulation.preview.results import splat_name
 
 ROOT = Path(__file__).parents[2]
@@ -137,6 +138,76 @@ def test_edited_starter_is_kept(splat, tmp_path):
     assert not (out / "starter.3.yaml").exists()
 
 
+@pytest.fixture
+def dense(tmp_path):
+    """A flag that is fine enough for every quality."""
+    path = tmp_path / "dense.ply"
+    write_ply(path, FlagScene(spacing=0.012).generate())
+    return path
+
+
+def _spacing(folder):
+    return {
+        name: yaml.safe_load((folder / f"{name}.yaml").read_text())["solver"]["dx"] for name in ("draft", "starter")
+    }
+
+
+@pytest.mark.usefixtures("untried")
+def test_a_quality_chooses_the_grid_of_the_starter(dense, tmp_path, capsys):
+    spacings = {}
+    for quality in ("draft", "normal", "fine"):
+        out = tmp_path / quality
+        assert preview(dense, out, "--quality", quality, "--frames", "10") == 0
+        report = capsys.readouterr().out
+        data = json.loads((out / "preview.json").read_text())
+        assert data["suggestion"]["quality"] == quality
+        assert f"quality         {quality}: " in report
+        assert set(data["qualities"]) == {"draft", "normal", "fine"} - {quality}
+        for name, other in data["qualities"].items():
+            assert f"with dx = {other['dx_m']:g} m (--quality {name})" in report
+            finer = other["dx_m"] < data["cost"]["dx"]
+            assert (other["total_seconds"] > data["cost"]["total_seconds"]) == finer
+        assert "(--quality " + quality not in report
+        spacings[quality] = _spacing(out)
+    assert {one["draft"] for one in spacings.values()} == {spacings["draft"]["starter"]}
+    assert [one["starter"] for one in spacings.values()] == [0.062, 0.042, 0.021]
+
+
+@pytest.mark.usefixtures("untried")
+@pytest.mark.parametrize(
+    ("seconds_per_node", "minutes", "dx", "words"),
+    [
+        (1.0, 1e4, 0.02, "the finest for Gaussians so far apart"),
+        (10.0, 2.0, 0.054, "the finest grid that takes at most 2 min"),
+        (10.0, 0.01, 0.062, "warning: Even a draft takes about 88 s, longer than 600 ms: ask for fewer `--frames`."),
+    ],
+)
+def test_minutes_choose_the_grid_of_the_starter(
+    dense, tmp_path, capsys, monkeypatch, seconds_per_node, minutes, dx, words
+):
+    """With a run that takes a time in proportion to 1 / dx²."""
+    measured = []
+
+    def estimate(simulation, frames, startup_seconds=0.0, growth=1.0):
+        measured.append(simulation.solver.dx)
+        seconds = seconds_per_node * 0.034 / simulation.solver.dx**2
+        substep = seconds * simulation.solver.dx  # of 1 / dx of them
+        return Cost("", 1, simulation.solver.dx, (1, 1, 1), frames, 1.0, 1.0, 0.04, 1, substep, seconds, None)
+
+    monkeypatch.setattr("gaussian_swaying.cli.preview.estimate_cost", estimate)
+    out = tmp_path / "out"
+    assert preview(dense, out, "--minutes", str(minutes)) == 0
+    assert _spacing(out) == {"draft": 0.062, "starter": dx}
+    report = capsys.readouterr().out
+    assert words in report
+    assert report.count("warning") == words.count("warning")
+    data = json.loads((out / "preview.json").read_text())
+    assert data["cost"]["dx"] == data["run"]["dx_m"] == dx
+    assert set(data["qualities"]) == {"draft", "normal", "fine"}
+    assert len(measured) <= 5  # the draft, the starter, and a few more
+    assert f"Quality: --minutes {minutes:g}." in (out / "starter.yaml").read_text()
+
+
 @pytest.mark.usefixtures("untried")
 def test_options_replace_guesses(splat, tmp_path, capsys):
     assert preview(splat, tmp_path / "a", "--up", "-y", "--hold", "+x", "--longest-side", "2") == 0
@@ -207,6 +278,13 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--sway", "0"], "`--sway`"),
         (splat, ["--sway", "nan"], "`--sway`"),
         (splat, ["--height", "7"], "`--height`"),
+        (splat, ["--quality", "best"], "`--quality` to be one of draft, normal, fine"),
+        (splat, ["--minutes", "0"], "`--minutes`"),
+        (splat, ["--minutes", "nan"], "`--minutes`"),
+        (splat, ["--minutes", "inf"], "`--minutes`"),
+        (splat, ["--minutes", "1", "--quality", "fine"], "leave out one of them"),
+        (splat, ["--config", str(FLAG), "--quality", "fine"], "`--quality` is for suggestions, and"),
+        (splat, ["--config", str(FLAG), "--minutes", "3"], "`--minutes` is for suggestions, and"),
         (splat, ["--config", str(typo)], "dxx"),
         (splat, ["--config", str(FLAG), "--capture", str(tmp_path)], "`--capture` is for suggestions, and"),
         (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),

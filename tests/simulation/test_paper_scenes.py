@@ -74,13 +74,16 @@ def test_the_wind_of_the_vase_turns():
 def test_the_preset_is_a_small_version(name):
     """Fewer Gaussians on a coarser grid in a smaller picture; pins and regions still hold some.
 
-    A coarse grid is stiffer, so thicknesses, which the paper leaves open, may be smaller; nothing else differs.
+    A coarse grid is stiffer, so thicknesses, which the paper leaves open, may be smaller. Some are half as long.
+    Nothing else differs.
     """
     parser = Simulation.parser()
     full, small = (parser.parse_args(arguments) for arguments in (files(name)[:2], files(name)))
     changed = yaml.safe_load((CONFIGS / f"preview/{name}.yaml").read_text())
-    if name == "sand":  # half as long, of a larger bear, as sand takes the most substeps
-        assert (changed.pop("frames"), changed["scene"].pop("metres_per_unit")) == (125, 0.5)
+    if "frames" in changed:  # half as long, for scenes with many substeps
+        assert changed.pop("frames") == 125
+    if name == "sand":  # of a larger bear, as sand takes the most substeps
+        assert changed["scene"].pop("metres_per_unit") == 0.5
         sway = small.wind.modulations[0].init_args
         assert changed.pop("wind")["modulations"][0]["init_args"]["period"] == sway.period == 10.0
         assert (sway.amplitude, small.wind.modulations[1].init_args.std) == (0.5, 0.3)

@@ -59,7 +59,13 @@ def test_points_of_a_group_have_its_moments(case):
     """Mass, centre and covariance; as many points as the group has directions, two along each."""
     generator = torch.Generator().manual_seed(0)
     place = torch.randn(600, 3, generator=generator, dtype=torch.float64) * torch.tensor(
-        {"cloud": [1.0, 0.5, 0.3], "thin": [1.0, 0.5, 0.1], "sheet": [1.0, 0.5, 0.0], "line": [1.0, 0.0, 0.0], "point": [0.0, 0.0, 0.0]}[case]
+        {
+            "cloud": [1.0, 0.5, 0.3],
+            "thin": [1.0, 0.5, 0.1],
+            "sheet": [1.0, 0.5, 0.0],
+            "line": [1.0, 0.0, 0.0],
+            "point": [0.0, 0.0, 0.0],
+        }[case]
     )
     place = place @ torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))[0]
     mass = torch.rand(600, generator=generator, dtype=torch.float64)
@@ -85,7 +91,9 @@ def test_points_of_a_group_have_its_moments(case):
 def test_points_of_a_full_cell_are_those_of_gauss():
     axis = (torch.arange(40, dtype=torch.float64) + 0.5) / 40
     place = torch.cartesian_prod(axis, axis, axis[:1])
-    points, _, _ = matched_points(place, torch.ones(1600), torch.zeros(1600, dtype=torch.long), torch.tensor([True]), 1.0)
+    points, _, _ = matched_points(
+        place, torch.ones(1600), torch.zeros(1600, dtype=torch.long), torch.tensor([True]), 1.0
+    )
     found = (points[:, :2] - 0.5).abs()
     torch.testing.assert_close(found, torch.full((4, 2), 0.5 / 3**0.5).double(), rtol=1e-3, atol=0)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import pages, record, show
-from bench.cases import accuracy, flags, gallery, gradients, pareto, pins, points, runs, speed, training
+from bench.cases import accuracy, flags, gallery, gradients, pareto, pins, points, previews, runs, speed, training
 from bench.slots import SlotError
 
 
@@ -19,7 +19,7 @@ def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Nam
     def run(options: argparse.Namespace) -> None:
         device, result = record.start(options.device)
         options.device = device.type
-        if name == "gallery":
+        if name in ("gallery", "previews"):
             options.preset = options.preset or ("preview" if device.type == "cpu" else None)
         record.go_on(options, f"{name}_{device.type}", result, measure)
 
@@ -70,6 +70,8 @@ COMMANDS = {
                     _going_on("pins", pins.measure), pins.add_arguments),
     "gallery": Command("Run the paper's scenes and make pictures of them.",
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
+    "previews": Command("Compare the times that previews announce with those of runs.",
+                        _going_on("previews", previews.measure), previews.add_arguments),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),

@@ -18,6 +18,8 @@ from bench.tables import (
     pareto,
     pareto_plot,
     pins,
+    points,
+    previews,
     runs,
     speed,
     speed_plot,
@@ -25,7 +27,7 @@ from bench.tables import (
 )
 from gaussian_swaying._files import write_text
 
-TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, pins, runs, speed, training)
+TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, pins, points, previews, runs, speed, training)
 """The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {

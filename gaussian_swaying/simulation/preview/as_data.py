@@ -36,6 +36,7 @@ def suggestion_dict(found: Suggestion) -> dict[str, Any]:
         "size_m": list(found.size),
         "spacing_m": found.spacing,
         "dx_m": found.dx,
+        "quality": found.quality,
         "sheet": found.sheet,
         "azimuth": found.azimuth,
         "flow": list(found.flow),

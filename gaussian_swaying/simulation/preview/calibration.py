@@ -40,12 +40,14 @@ class Motion:
         stretch_min: Smallest stretch of all but :data:`STRETCHED` of the particles.
         stretch_max: Largest stretch of all but :data:`STRETCHED` of the particles.
         complete: False if the run was stopped because the scene moved much too far.
+        growth: Mean substeps of a frame over those of the first, as a material may stiffen when it is stretched.
     """
 
     share: float
     stretch_min: float
     stretch_max: float
     complete: bool = True
+    growth: float = 1.0
 
     @property
     def strain(self) -> float:
@@ -238,9 +240,10 @@ def measure_motion(
     motion, threads = Motion(0.0, 1.0, 1.0), torch.get_num_threads()
     torch.set_num_threads(1)  # for a few hundred particles more threads would only wait for each other
     try:
-        state = simulation.start()
+        state, taken = simulation.start(), []
         for _ in range(max(1, round(seconds / simulation.frame_dt))):
-            state, _ = simulation.advance(state)
+            state, health = simulation.advance(state)
+            taken.append(health.substeps)
             moved = torch.linalg.vector_norm(state.position - points.position, dim=-1)
             F = state.F_total.double()
             stretch = symmetric_eigenvalues(matmul3(F.mT, F)).clamp(min=0).sqrt()
@@ -248,6 +251,7 @@ def measure_motion(
                 max(motion.share, quantile(moved, MOVED) / side),
                 min(motion.stretch_min, quantile(stretch.amin(-1), STRETCHED)),
                 max(motion.stretch_max, quantile(stretch.amax(-1), 1 - STRETCHED)),
+                growth=sum(taken) / (len(taken) * taken[0]),
             )
             if motion.share > limit:
                 return replace(motion, complete=False)
@@ -272,4 +276,5 @@ def calibrated_suggestion(found: Suggestion, draft: Simulation, sway: float) -> 
         thickness=best.setting.thickness,
         flow=tuple(round(c * best.setting.wind, 2) for c in found.flow),
         stiffness_reason=best.reason,
+        growth=best.motion.growth,
     )

@@ -9,7 +9,7 @@ from typing import Any
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.simulation.preview.cost import Cost
 from gaussian_swaying.simulation.preview.starter import region_dict
-from gaussian_swaying.simulation.preview.suggest import Suggestion
+from gaussian_swaying.simulation.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
 from gaussian_swaying.simulation.progress import duration
 
 
@@ -30,8 +30,8 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
     ]
 
 
-def suggestion_lines(found: Suggestion) -> list[str]:
-    """The guesses."""
+def suggestion_lines(found: Suggestion, further: int) -> list[str]:
+    """The guesses, and the number of points that fill holes."""
     region = "all of space"
     if found.region.box is not None:
         region = json.dumps(dict(zip(("min", "max"), found.region.box, strict=True)))
@@ -49,10 +49,10 @@ def suggestion_lines(found: Suggestion) -> list[str]:
     lines += [
         f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
         f"{found.metres_per_unit:.4g} m, assuming a longest side of {found.longest_side:g} m",
-        f"grid            dx = {found.dx:g} m: {found.longest_side / found.dx:.0f} cells along the longest side, "
-        f"{found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of {found.spacing:.3g} m",
-        "further points  "
-        + ("none needed" if found.fill_spacing is None else f"every {found.fill_spacing:g} m on large Gaussians"),
+        f"grid            quality {found.quality}: dx = {found.dx:g} m, {found.longest_side / found.dx:.0f} cells "
+        f"along the longest side, {found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of "
+        f"{found.spacing:.3g} m",
+        "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
         f"material        {_material(found)}",
         f"wind            {_numbers(found.flow)} m/s, z up",
     ]
@@ -89,9 +89,45 @@ def cost_lines(cost: Cost) -> list[str]:
         f"waves of {cost.wave_speed:.3g} m/s)",
         f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
         f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
-        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep at rest",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep",
         f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
     ]
+
+
+def quality_lines(
+    found: Suggestion, cost: Cost, minutes: float | None, grids: dict[str, float], others: dict[str, float]
+) -> list[str]:
+    """Why the starter has its grid, and what the other qualities would cost.
+
+    Args:
+        found: The guesses, with the chosen grid.
+        cost: The cost of the starter.
+        minutes: The wanted time [minutes], if there is one.
+        grids: Grid spacings of the qualities [m].
+        others: Times of a run with the other ones [s], from scaling.
+    """
+    cells = found.longest_side / found.dx
+    chosen = f"  quality         {found.quality}: {cells:.0f} cells along the longest side"
+    lines = [chosen]
+    if minutes is not None:
+        wish = duration(60 * minutes)
+        if cost.total_seconds > 60 * minutes:
+            lines[0] = (
+                f"warning: Even a draft takes about {duration(cost.total_seconds)}, longer than {wish}: ask for fewer "
+                "`--frames`. The starter has the grid of a draft."
+            )
+        else:
+            why = f"the finest grid that takes at most {wish}"
+            if found.dx <= finest_spacing(found):
+                limited = found.dx > 1.02 * found.longest_side / MOST_CELLS
+                why = "the finest for Gaussians so far apart" if limited else "the finest that a preview chooses"
+            lines[0] = f"{chosen}, {why}"
+    for name, seconds in others.items():
+        if grids[name] == found.dx:
+            lines.append(f"    {name:<13} the same grid")
+        else:
+            lines.append(f"    {name:<13} about {duration(seconds)} with dx = {grids[name]:g} m (--quality {name})")
+    return lines
 
 
 def video_length(text: str) -> str:

@@ -6,13 +6,12 @@ import json
 import math
 import shlex
 import textwrap
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
-from gaussian_swaying.simulation.preview.suggest import DRAFT_CELLS, Suggestion, suggest_spacing
+from gaussian_swaying.simulation.preview.suggest import Suggestion, at_quality
 
 DRAFT_FRAMES = 51  # 2 s
 DRAFT_PICTURE = (480, 270)
@@ -51,12 +50,6 @@ material:
 """
 
 
-def _fill(s: Suggestion) -> str:
-    if s.fill_spacing is None:
-        return f"{'null':<12}# m; where Gaussians are large for the grid, 0.45 dx fills the holes between their centres"
-    return f"{s.fill_spacing:<12g}# m; 0.45 dx: fills the holes between the centres of large Gaussians"
-
-
 def region_dict(region: Region) -> dict[str, Any]:
     """A region as ``class_path`` and ``init_args``, open sides as None.
 
@@ -80,11 +73,9 @@ def region_dict(region: Region) -> dict[str, Any]:
 
 
 def draft_yaml(suggestion: Suggestion, ply: str | Path) -> str:
-    """A configuration for a first look, like :func:`starter_yaml`, with a coarser grid, 2 s and a small picture."""
-    dx = max(suggest_spacing(suggestion.longest_side, suggestion.spacing, DRAFT_CELLS), suggestion.dx)
-    fill = None if suggestion.fill_spacing is None else float(f"{0.45 * dx:.2g}")
-    coarse = replace(suggestion, dx=dx, fill_spacing=fill)
-    return _yaml(coarse, ply, DRAFT_FRAMES, DRAFT_PICTURE, "# A first look: the same motion on a coarser grid, 2 s.")
+    """A configuration for a first look: like :func:`starter_yaml`, of quality draft, with 2 s and a small picture."""
+    title = "# A first look: 2 s, a small picture. Quality: draft."
+    return _yaml(at_quality(suggestion, "draft"), ply, DRAFT_FRAMES, DRAFT_PICTURE, title)
 
 
 def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> str:
@@ -98,7 +89,8 @@ def starter_yaml(suggestion: Suggestion, ply: str | Path, frames: int = 250) -> 
     Returns:
         YAML for ``--config`` of a simulation.
     """
-    return _yaml(suggestion, ply, frames, STARTER_PICTURE, "# A first configuration.")
+    title = f"# A first configuration. Quality: {suggestion.quality}."
+    return _yaml(suggestion, ply, frames, STARTER_PICTURE, title)
 
 
 def _yaml(suggestion: Suggestion, ply: str | Path, frames: int, size: tuple[int, int], title: str) -> str:
@@ -136,13 +128,12 @@ scene:
   faint: carry
   loose: carry                  # and so do specks that hang on nothing or by a thread
   area: coverage
-  particle_spacing: {_fill(s)}
-  points: grid                  # as many as the grid can use; the Gaussians follow its nodes; gaussian: one for each
+  points: grid                  # as many as the grid can use, holes filled; the Gaussians follow its nodes
 
 {_material(s)}
 solver:
   formulation: total            # particles keep their neighbours: cannot tear
-  dx: {s.dx:<26.6g}# m; {s.longest_side / s.dx:.0f} cells along the longest side
+  dx: {s.dx:<26.6g}# m; quality {s.quality}: {s.longest_side / s.dx:.0f} cells along the longest side
   cfl: 0.4
   gravity: {gravity}     # m/s^2, z up; {why}
   damping: {0.2 if s.sheet else 1.0:<21.3g}# 1/s; losses in air and material

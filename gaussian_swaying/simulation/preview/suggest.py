@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying._checks import check_choice, check_positive, check_shape
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.subdivision import subdivide
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -34,8 +33,9 @@ from gaussian_swaying.simulation.preview.shape import (
 )
 from gaussian_swaying.simulation.preview.up import UpGuess, given_up, guess_up
 
-CELLS = 24  # along the longest side: enough for bending, and few enough for a laptop
-DRAFT_CELLS = 16  # the same for a first look
+QUALITIES = {"draft": 16, "normal": 24, "fine": 48}  # cells along the longest side; normal is enough for bending
+CELLS = QUALITIES["normal"]
+MOST_CELLS = 96  # of a grid that is chosen by its time
 CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
 SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; everything else: a shell of rubber
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
@@ -120,7 +120,7 @@ class Suggestion:
         size: Sides of the object along the z-up axes [m].
         spacing: Particle spacing [m], see :func:`particle_spacing`.
         dx: Grid spacing [m].
-        fill_spacing: Spacing of extra points on large Gaussians [m], see :func:`suggest_fill`; None if not needed.
+        quality: Which quality that is, one of ``QUALITIES``, or in words how it was chosen.
         sheet: Whether the object is a thin sheet.
         azimuth: Azimuth of a camera that sees the broad side, or the side seen in photos [degrees].
         flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
@@ -132,6 +132,7 @@ class Suggestion:
         camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
             of the moving part.
         camera_radius: Distance of a camera that shows the whole, in the same unit.
+        growth: How many times the substeps of a frame at rest a frame takes on average, from the trial runs.
     """
 
     up: UpGuess
@@ -143,7 +144,7 @@ class Suggestion:
     size: tuple[float, ...]
     spacing: float
     dx: float
-    fill_spacing: float | None
+    quality: str
     sheet: bool
     azimuth: float
     flow: tuple[float, ...]
@@ -153,6 +154,7 @@ class Suggestion:
     whole: tuple[list[float], list[float]]
     camera_offset: tuple[float, ...]
     camera_radius: float
+    growth: float = 1.0
 
 
 def suggest(
@@ -163,6 +165,7 @@ def suggest(
     longest_side: float = 1.0,
     speed: float = 6.0,
     capture: CapturedFrom | None = None,
+    quality: str = "normal",
 ) -> Suggestion:
     """Guess a first configuration.
 
@@ -174,6 +177,7 @@ def suggest(
         longest_side: Length of the longest side of the object [m].
         speed: Speed of the wind [m/s].
         capture: The cameras of the splat's photos, which define the up direction and the object.
+        quality: ``draft``, ``normal`` or ``fine``. Only the grid spacing depends on it.
 
     Returns:
         The suggestion.
@@ -183,6 +187,7 @@ def suggest(
     """
     check_positive("--longest-side", longest_side)
     check_positive("--wind", speed, allow_zero=True)
+    check_choice("--quality", quality, tuple(QUALITIES))
     if len(cloud) < FEWEST:
         raise ValueError(f"The splat has {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed.")
     means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
@@ -236,7 +241,7 @@ def suggest(
     outside = upward.ground if shown is None else upward.ground | ~shown.mask
     whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
     offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
-    return Suggestion(
+    found = Suggestion(
         up=upward,
         region=chosen,
         hold=held,
@@ -246,7 +251,7 @@ def suggest(
         size=tuple(float(v) for v in metres.amax(0) - metres.amin(0)),
         spacing=spacing,
         dx=dx,
-        fill_spacing=suggest_fill(cloud.select(chosen.simulated), frame.metres_per_unit, dx),
+        quality="normal",
         sheet=flat is not None,
         azimuth=round(azimuth + turn, 1),
         flow=tuple(round(c, 2) + 0.0 for c in flow),
@@ -257,6 +262,18 @@ def suggest(
         camera_offset=offset,
         camera_radius=radius,
     )
+    return at_quality(found, quality)
+
+
+def at_quality(found: Suggestion, quality: str) -> Suggestion:
+    """The same suggestion with the grid of another quality, one of ``QUALITIES``."""
+    spacing = suggest_spacing(found.longest_side, found.spacing, QUALITIES[quality])
+    return replace(found, dx=spacing, quality=quality)
+
+
+def finest_spacing(found: Suggestion) -> float:
+    """The finest grid spacing [m] that a time may choose: ``MOST_CELLS``, and at least twice the particle spacing."""
+    return suggest_spacing(found.longest_side, found.spacing, MOST_CELLS)
 
 
 def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
@@ -398,28 +415,6 @@ def suggest_spacing(longest_side: float, spacing: float, cells: int = CELLS) -> 
     """
     check_positive("longest_side", longest_side)
     return float(f"{max(longest_side / cells, 2 * spacing):.2g}")
-
-
-def suggest_fill(cloud: GaussianCloud, metres_per_unit: float, dx: float) -> float | None:
-    """``scene.particle_spacing``, if the splat has holes for the grid: points more than 0.6 cells from any centre.
-
-    Args:
-        cloud: The simulated Gaussians.
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
-
-    Returns:
-        0.45 ``dx`` rounded to 2 digits [m], or None if such points are fewer than 2 %, or far too many.
-    """
-    spacing = float(f"{0.45 * dx:.2g}")
-    opacity = cloud.opacities.sigmoid()
-    try:
-        further = subdivide(cloud.means, cloud.quats, cloud.scales, opacity, spacing / metres_per_unit).means
-    except ValueError:  # haze, which gets no extra points
-        return None
-    distance, _ = nearest_neighbours(cloud.means, 1, further)
-    holes = int((distance * metres_per_unit > 0.6 * dx).sum())
-    return spacing if holes > 0.02 * len(cloud) else None
 
 
 def broad_side(points: Tensor) -> float:

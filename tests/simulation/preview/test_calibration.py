@@ -100,7 +100,9 @@ def test_a_run_leaves_the_scene_as_it_was_and_feels_the_setting(make_simulation)
     base = Setting(3e3, 0.01)
     shares = {}
     for name, setting in (("base", base), ("weak", Setting(3e3, 0.01, 0.5)), ("thick", Setting(3e3, 0.03))):
-        shares[name] = measure_motion(simulation, setting, base, seconds=0.12).share
+        motion = measure_motion(simulation, setting, base, seconds=0.12)
+        shares[name] = motion.share
+        assert 0.9 < motion.growth < 1.5  # of three frames
         assert simulation.scene.points is points
         assert simulation.wind.flows is flows
     assert shares["weak"] == pytest.approx(shares["base"] / 4, rel=0.1)  # too short to be held back: by force

@@ -29,6 +29,7 @@ from gaussian_swaying.simulation.preview.picture import (
 )
 from gaussian_swaying.simulation.preview.starter import region_dict, starter_yaml
 from gaussian_swaying.simulation.preview.suggest import suggest
+from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.simulation import Simulation
 
 POLE = Box([None, None, None], [0.11, None, None])
@@ -104,7 +105,7 @@ def test_picture_and_cost_on_a_gpu(make_simulation):
     there = preview_picture(simulation, height=96).astype(int)
     assert there.shape == here.shape
     assert np.abs(there - here).mean() < 1  # of 255: lines may fall on other pixels by round-off
-    assert estimate_cost(simulation, 3, tries=1).particles == 96
+    assert estimate_cost(simulation, 3).particles == 96
 
 
 def test_flow_is_the_strongest_of_a_schedule(make_simulation):
@@ -118,17 +119,19 @@ def test_flow_is_the_strongest_of_a_schedule(make_simulation):
 
 def test_cost_is_the_product_of_its_parts(make_simulation):
     simulation = make_simulation(frame_dt=0.04)
-    cost = estimate_cost(simulation, frames=11, tries=1)
+    cost = estimate_cost(simulation, frames=11)
     # E = 3e3, nu = 0.3, 30 kg/m^3 by default of the fixture; c^2 = (lambda + 2 mu) / rho
     speed = math.sqrt(3e3 * 0.7 / (1.3 * 0.4) / 30)
     assert cost.wave_speed == pytest.approx(speed, rel=1e-5)
     assert cost.substeps >= math.ceil(0.04 / (0.4 * 0.2 / speed) - 1e-6)
-    assert cost.substep == pytest.approx(0.04 / cost.substeps)
+    assert cost.substep == pytest.approx(0.04 / simulation.solver.substeps(simulation.start(), 0.04))
     assert cost.substep <= cost.stable_substep
     assert cost.particles == 96
     assert cost.simulation_seconds == pytest.approx(10 * cost.substeps * cost.substep_seconds)
     assert cost.total_seconds == pytest.approx(cost.simulation_seconds + 11 * cost.picture_seconds)
-    assert estimate_cost(simulation, 2, tries=1, picture=False).picture_seconds is None
+    assert estimate_cost(simulation, 11, growth=3.0).substeps == pytest.approx(3 * 0.04 / cost.substep)
+    simulation.recorder = Recorder(images=False, video=False)
+    assert estimate_cost(simulation, 2).picture_seconds is None
 
 
 def test_cost_of_a_run_that_cannot_start_is_its_error(make_simulation):

@@ -11,6 +11,7 @@ import yaml
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import LOOSE
+from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.regions import Box, Cylinder
 from gaussian_swaying.geometry.rotations import quat_to_rotation
@@ -22,17 +23,18 @@ from gaussian_swaying.simulation.preview.starter import DRAFT_FRAMES, draft_yaml
 from gaussian_swaying.simulation.preview.suggest import (
     CELLS,
     CLOTH_E,
-    DRAFT_CELLS,
     KEPT_AREA,
     MAX_BOXES,
+    MOST_CELLS,
+    QUALITIES,
     SHELL_E,
     broad_side,
     connected_parts,
+    finest_spacing,
     gaussian_statistics,
     given_region,
     particle_spacing,
     suggest,
-    suggest_fill,
     suggest_region,
     suggest_spacing,
     suggest_threshold,
@@ -40,6 +42,7 @@ from gaussian_swaying.simulation.preview.suggest import (
 )
 from gaussian_swaying.simulation.preview.up import CONVENTION, floor_mask, guess_up
 from gaussian_swaying.simulation.scene import SPECK
+from gaussian_swaying.simulation.simulation import Simulation
 
 AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
 FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
@@ -126,19 +129,38 @@ def test_fine_flag_gets_the_cells_of_its_longest_side():
     assert found.metres_per_unit == pytest.approx(1.2 / (1.2 - 0.0125))
 
 
-def test_large_gaussians_get_further_points():
-    """A sheet of a few huge Gaussians: more points than Gaussians, as the run then has."""
+def test_holes_between_large_gaussians_are_filled_without_asking(tmp_path):
+    """A sheet of few, huge Gaussians."""
     cloud = FlagScene(spacing=0.05).generate()
-    assert suggest(cloud).fill_spacing is None
-    wide = cloud.scales + math.log(4) * (cloud.scales > cloud.scales.amin(-1, keepdim=True))
     few = torch.arange(len(cloud)) % 5 == 0
-    found = suggest(dataclasses.replace(cloud, scales=wide).select(few), longest_side=1.0)
-    fine = suggest_fill(dataclasses.replace(cloud, scales=wide).select(few), found.metres_per_unit, 0.06)
-    assert fine == 0.027
-    text = starter_yaml(dataclasses.replace(found, fill_spacing=fine), "flag.ply")
-    assert yaml.safe_load(text)["scene"]["particle_spacing"] == fine
-    text = starter_yaml(dataclasses.replace(found, fill_spacing=None), "flag.ply")
-    assert yaml.safe_load(text)["scene"]["particle_spacing"] is None
+    sparse = dataclasses.replace(cloud, scales=cloud.scales + math.log(4)).select(few)
+    write_ply(tmp_path / "flag.ply", sparse)
+    found = dataclasses.replace(suggest(sparse), dx=0.06)
+    (tmp_path / "starter.yaml").write_text(starter_yaml(found, tmp_path / "flag.ply"))
+    assert "particle_spacing" not in (tmp_path / "starter.yaml").read_text()
+    scene = Simulation.from_yaml(tmp_path / "starter.yaml", device="cpu").scene
+    assert scene.further > 0.5 * len(sparse)
+
+
+def test_a_quality_is_a_grid_and_nothing_else():
+    cloud = FlagScene(spacing=0.015).generate()
+    found = {name: suggest(cloud, quality=name) for name in QUALITIES}
+    assert {name: one.dx for name, one in found.items()} == {"draft": 0.062, "normal": 0.042, "fine": 0.025}
+    assert found["fine"].dx == pytest.approx(2 * found["fine"].spacing, rel=0.02)  # its Gaussians are too far apart
+    assert suggest(cloud).dx == found["normal"].dx
+    for name, one in found.items():
+        assert one.quality == name
+        same = dataclasses.replace(one, dx=0.042, quality="normal")
+        assert starter_yaml(same, "flag.ply") == starter_yaml(found["normal"], "flag.ply")
+        text = starter_yaml(one, "flag.ply")
+        assert text.startswith(f"# A first configuration. Quality: {name}.\n")
+        assert f"# m; quality {name}: " in text
+        assert yaml.safe_load(text)["solver"]["dx"] == one.dx
+        assert draft_yaml(one, "flag.ply") == draft_yaml(found["normal"], "flag.ply")
+    assert finest_spacing(found["normal"]) == found["fine"].dx
+    assert finest_spacing(dataclasses.replace(found["normal"], spacing=1e-4)) == float(f"{1 / MOST_CELLS:.2g}")
+    with pytest.raises(ValueError, match="Expected `--quality` to be one of draft, normal, fine, but got 'best'"):
+        suggest(cloud, quality="best")
 
 
 def test_given_values_replace_guesses():
@@ -365,7 +387,8 @@ def test_page_states_the_numbers_of_the_rules():
         f"z up (Blender), y down (COLMAP) | {CONVENTION['+z']:g} |",
         f"y up (glTF) | {CONVENTION['+y']:g} |",
         f"up to {MAX_BOXES} small boxes",
-        f"longest side over {CELLS} (in the draft over {DRAFT_CELLS})",
+        *(f"| `{name}` | {cells} |" for name, cells in QUALITIES.items()),
+        f"at most {MOST_CELLS} cells",
         f"{KEPT_AREA:.0%}".replace("%", " % of the visible area"),
         f"default is {calibration.SWAY:.0%}".replace("%", " %"),
         f"from {calibration.SOFTEST:.0e} to {calibration.STIFFEST:.0e} Pa".replace("e+0", "e"),
@@ -386,7 +409,7 @@ def test_page_states_the_numbers_of_the_rules():
 def test_draft_is_the_starter_on_a_coarser_grid():
     found = suggest(FlagScene(spacing=0.0125).generate())
     starter, draft = (yaml.safe_load(make(found, "flag.ply")) for make in (starter_yaml, draft_yaml))
-    assert draft["solver"]["dx"] == float(f"{1 / DRAFT_CELLS:.2g}") > starter["solver"]["dx"]
+    assert draft["solver"]["dx"] == float(f"{1 / QUALITIES['draft']:.2g}") > starter["solver"]["dx"]
     assert draft["frames"] == DRAFT_FRAMES < starter["frames"]
     assert draft["camera"]["init_args"]["height"] < starter["camera"]["init_args"]["height"]
     assert draft["scene"]["points"] == starter["scene"]["points"] == "grid"
