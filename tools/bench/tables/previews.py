@@ -10,7 +10,7 @@ from bench.tables.markdown import grid, source
 Row = dict[str, Any]
 
 
-@table("own_scene.md", "previews.rows", "previews_*")
+@table("benchmarks.md", "previews.rows", "previews_*")
 def rows(result: Row) -> list[str]:
     """Announced and taken times of whole processes."""
     head = ["run", "frames", "announced [s]", "taken [s]", "announced / taken", "substeps a frame, announced and taken"]
