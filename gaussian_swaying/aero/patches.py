@@ -26,13 +26,13 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying.gaussians.grouping import sums
 from gaussian_swaying.geometry.linalg import cofactor
 
-MOST = 75
+MOST = 243
 """Directions that are kept of the patches of one point; like ones are joined until there are no more."""
 
-_ANGLES = (0.003, 0.01, 0.03, 0.1, 0.25, 0.5)  # [rad] of the cells of directions; the coarsest make 3 x 5 x 5 of them
+_ANGLES = (0.003, 0.01, 0.03, 0.1, 0.25)  # [rad] of the cells of directions; the coarsest make 3 x 9 x 9 of them
 
-_COARSE = 0.5
-"""Smallest cell of directions [rad] where the sum of signs is a small part of the force."""
+_COARSE = (0.5,)
+"""The same where the sum of signs is a small part of the force; 3 x 5 x 5 cells."""
 
 
 class Patches(nn.Module):
@@ -152,7 +152,7 @@ def joined_directions(
     on_face = local * sign / local.gather(-1, major).abs()
     pending = torch.arange(len(point))
     cell = torch.zeros(len(point), 5, dtype=torch.long)
-    for level, angle in enumerate(angle for angle in _ANGLES if not coarse or angle >= _COARSE):
+    for level, angle in enumerate(_COARSE if coarse else _ANGLES):
         rows = torch.cat([(on_face[pending] / angle).round().long(), major[pending]], -1)
         cell[pending] = torch.cat([rows, torch.full_like(rows[:, :1], level)], -1)
         used = torch.unique(torch.cat([point[pending, None], rows], -1), dim=0)[:, 0].bincount(minlength=len(tensor))

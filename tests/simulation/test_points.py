@@ -8,12 +8,15 @@ import pytest
 import torch
 
 from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.geometry.patches import deform_all
+from gaussian_swaying.geometry.patches import deform_all, deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.diagnostics import measure
@@ -344,3 +347,29 @@ def test_recorded_measurements_are_those_of_the_frame(make_simulation):
             assert found.as_dict() == pytest.approx(expected.as_dict(), rel=1e-6)
             state = end
     assert simulation._gauge._graph is not None
+
+
+@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("scene", ["flag", "leaves", "noise"])
+def test_wind_on_the_groups_of_a_scene_is_that_on_its_patches(law, scene, make_cloud, make_scene):
+    """Within 1 % of the sum over the patches, in any direction, for moving and turned groups."""
+    cloud = {"flag": fine_flag, "leaves": LeavesScene(spacing=0.01).generate, "noise": lambda: make_cloud(4000)}[
+        scene
+    ]()
+    dx = 0.3 if scene == "noise" else 0.1
+    scene = make_scene(cloud, dx=dx, points="grid", dtype=torch.float64)
+    patches = scene.patches
+    assert scene.points.count < 0.7 * len(patches.area)
+    generator = torch.Generator().manual_seed(0)
+    turn = torch.linalg.qr(torch.randn(scene.points.count, 3, 3, generator=generator, dtype=torch.float64))[0]
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    velocity = torch.randn(scene.points.count, 3, generator=generator, dtype=torch.float64)
+    aero = AeroForce(law=law)
+    force = WindForce(aero, WindField([0.0, 0.0, 0.0]), patches)
+    state = MPMSolver(dx=dx).init_state(scene.points).replace(F_total=turn, velocity=velocity)
+    normal, area = deform_patch(turn[patches.point], patches.normal, patches.area)
+    for wind in torch.nn.functional.normalize(torch.randn(10, 3, generator=generator, dtype=torch.float64), dim=-1):
+        each = aero(6 * wind, velocity[patches.point], normal, area)
+        expected = torch.zeros_like(velocity).index_add(0, patches.point, each)
+        found = force.force(state, 6 * wind)[0]
+        assert float((found - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
