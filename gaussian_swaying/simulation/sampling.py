@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from gaussian_swaying.aero.patches import joined_directions
 from gaussian_swaying.gaussians.filling import Filling
 from gaussian_swaying.gaussians.grouping import grid_groups, sums
 from gaussian_swaying.geometry.frame import SimFrame
@@ -18,6 +19,9 @@ from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.material import Material
 
 _FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
+SHARED = 4
+"""Directions of a group up to which its points share them."""
+
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness")
 
@@ -159,7 +163,7 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 @torch.no_grad()
 def grouped(
     samples: Samples, dx: float, per_cell: int, apart: Sequence[Region], frame: SimFrame, dtype: torch.dtype
-) -> tuple[Samples, Tensor]:
+) -> tuple[Samples, Tensor, Tensor]:
     """Samples for a grid: one or a few for each group, which keep its mass, centre of mass and volume.
 
     A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not, or
@@ -175,7 +179,8 @@ def grouped(
         dtype: Precision of the solver.
 
     Returns:
-        The points as samples, those on the surface first, and the point that each sample belongs to, shape (N,).
+        The points as samples, those on the surface first; the point that each sample belongs to, shape (N,); and the
+        group of each point, shape (P,).
     """
     kinds = torch.stack([getattr(samples, name) for name in _PROPERTIES], -1)
     kind = torch.unique(kinds, dim=0, return_inverse=True)[1]
@@ -204,7 +209,46 @@ def grouped(
             parts[wrong] = False
     order = (~points.surface).long().argsort(stable=True)
     rank = torch.empty_like(order).scatter_(0, order, torch.arange(len(order)))
-    return points.choose(order), rank[owner]
+    return points.choose(order), rank[owner], of[order]
+
+
+@torch.no_grad()
+def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The patches that feel the wind, so that the points of a group share its wind as they share its mass.
+
+    A group of up to :data:`SHARED` directions is one patch of each direction at each of its points, with an equal part
+    of the area: the wind then has the second moments of the group, too. If each patch went to the point next to it,
+    some points of a cell that a sheet crosses obliquely would get much more wind than mass, and the sheet would
+    wrinkle. In a group of more directions, as in noisy captures, each patch does go to that point.
+
+    Args:
+        samples: The samples of the object.
+        owner: The point that each belongs to, shape (N,).
+        parent: The group of each point, shape (P,).
+
+    Returns:
+        Unit normals, shape (Q, 3), areas [m²], shape (Q,), and the point of each patch, shape (Q,).
+    """
+    feels = samples.area > 0
+    normal, area, point = samples.normal[feels], samples.area[feels], owner[feels]
+    group, count = parent[point], parent.bincount()
+    moment = area[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    tensor = moment.new_zeros(len(count), 3, 3).index_add_(0, group, moment)
+    vector, of = joined_directions(normal, area, group, tensor)
+    few = of.bincount(minlength=len(count)) <= SHARED
+    vector, of = vector[few[of]], of[few[of]]
+    times = count[of]  # a copy for each point of the group
+    copies = torch.repeat_interleave(torch.arange(len(of)), times)
+    rank = torch.arange(len(copies)) - (times.cumsum(0) - times)[copies]
+    members = parent.argsort(stable=True)
+    their_point = members[(count.cumsum(0) - count)[of[copies]] + rank]
+    size = vector.norm(dim=-1)
+    own = ~few[group]
+    return (
+        torch.cat([normal[own], (vector / size[:, None])[copies]]),
+        torch.cat([area[own], (size / times)[copies]]),
+        torch.cat([point[own], their_point]),
+    )
 
 
 def _parted(group: Tensor, parts: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,7 @@ from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.followers import Followers, GridFollowers, PointFollowers, on_material
 from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.sampling import grouped, sample_object
+from gaussian_swaying.simulation.sampling import grouped, sample_object, shared_wind
 
 __all__ = ["Material", "MaterialRegion", "Scene", "SimulatedScene"]
 
@@ -257,15 +257,15 @@ class SimulatedScene(nn.Module):
             raise ValueError('Expected `material.volume` "patch" with `scene.layers` 3: layers share a thickness.')
         owner = torch.arange(len(samples.position))
         chosen_samples = samples
+        feels = samples.area > 0
+        patches = samples.normal[feels], samples.area[feels], owner[feels]
         if by_grid:
-            chosen_samples, owner = grouped(samples, dx, scene.points_per_cell, apart, self.frame, dtype)
+            chosen_samples, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, self.frame, dtype)
+            patches = shared_wind(samples, owner, parent)
         self.points = chosen_samples.points(scene.layers, laws, dtype)
         self.on_surface = int(chosen_samples.surface.sum())
         self.filled = len(chosen_samples.surface) - self.on_surface
-        feels = samples.area > 0
-        self.patches = Patches(
-            samples.normal[feels].to(dtype), samples.area[feels].to(dtype), owner[feels], self.points.count
-        )
+        self.patches = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], self.points.count)
         self.max_stretch = scene.max_stretch
         self._kept: tuple[MaterialPoints, Tensor] | None = None
         carried = carried.nonzero()[:, 0]
