@@ -83,7 +83,7 @@ def test_everything_is_measured_and_shown(bench, tmp_path):
         assert row["ratio"] == pytest.approx(row["apart"]["median_ms"] / row["together"]["median_ms"])
         assert row["difference"] < 1e-5
     (frame,) = found["frame"]
-    assert (frame["particles"], frame["width"], frame["height"], frame["main"]) == (468, 64, 36, True)
+    assert (frame["particles"], frame["width"], frame["height"], frame["main"]) == (1536, 64, 36, True)
 
     text = _pages(bench, results)
     assert text.count("| `total`, sheet in wind, ") == 2

@@ -242,7 +242,12 @@ def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
     row: Row = spread([sum(part) for part in parts])
     names = ("simulation_ms", "shading_ms", "rendering_ms")
     row |= {name: statistics.median(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
-    row |= {"particles": simulation.solver.points.count, "width": width, "height": height}
+    row |= {
+        "particles": len(simulation.scene.simulated),
+        "points": simulation.solver.points.count,
+        "width": width,
+        "height": height,
+    }
     row |= {"substeps": statistics.median(substeps), "renderer": type(simulation.painter.renderer).__name__}
     return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory}
 
