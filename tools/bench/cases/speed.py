@@ -244,7 +244,6 @@ def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
     row |= {name: statistics.median(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
     row |= {
         "particles": len(simulation.scene.simulated),
-        "points": simulation.solver.points.count,
         "width": width,
         "height": height,
     }
