@@ -344,11 +344,18 @@ def test_a_sheet_of_one_layer_and_some_cells_thick(cells, formulation):
     assert log[-1].torn == 0
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_a_sheet_coarser_than_its_grid_is_reported(formulation):
+def test_a_sheet_coarser_than_its_grid_is_reported():
     """Particles four cells apart share no node and could not hang on the pole: refused, with a grid that would do."""
     with pytest.raises(ValueError, match=r"nearest neighbour, more than two cells.*raise `solver.dx` to about 0\.1 m"):
-        _advance(_flag(WindField(), formulation, dx=0.025, width=0.4, gravity=UP), 3)
+        _advance(_flag(WindField(), "updated", dx=0.025, width=0.4, gravity=UP), 3)
+
+
+def test_a_sheet_coarser_than_its_grid_is_filled():
+    """In `total` extra points fill the holes, and the same sheet hangs on its pole."""
+    simulation = _flag(WindField(), "total", dx=0.025, width=0.4, gravity=UP)
+    assert simulation.scene.further > 100
+    _, log = _advance(simulation, 3)
+    assert log[-1].stretch_max < 1.5
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -704,7 +711,12 @@ def test_gaussians_of_extreme_shape(scales):
     camera = OrbitCamera(width=32, height=18, azimuth=-70.0, radius=2.0)
     material = Material(E=1e4, density=50.0)
     simulation = Simulation(
-        Scene(generator=source), material, solver, WindField([2.0, 1.0, 0.0]), camera=camera, device="cpu"
+        Scene(generator=source, points="gaussian"),
+        material,
+        solver,
+        WindField([2.0, 1.0, 0.0]),
+        camera=camera,
+        device="cpu",
     )
     scene = simulation.scene
     assert bool((scene.points.mass > 0).all())
