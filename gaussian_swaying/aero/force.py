@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -227,38 +228,28 @@ class AeroForce(nn.Module):
         Returns:
             Shape (..., P, 3).
         """
-        return aero_force(
-            wind,
-            velocity,
-            normal,
-            area,
-            drag=self.C_D,
-            friction=self.C_F,
-            lift=self.C_L,
-            air_density=self.air_density,
-            law=self.law,
-            lift_direction=self.lift_direction,
-            unit_tangent=self.unit_tangent,
-        )
+        return aero_force(wind, velocity, normal, area, **self._numbers)
 
     def on_groups(
         self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums
     ) -> tuple[Tensor, Tensor]:
         """The result of :func:`~gaussian_swaying.aero.patches.grouped_force` with the numbers of this component."""
         return grouped_force(
-            wind,
-            velocity,
-            deformation_gradient,
-            patches,
-            drag=self.C_D,
-            friction=self.C_F,
-            lift=self.C_L,
-            air_density=self.air_density,
-            law=self.law,
-            lift_direction=self.lift_direction,
-            unit_tangent=self.unit_tangent,
-            max_area_ratio=self.max_area_ratio,
+            wind, velocity, deformation_gradient, patches, **self._numbers, max_area_ratio=self.max_area_ratio
         )
+
+    @property
+    def _numbers(self) -> dict[str, Any]:
+        """The keyword arguments of the force on patches."""
+        return {
+            "drag": self.C_D,
+            "friction": self.C_F,
+            "lift": self.C_L,
+            "air_density": self.air_density,
+            "law": self.law,
+            "lift_direction": self.lift_direction,
+            "unit_tangent": self.unit_tangent,
+        }
 
     def extra_repr(self) -> str:
         """The settings, for printing."""

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying.gaussians.grouping import sums
+from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.linalg import cofactor
 
 MOST = 243
@@ -60,7 +60,7 @@ class Patches(nn.Module):
 
     def areas(self) -> Tensor:
         """Area of the patches of each material point at rest [m²], shape (P,)."""
-        return self.area.new_zeros(self.count).index_add(0, self.point, self.area)
+        return sums(self.area, self.point, self.count)
 
 
 class PatchSums(nn.Module):
@@ -81,12 +81,9 @@ class PatchSums(nn.Module):
     def __init__(self, patches: Patches, coarse: bool = False) -> None:
         super().__init__()
         with torch.no_grad():
-            normal, area = patches.normal.double(), patches.area.double()
-            whole = patches.point.new_zeros(0) if patches.count == 0 else torch.arange(patches.count)
-            point = torch.cat([patches.point.cpu(), whole])  # so that every point has a sum
-            weighted = area[:, None, None] * normal[:, :, None] * normal[:, None, :]
-            tensor = sums(torch.cat([weighted.cpu(), weighted.new_zeros(patches.count, 3, 3).cpu()]), point)
-            vector, owner = joined_directions(normal.cpu(), area.cpu(), patches.point.cpu(), tensor, coarse)
+            normal, area, point = patches.normal.double().cpu(), patches.area.double().cpu(), patches.point.cpu()
+            tensor = second_moments(normal, area, point, patches.count)
+            vector, owner = joined_directions(normal, area, point, tensor, coarse)
         like = patches.area
         self.register_buffer("tensor", tensor.to(like), persistent=False)
         self.register_buffer("vector", vector.to(like), persistent=False)
@@ -125,6 +122,11 @@ class PatchSums(nn.Module):
         """Unit normal of each point, if it has patches of one direction, shape (P, 3); z where it has none."""
         normal = self.tensor.new_tensor([0.0, 0.0, 1.0]).repeat(len(self.tensor), 1)
         return normal.index_copy(0, self.point, torch.nn.functional.normalize(self.vector, dim=-1))
+
+
+def second_moments(normal: Tensor, area: Tensor, point: Tensor, count: int) -> Tensor:
+    """Sum of A N N^T over normals (Q, 3) and areas (Q,) of each point (Q,), shape (count, 3, 3)."""
+    return sums(area[:, None, None] * normal[:, :, None] * normal[:, None, :], point, count)
 
 
 def joined_directions(
@@ -210,7 +212,7 @@ def grouped_force(
     across = (turned * pulled[..., None, :]).sum(-1) / growth[..., None]  # T v_r
     dots = (patches.vector * pulled[patches.point]).sum(-1, keepdim=True)
     sign = torch.where(dots < 0, -1.0, 1.0)
-    signed = sums_at(sign * patches.vector, patches.point, relative)
+    signed = sums(sign * patches.vector, patches.point, len(relative))
     facing = (cof * signed[..., None, :]).sum(-1)  # s
     area = growth * rest
     pressure = drag * (speed * speed * facing if law == "paper" else speed * across)
@@ -221,7 +223,7 @@ def grouped_force(
         tangent = pulled[patches.point] - along * unit
         length = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
         tangent = size * tangent / length.clamp(min=torch.finfo(size.dtype).tiny)
-        tangents = (cof * sums_at(tangent, patches.point, relative)[..., None, :]).sum(-1)
+        tangents = (cof * sums(tangent, patches.point, len(relative))[..., None, :]).sum(-1)
         shear = friction * speed.square() * tangents
     else:
         shear = friction * speed * (area[..., None] * relative - across)
@@ -232,8 +234,3 @@ def grouped_force(
         cap = (max_area_ratio / growth).clamp(max=1.0)
         scale, area = scale * cap, area * cap
     return scale[..., None] * (pressure + shear + lifting), area
-
-
-def sums_at(values: Tensor, point: Tensor, like: Tensor) -> Tensor:
-    """Sum of values (V, 3) over the rows of each point, shape of ``like`` (P, 3)."""
-    return torch.zeros_like(like).index_add(0, point, values)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 LOOSE = 0.01  # share of the largest part; what is smaller and connected to nothing is loose
@@ -74,12 +75,6 @@ def grid_groups(
     spread = (sums(share * height.square(), group) / total).sqrt()
     two = (spread > _APART * dx) & (size[:, 2] > _ALIGNED * size.sum(-1))
     return torch.unique(2 * group + (two[group] & (height > 0)), return_inverse=True)[1]
-
-
-def sums(values: Tensor, group: Tensor) -> Tensor:
-    """Sum of values (N, ...) over the points of each group (N,); shape (M, ...), with M the largest group plus one."""
-    count = int(group.max()) + 1 if len(group) else 0
-    return values.new_zeros(count, *values.shape[1:]).index_add_(0, group, values)
 
 
 @torch.no_grad()

@@ -25,6 +25,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -88,9 +89,8 @@ class Rows:
 def means(values: Tensor, mass: Tensor, group: Tensor) -> Tensor:
     """The mean of values (P, n) over each group, weighted with masses (P,); groups are numbered from 0, shape (P,)."""
     weighted = torch.cat([mass[:, None] * values, mass[:, None]], dim=-1)
-    count = int(group.max()) + 1 if len(group) else 0
-    sums = weighted.new_zeros(count, weighted.shape[1]).index_add(0, group, weighted)
-    return sums[:, :-1] / sums[:, -1:]
+    total = sums(weighted, group)
+    return total[:, :-1] / total[:, -1:]
 
 
 @torch.no_grad()

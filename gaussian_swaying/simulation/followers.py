@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor, nn
 
@@ -11,7 +13,7 @@ from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bound
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 
 
-class Followers(nn.Module):
+class Followers(nn.Module, ABC):
     """Places of the material that are read from a state.
 
     Args:
@@ -32,12 +34,13 @@ class Followers(nn.Module):
             move = move + ((F - eye) * self.arm.to(F)[..., None, :]).sum(-1)
         return move, F
 
+    @abstractmethod
     def velocity(self, state: MPMState) -> Tensor:
         """Velocity of the places that are read [m/s], shape (M, 3)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
+        """Displacement and deformation gradient of the places that are read."""
 
 
 class PointFollowers(Followers):

@@ -8,10 +8,11 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from gaussian_swaying.aero.patches import joined_directions
+from gaussian_swaying.aero.patches import joined_directions, second_moments
 from gaussian_swaying.gaussians.filling import Filling
-from gaussian_swaying.gaussians.grouping import grid_groups, sums
+from gaussian_swaying.gaussians.grouping import grid_groups
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
@@ -232,9 +233,7 @@ def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor
     feels = samples.area > 0
     normal, area, point = samples.normal[feels], samples.area[feels], owner[feels]
     group, count = parent[point], parent.bincount()
-    moment = area[:, None, None] * normal[:, :, None] * normal[:, None, :]
-    tensor = moment.new_zeros(len(count), 3, 3).index_add_(0, group, moment)
-    vector, of = joined_directions(normal, area, group, tensor)
+    vector, of = joined_directions(normal, area, group, second_moments(normal, area, group, len(count)))
     few = of.bincount(minlength=len(count)) <= SHARED
     vector, of = vector[few[of]], of[few[of]]
     times = count[of]  # a copy for each point of the group
@@ -268,18 +267,13 @@ def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> t
     share = of.bincount()[of].double()
     alone = group.bincount()[of] == 1
     position = torch.where(alone[:, None], found.position, position)
-    weight = samples.area.clamp_min(1e-9 * samples.body_area).clamp_min(torch.finfo(torch.float64).tiny)
-    moment = weight[:, None, None] * samples.normal[:, :, None] * samples.normal[:, None, :]
-    of_group = sums(moment, group)[of]
-    own = torch.zeros(count, 3, 3, dtype=moment.dtype).index_add_(0, owner, moment)
+    of_group = second_moments(samples.normal, samples.body_area, group, len(parts))[of]
+    own = second_moments(samples.normal, samples.body_area, owner, count)
     empty = own.diagonal(dim1=1, dim2=2).sum(-1) == 0
     axis = torch.linalg.eigh(torch.where(empty[:, None, None], of_group, own))[1][..., 2]
     solid = of_group.diagonal(dim1=1, dim2=2).sum(-1) == 0
     normal = torch.where(solid[:, None], 0.0, torch.where(alone[:, None], found.normal, axis))
-    areas = {
-        name: torch.zeros(count, dtype=mass.dtype).index_add_(0, owner, getattr(samples, name))
-        for name in ("body_area", "area")
-    }
+    areas = {name: sums(getattr(samples, name), owner, count) for name in ("body_area", "area")}
     volume = sums(samples.volume, group)[of] / share
     return replace(found, position=position, normal=normal, volume=volume, **areas), owner, of
 

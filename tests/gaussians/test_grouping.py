@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.grouping import grid_groups, joined, loose_points, sums
+from gaussian_swaying.gaussians.grouping import grid_groups, joined, loose_points
+from gaussian_swaying.geometry.groups import sums
 
 DX = 0.1
 
