@@ -133,3 +133,14 @@ def test_a_capture_takes_the_place_of_the_generated_splat(tmp_path):
     assert len(simulation.scene.simulated) == 96
     assert simulation.scene.further > 1000  # its Gaussians are 5 cells apart
     assert simulation.scene.points.count == 3 * simulation.scene.on_surface  # three layers
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_each_scene_says_what_its_pins_hold(path):
+    """And why: the line has a comment."""
+    text = path.read_text(encoding="utf-8")
+    pins = text.count("PinnedRegion")
+    kinds = [line for line in text.splitlines() if line.strip().startswith("kind:")]
+    assert len(kinds) == pins
+    for line in kinds:
+        assert len(line.split("#", 1)[1].strip()) > 10
