@@ -40,19 +40,15 @@ def fingerprint(modules: Iterable[nn.Module]) -> tuple[tuple[object, ...], ...]:
     object that is not a module, such as a region, is not detected.
     """
     plain = (bool, int, float, str, type(None))
-    return tuple(
-        (
-            type(part),
-            *(
-                (name, value if isinstance(value, plain) else id(value))
-                for name, value in vars(part).items()
-                if not name.startswith("_")
-            ),
-            *((t.data_ptr(), t.shape) for t in (*part.parameters(recurse=False), *part.buffers(recurse=False))),
-        )
-        for module in modules
-        for part in module.modules()
-    )
+    found = []
+    for module in modules:
+        for part in module.modules():
+            values = vars(part)
+            own = [(n, v if isinstance(v, plain) else id(v)) for n, v in values.items() if n[0] != "_"]
+            tensors = (*values["_parameters"].values(), *values["_buffers"].values())  # many times faster than named_*
+            own += [(t.data_ptr(), t.shape) for t in tensors if t is not None]
+            found.append((type(part), *own))
+    return tuple(found)
 
 
 def record(

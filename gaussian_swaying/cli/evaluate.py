@@ -59,13 +59,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def compare(options: argparse.Namespace) -> None:
     """Compare, print the table and report the files."""
-    from gaussian_swaying.evaluation.compare import evaluate, table  # they need torchmetrics
-    from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
+    from gaussian_swaying.evaluation.compare import evaluate, table
 
     output = Path(options.output or Path(options.run) / "eval")
     device = resolve_device(options.device)
     network = None
     if options.i3d:
+        from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance  # torchmetrics takes seconds to load
+
         network = FrechetVideoDistance(options.i3d, options.clip_length, options.clip_stride, options.resize)
     result = evaluate(
         options.run,

@@ -7,11 +7,12 @@ import math
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
@@ -28,17 +29,21 @@ from gaussian_swaying.evaluation.comparison_picture import comparison_picture
 from gaussian_swaying.evaluation.reference import Cloth, frame_files, read_cloth, surface_points
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.rotations import rotation_from_z
+from gaussian_swaying.metrics.nearest import nearest_distances
+from gaussian_swaying.metrics.ssim import SSIM_TAPS, ssim_map
 from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.recording.video import VideoEncoder
 
 if TYPE_CHECKING:
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
-_SSIM_WINDOW = 11
+T = TypeVar("T")
+
+AHEAD = 2  # frames that each thread may be ahead of the video
 
 
 def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
-    """PSNR and SSIM from torchmetrics, for values from 0 to 1.
+    """PSNR and SSIM as torchmetrics computes them, for values from 0 to 1.
 
     Args:
         image: Picture of the run, shape (H, W, 3).
@@ -50,20 +55,19 @@ def picture_errors(image: Tensor, target: Tensor) -> dict[str, float]:
     Raises:
         ValueError: If the shapes differ or the pictures are smaller than the window of SSIM, 11 pixels.
     """
-    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+    found = {name: float(value) for name, value in _errors(image, target).items()}
+    return {"psnr_db": _psnr(found["mse"]), **found}
 
+
+def _errors(image: Tensor, target: Tensor) -> dict[str, Tensor]:
+    """``ssim`` and ``mse`` on the device of the pictures, so that the host need not wait for each frame."""
     check_shape("target", target, "H", "W", 3)
     check_shape("image", image, *target.shape)
-    if min(target.shape[:2]) < _SSIM_WINDOW:
-        raise ValueError(
-            f"Expected pictures of at least 11 x 11 pixels, but got {target.shape[1]} x {target.shape[0]}."
-        )
-    one, two = (rearrange(picture, "h w c -> 1 c h w") for picture in (image, target))
-    return {
-        "psnr_db": float(peak_signal_noise_ratio(one, two, data_range=1.0)),
-        "ssim": float(structural_similarity_index_measure(one, two, data_range=1.0)),  # type: ignore[arg-type]
-        "mse": float((one - two).square().mean()),
-    }
+    return {"ssim": ssim_map(image, target, "reflect").mean(), "mse": (image - target).square().mean()}
+
+
+def _psnr(mse: float) -> float:
+    return -10 * math.log10(mse) if mse > 0 else math.inf
 
 
 def compare_run(
@@ -162,26 +166,35 @@ def compare_run(
     encoder = None
     if video is not None and with_pictures:
         encoder = VideoEncoder(Path(video), 1 / float(summary.get("frame_dt_s") or 0.04))
-    small: dict[bool, list[Tensor]] = {True: [], False: []}
+
+    def compared(number: int) -> tuple[dict[str, Any], np.ndarray | None, list[Tensor]]:
+        """The numbers of a frame, its picture for the video, and what the network gets: reference and run."""
+        row: dict[str, Any] = {"frame": first + number, "reference_frame": first_reference + number}
+        film, small = None, []
+        if with_pictures:
+            image, target = (_read_frame(files[number], device) for files in (run_pictures, pictures))
+            row |= _errors(image, target)
+            if encoder is not None:
+                labels = (f"reference, frame {row['reference_frame']}", f"run, frame {row['frame']}")
+                film = comparison_picture(target, image, labels)
+            if fvd is not None:
+                small = [fvd.prepare(rearrange(picture, "h w c -> c h w")) for picture in (target, image)]
+        if surface is not None:
+            row |= surface.distances(first + number, first_reference + number)
+        return row, film, small
+
     rows: list[dict[str, Any]] = []
+    prepared: list[list[Tensor]] = []
     try:
-        for number in tqdm(range(count), unit="frame", disable=not progress, file=sys.stderr):
-            row: dict[str, Any] = {"frame": first + number, "reference_frame": first_reference + number}
-            if with_pictures:
-                image, target = (_read_frame(files[number], device) for files in (run_pictures, pictures))
-                row |= picture_errors(image, target)
-                if encoder is not None:
-                    labels = (f"reference, frame {row['reference_frame']}", f"run, frame {row['frame']}")
-                    encoder.write(comparison_picture(target, image, labels))
-                if fvd is not None:
-                    for real, picture in ((True, target), (False, image)):
-                        small[real].append(fvd.prepare(rearrange(picture, "h w c -> c h w")))
-            if surface is not None:
-                row |= surface.distances(first + number, first_reference + number)
+        done = in_threads(compared, count, device)
+        for row, film, small in tqdm(done, total=count, unit="frame", disable=not progress, file=sys.stderr):
+            if encoder is not None and film is not None:
+                encoder.write(film)
+            prepared += [small] if small else []
             rows.append(row)
         video_distance: dict[str, Any] | None = None
         if fvd is not None:
-            for real, pile in small.items():
+            for real, pile in zip((True, False), zip(*prepared, strict=True), strict=True):
                 fvd.update(torch.stack(pile), real=real)
             video_distance = {"fvd": float(fvd.compute()), **fvd.protocol()}
         if encoder is not None:
@@ -190,6 +203,7 @@ def compare_run(
         if encoder is not None:
             encoder.abort()
 
+    _read_all(rows)
     names = [name for name in rows[0] if name not in ("frame", "reference_frame")]
     mean = {name: float(np.mean([row[name] for row in rows])) for name in names}
     higher_is_better = ("psnr_db", "ssim")
@@ -208,11 +222,11 @@ def compare_run(
         "skipped": skipped,
         "seed": seed,
         "device": describe_device(device),
-        "versions": versions() | {"torchmetrics": version("torchmetrics")},
+        "versions": versions(),
         "run_status": summary.get("status"),
     }
     if with_pictures:
-        result["psnr_of_mean_db"] = -10 * math.log10(mean["mse"]) if mean["mse"] > 0 else math.inf
+        result["psnr_of_mean_db"] = _psnr(mean["mse"])
     if surface is not None and cloth is not None:
         side = side if side is not None else cloth.side
         result |= surface.about() | {"side_m": side, "chamfer_share": mean["chamfer_m"] / side if side else None}
@@ -337,9 +351,9 @@ class _Surface:
         generator = torch.Generator().manual_seed(seed)
         self.chosen = torch.randperm(self.particles, generator=generator)[:points].sort().values
         others = surface_points(cloth.positions[first_reference], cloth.faces, len(self.chosen), seed + 1)
-        self.sampling = self._distances(others, first_reference)["chamfer_m"]
+        self.sampling = float(self._distances(others, first_reference)["chamfer_m"])
 
-    def distances(self, frame: int, reference_frame: int) -> dict[str, float]:
+    def distances(self, frame: int, reference_frame: int) -> dict[str, Tensor]:
         position = load_trajectory(self.trajectory, frame)[0]
         if not bool(torch.isfinite(position).all()):
             raise ValueError(
@@ -349,11 +363,9 @@ class _Surface:
         in_scene = self.frame.point_to_scene(position[self.chosen].double()) * self.frame.metres_per_unit
         return self._distances(in_scene.float(), reference_frame)
 
-    def _distances(self, points: Tensor, reference_frame: int) -> dict[str, float]:
-        from gaussian_swaying.metrics.chamfer import nearest_distances
-
+    def _distances(self, points: Tensor, reference_frame: int) -> dict[str, Tensor]:
         surface = surface_points(self.cloth.positions[reference_frame], self.cloth.faces, self.points, self.seed)
-        there, back = (float(d.mean()) for d in nearest_distances(points.to(self.device), surface.to(self.device)))
+        there, back = (d.mean() for d in nearest_distances(points.to(self.device), surface.to(self.device)))
         return {"chamfer_m": 0.5 * (there + back), "run_to_reference_m": there, "reference_to_run_m": back}
 
     def about(self) -> dict[str, Any]:
@@ -364,6 +376,44 @@ class _Surface:
             "reference_points": self.points,
             "sampling_m": self.sampling,
         }
+
+
+def in_threads(work: Callable[[int], T], count: int, device: torch.device) -> Iterator[T]:
+    """``work(0)`` to ``work(count - 1)`` in order, computed by threads: one for each core, at most eight.
+
+    Reading and writing pictures takes longer than comparing them. On a CPU each thread computes with one core.
+    """
+    workers = max(1, min(8, os.cpu_count() or 1))
+    threads = torch.get_num_threads()
+    waiting: deque[Future[T]] = deque()
+
+    def one(number: int) -> T:
+        with torch.inference_mode():  # it is set per thread
+            return work(number)
+
+    pool = ThreadPoolExecutor(workers, "compare")
+    try:
+        if device.type == "cpu":
+            torch.set_num_threads(1)
+        for number in range(count):
+            waiting.append(pool.submit(one, number))
+            if len(waiting) > AHEAD * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(threads)
+
+
+def _read_all(rows: list[dict[str, Any]]) -> None:
+    """Replace the tensors of the frames by numbers (one GPU synchronisation), and add ``psnr_db``."""
+    names = [name for name, value in rows[0].items() if isinstance(value, Tensor)]
+    table = torch.stack([torch.stack([row[name].double() for name in names]) for row in rows]).tolist()
+    for row, values in zip(rows, table, strict=True):
+        row |= dict(zip(names, values, strict=True))
+        if "mse" in row:
+            row["psnr_db"] = _psnr(row["mse"])
 
 
 def _read_summary(run: Path) -> dict[str, Any]:
@@ -442,7 +492,7 @@ def _common_size(run: Path, reference: Path, ours: Sequence[Path], theirs: Seque
                 f"The picture {path} has {other[0]} x {other[1]} pixels, but the first one {size[0]} x {size[1]}: make "
                 "it again."
             )
-    if min(size) < _SSIM_WINDOW:
+    if min(size) < SSIM_TAPS:
         raise ValueError(f"The pictures have {size[0]} x {size[1]} pixels, but SSIM needs 11 x 11: make larger ones.")
     return size
 

@@ -1,1 +1,1 @@
-"""How far a run is from a reference: Chamfer and Fréchet video distance. PSNR and SSIM come from torchmetrics."""
+"""How far a run is from a reference: structural similarity, Chamfer and Fréchet video distance."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
+from gaussian_swaying._graphs import Repeater
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -281,8 +282,13 @@ class MPMSolver(nn.Module):
         """Longest substep [s] that is stable for any arrangement of particles (one GPU synchronisation)."""
         return self.bound.stable_substep(state)
 
-    def substeps(self, state: MPMState, frame_dt: float) -> int:
+    def substeps(self, state: MPMState, frame_dt: float, cells: float | None = None) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
+
+        Args:
+            state: The state now.
+            frame_dt: Length of the frame [s].
+            cells: What :meth:`cells_per_second` says, where it is known: then the host need not wait.
 
         Raises:
             ValueError: If the fixed substep is longer than the stable one; the message gives the limit.
@@ -296,7 +302,8 @@ class MPMSolver(nn.Module):
                 )
             steps = substeps_per_frame(frame_dt, self.substep, exact=True)
             return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
-        longest = self.cfl / max(float(self._cells_per_second(state)), 1e-30)
+        fastest = float(self.cells_per_second(state)) if cells is None else cells
+        longest = self.cfl / max(fastest, 1e-30)
         return substeps_per_frame(frame_dt, damped_substep(longest, self.bound.viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
@@ -304,10 +311,10 @@ class MPMSolver(nn.Module):
 
         With stiffness damping it is the number of the undamped substep that is equally stable.
         """
-        return math.sqrt(dt * dt + 2 * self.bound.viscous_time(state) * dt) * self._cells_per_second(state)
+        return math.sqrt(dt * dt + 2 * self.bound.viscous_time(state) * dt) * self.cells_per_second(state)
 
-    def _cells_per_second(self, state: MPMState) -> Tensor:
-        """How many cells the fastest wave crosses per second; computed in a kernel if there is one."""
+    def cells_per_second(self, state: MPMState) -> Tensor:
+        """How many cells the fastest wave crosses per second, a scalar tensor; in a kernel if there is one."""
         if self._fused_obstacle is None:
             from gaussian_swaying.mpm.triton.measures import largest_speed
 
@@ -461,13 +468,13 @@ class MPMSolver(nn.Module):
             dt: Substep [s].
             steps: Number of substeps.
             forces: As in :meth:`rollout`.
-            looks: Number of checks, evenly spaced; the last one is at the end.
+            looks: Number of checks, about evenly spaced, the last one at the end; fewer in short rollouts.
             watch: As in :meth:`rollout`.
 
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
         """
-        marks = sorted({math.ceil((k + 1) * steps / looks) for k in range(looks)})
+        marks = _marks(steps, looks)
         acting = as_forces(forces)
         if self.stiffness_damping == 0:
             fused = self._fused_for(state, acting)
@@ -507,6 +514,12 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
+
+
+def _marks(steps: int, looks: int) -> list[int]:
+    """Numbers of the substeps after which to look: multiples of what a CUDA graph repeats, and the last one."""
+    unit = max(size for size in Repeater.SIZES if size == 1 or looks * size <= 2 * steps)
+    return sorted({min(unit * math.ceil((k + 1) * steps / (looks * unit)), steps) for k in range(looks)})
 
 
 def _told(watch: WatchFunction, before: int, done: int) -> None:

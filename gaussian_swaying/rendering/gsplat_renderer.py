@@ -1,6 +1,11 @@
 """Renderer on top of the CUDA rasterizer of gsplat."""
 
+import sys
+from functools import cache
+from pathlib import Path
+
 import torch
+from filelock import FileLock, Timeout
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive
@@ -20,11 +25,40 @@ def gsplat_works() -> bool:
     if not torch.cuda.is_available():
         return False
     try:
+        return load_kernels()
+    except Exception:  # the compiler failed; its messages are on the terminal
+        return False
+
+
+@cache
+def load_kernels() -> bool:
+    """Load gsplat's CUDA kernels, or compile them at the first use on a machine.
+
+    One process compiles at a time and the others wait: gsplat 1.5.3 deletes the folder of a build that is not finished,
+    also if another process is at work there. Later calls do nothing.
+
+    Returns:
+        Whether there are kernels: False if gsplat finds no compiler.
+
+    Raises:
+        Exception: What the compiler says, if it fails.
+    """
+    from torch.utils.cpp_extension import _get_build_directory
+
+    lock = FileLock(Path(_get_build_directory("gsplat_cuda", verbose=False)).with_suffix(".lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        print("Another process is compiling the CUDA kernels of gsplat: waiting until it is done.", file=sys.stderr)
+        lock.acquire()
+    except OSError:  # a folder that cannot be written to: what lies there was compiled before
+        pass
+    try:
         from gsplat.cuda._backend import _C
     except ModuleNotFoundError:  # another version of gsplat, which keeps its kernels elsewhere
         return True
-    except Exception:  # the compiler failed; its messages are on the terminal
-        return False
+    finally:
+        lock.release()
     return _C is not None
 
 
@@ -37,9 +71,10 @@ def render_gsplat(
     background: Tensor | None = None,
     eps2d: float = 0.3,
 ) -> RenderOutput:
-    """Draw Gaussians with ``gsplat.rasterization`` (Ye et al. 2025, arXiv 2409.06765) in float32.
+    """Draw Gaussians as ``gsplat.rasterization`` (Ye et al. 2025, arXiv 2409.06765) does, in float32.
 
-    gsplat compiles its kernels at the first call, see :func:`gsplat_works`.
+    It is built from gsplat's functions: ``rasterization`` makes the host wait four times, and this once. gsplat
+    compiles its kernels at the first call, see :func:`load_kernels`.
 
     Args:
         means: Centres [scene units], on a CUDA device, shape (N, 3).
@@ -63,7 +98,8 @@ def render_gsplat(
         raise RuntimeError("GsplatRenderer needs CUDA, but torch finds no CUDA device: use TorchRenderer instead.")
     if means.device.type != "cuda":
         raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
-    from gsplat import rasterization
+    load_kernels()
+    from gsplat import fully_fused_projection
 
     dtype = means.dtype
     if means.shape[0] == 0:
@@ -71,25 +107,23 @@ def render_gsplat(
         return _compose(pixels[..., :4], pixels[..., 4:], background, dtype)
     # gsplat skips opacities below 1/255, but would draw a mean or covariance that is not finite.
     finite = finite_gaussians(means, covariances, opacities, colors)
-    opacities = torch.where(finite, opacities, 0.0)
-    view = camera.to(means.device, torch.float32)
-    pixels, alpha, _ = rasterization(
-        means=means.float(),
-        quats=None,  # not used with covars
-        scales=None,
-        opacities=opacities.float(),
-        colors=colors.float(),
-        viewmats=view.world_to_camera[None],
-        Ks=view.intrinsics[None],
-        width=camera.width,
-        height=camera.height,
-        near_plane=camera.near,
+    opacities = torch.where(finite, opacities, 0.0).float()
+    view, rows = camera.to(means.device, torch.float32), covariances.float()
+    radii, means2d, depths, conics, _ = fully_fused_projection(
+        means.float(),
+        torch.cat([rows[:, 0], rows[:, 1, 1:], rows[:, 2, 2:]], dim=-1),  # the upper triangle
+        None,
+        None,
+        view.world_to_camera[None],
+        view.intrinsics[None],
+        camera.width,
+        camera.height,
         eps2d=eps2d,
-        packed=True,
-        render_mode="RGB+D",
-        rasterize_mode="classic",
-        covars=covariances.float(),
+        near_plane=camera.near,
+        opacities=opacities,  # for a tighter radius
     )
+    values = torch.cat([colors.float()[None], depths[..., None]], dim=-1)
+    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera)
     return _compose(pixels[0], alpha[0], background, dtype)
 
 
@@ -126,15 +160,9 @@ def rasterize_splat(
     Returns:
         Colours (1, H, W, 3), alphas (1, H, W, 1), centres on the screen (1, N, 2) and radii (1, N, 2) [pixels].
     """
-    from gsplat import (
-        fully_fused_projection,
-        isect_offset_encode,
-        isect_tiles,
-        rasterize_to_pixels,
-        spherical_harmonics,
-    )
+    load_kernels()
+    from gsplat import fully_fused_projection, spherical_harmonics
 
-    width, height = camera.width, camera.height
     radii, means2d, depths, conics, _ = fully_fused_projection(
         means,
         None,
@@ -142,8 +170,8 @@ def rasterize_splat(
         scales,
         camera.world_to_camera[None],
         camera.intrinsics[None],
-        width,
-        height,
+        camera.width,
+        camera.height,
         eps2d=eps2d,
         near_plane=camera.near,
         opacities=opacities,  # for a tighter radius
@@ -151,27 +179,47 @@ def rasterize_splat(
     seen = (radii > 0).all(-1)
     toward = (means - camera.position)[None]
     colors = spherical_harmonics(sh_degree(sh.shape[1]), toward, sh[None], masks=seen)
-    tiles = (-(-width // _TILE), -(-height // _TILE))
+    values = (colors + 0.5).clamp_min(0.0)
+    behind = None if background is None else background.to(means)[None]
+    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera, behind, absgrad)
+    return pixels, alpha, means2d, radii
+
+
+def _rasterize(
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    conics: Tensor,
+    values: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Sort the Gaussians into tiles, for which the host waits, and blend values: (1, H, W, C) and (1, H, W, 1)."""
+    from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
+
+    tiles = (-(-camera.width // _TILE), -(-camera.height // _TILE))
     _, crossings, order = isect_tiles(means2d, radii, depths, _TILE, *tiles)
     offsets = isect_offset_encode(crossings, 1, *tiles).reshape(1, tiles[1], tiles[0])
     pixels, alpha = rasterize_to_pixels(
         means2d,
         conics,
-        (colors + 0.5).clamp_min(0.0),
+        values,
         opacities[None],
-        width,
-        height,
+        camera.width,
+        camera.height,
         _TILE,
         offsets,
         order,
-        backgrounds=None if background is None else background.to(means)[None],
+        backgrounds=background,
         absgrad=absgrad,
     )
-    return pixels, alpha, means2d, radii
+    return pixels, alpha
 
 
 def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: torch.dtype) -> RenderOutput:
-    """Split colour and depth and add the background, which gsplat 1.5.3 refuses together with packed=True."""
+    """Split colour and depth, and put the background behind the colour."""
     color, depth = pixels[..., :3], pixels[..., 3:].clone()
     if background is not None:
         color = torch.addcmul(color, 1.0 - alpha, background.to(color))

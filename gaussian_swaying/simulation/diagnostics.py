@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -210,28 +212,55 @@ class Measurement:
         self._solver, self._substeps, self._given = solver, substeps, given
         self._sizes = {name: len(part) for name, part in parts.items()}
         self._values = torch.cat(list(parts.values()))
+        self._found: dict[str, list[Any]] = {}
 
     def again(self, substeps: int) -> Measurement:
         """The same measurements with the values that a replayed graph has written now."""
         new = copy.copy(self)
-        new._substeps, new._values = substeps, self._values.clone()
+        new._substeps, new._values, new._found = substeps, self._values.clone(), {}
         return new
+
+    def _wait(self) -> dict[str, list[Any]]:
+        """All numbers by name (one GPU synchronisation, the first time)."""
+        if not self._found:
+            values = iter(self._values.tolist())
+            self._found = {name: [next(values) for _ in range(size)] for name, size in self._sizes.items()}
+        return self._found
+
+    def _number(self, place: int) -> float:
+        """Of the given numbers the first or second, which may be a tensor."""
+        value = self._given[place]
+        if not isinstance(value, Tensor):
+            return float(value)
+        return float(self._wait()["given"][sum(isinstance(before, Tensor) for before in self._given[:place])])
+
+    @property
+    def cfl(self) -> float:
+        """Largest Courant number of the frame."""
+        return self._number(0)
+
+    @property
+    def outran(self) -> bool:
+        """Whether a particle with a finite position left the grid in the frame."""
+        return bool(self._wait()["outran"][0])
+
+    @property
+    def more(self) -> list[float]:
+        """Further numbers that :func:`measure` was given."""
+        return self._wait()["more"]
 
     def read(self, check: bool = False) -> FrameDiagnostics:
         """Wait for the measurements (one GPU synchronisation); see :func:`diagnose`."""
-        values = iter(self._values.tolist())
-        found = {name: [next(values) for _ in range(size)] for name, size in self._sizes.items()}
+        found = self._wait()
         if check:
             _raise_if_bad(self._solver, found["verdict"], found["time"][0])
-        known = iter(found["given"])
-        cfl, wind_work = (next(known) if isinstance(value, Tensor) else float(value) for value in self._given)
         axes = [f"{kind}momentum_{axis}" for kind in ("", "angular_") for axis in "xyz"]
         return FrameDiagnostics(
             time=found["time"][0],
             substeps=self._substeps,
-            cfl=cfl,
+            cfl=self.cfl,
             **dict(zip(("kinetic", "elastic", "potential"), found["energy"], strict=True)),
-            wind_work=wind_work,
+            wind_work=self._number(1),
             **dict(zip(axes, found["momentum"], strict=True)),
             lost=int(found["counts"][0]),
             torn=int(sum(found["counts"][1:])),
@@ -250,8 +279,12 @@ def measure(
     wind_work: Tensor | float = 0.0,
     tearing: TearingGauge | None = None,
     before: MPMState | None = None,
+    more: Tensor | None = None,
 ) -> Measurement:
-    """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device."""
+    """Start the measurements of :func:`diagnose`, with the same arguments, without waiting for the device.
+
+    ``more`` are further numbers to read with them, float64, shape (n,).
+    """
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
     energies, momenta = solver.energies(state), solver.momenta(state)
     energy = torch.stack([energies[name] for name in ("kinetic", "elastic", "potential")]).double()
@@ -273,6 +306,8 @@ def measure(
         "given": torch.cat(given) if given else stretch[:0],
         "support": _supports(state if before is None else before, state),
         "verdict": _verdict(solver, state, moved),
+        "outran": _outran(state if before is None else before, state),
+        "more": stretch[:0] if more is None else more,
     }
     return Measurement(solver, substeps, parts, [cfl, wind_work])
 
@@ -287,7 +322,7 @@ class Gauge:
     def __init__(self) -> None:
         self._key: tuple[object, ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._inputs: tuple[list[Tensor], list[Tensor]] = ([], [])
+        self._inputs: list[Tensor] = []
         self._made: Measurement | None = None
 
     def __getstate__(self) -> dict[str, object]:
@@ -295,29 +330,58 @@ class Gauge:
         return vars(Gauge())
 
     def __call__(
-        self, solver: MPMSolver, state: MPMState, substeps: int, cfl: Tensor, work: Tensor, before: MPMState
+        self,
+        solver: MPMSolver,
+        state: MPMState,
+        substeps: int,
+        cfl: Tensor,
+        work: Tensor,
+        before: MPMState,
+        more: Callable[[MPMState, Tensor], Tensor] | None = None,
+        given: Tensor | None = None,
+        same: tuple[object, ...] = (),
     ) -> Measurement:
-        """As :func:`measure`, without counting torn particles."""
+        """As :func:`measure`, without counting torn particles.
+
+        Args:
+            solver: The solver that made the state.
+            state: The state at the end of the frame.
+            substeps: Substeps of the frame.
+            cfl: Largest Courant number of the frame.
+            work: Work of the wind during the frame [J].
+            before: The state at the start of the frame.
+            more: Function of the state and ``given`` that computes further numbers; it may be recorded.
+            given: What it gets besides the state.
+            same: What it depends on besides; another value is another recording.
+        """
+        given = cfl if given is None else given
+
+        def now() -> Measurement:
+            return measure(
+                solver, state, substeps, cfl, work, None, before, None if more is None else more(state, given)
+            )
+
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
         if not small or not solver.neighbours_fixed or state.F_elastic is not state.F_total or torch.is_grad_enabled():
-            return measure(solver, state, substeps, cfl, work, None, before)
-        key = (solver.bound, state.grid, state.position.shape, state.impulse.shape)
+            return now()
+        key = (solver.bound, state.grid, state.position.shape, state.impulse.shape, more is None, given.shape, *same)
         if key != self._key:
             self._key, self._graph = key, None
-            return measure(solver, state, substeps, cfl, work, None, before)
-        after, old = _fields(state), _fields(before)
+            return now()
+        wanted = (*_fields(state), cfl, work, given, before.impulse, before.time)
         if self._graph is None:
             with torch.inference_mode(False), torch.no_grad():
-                self._inputs = [t.clone() for t in (*after, cfl, work)], [t.clone() for t in old]
-            *now, its_cfl, its_work = self._inputs[0]
-            end, start = _with_fields(state, now), _with_fields(before, self._inputs[1])
+                self._inputs = [tensor.clone() for tensor in wanted]
+            *fields, its_cfl, its_work, its_given, impulse, began = self._inputs
+            end = _with_fields(state, fields)
+            start = end.replace(impulse=impulse, time=began)
 
             def launch() -> None:
-                self._made = measure(solver, end, substeps, its_cfl, its_work, None, start)
+                others = None if more is None else more(end, its_given)
+                self._made = measure(solver, end, substeps, its_cfl, its_work, None, start, others)
 
             self._graph = record(state.position.device, launch)
-        for mine, given in zip((*self._inputs[0], *self._inputs[1]), (*after, cfl, work, *old), strict=True):
-            mine.copy_(given)
+        torch._foreach_copy_(self._inputs, list(wanted))
         self._graph.replay()
         assert self._made is not None
         return self._made.again(substeps)
@@ -341,6 +405,12 @@ def _supports(before: MPMState, after: MPMState) -> Tensor:
     """Force on each boundary [N], summed over the scenes, float64, shape (3 * boundaries,)."""
     force = support_force(before, after)
     return force.reshape(force.shape[:-2].numel(), *force.shape[-2:]).sum(0).reshape(-1)
+
+
+def _outran(before: MPMState, after: MPMState) -> Tensor:
+    """Whether a particle with a finite position left the grid in between, float64, shape (1,)."""
+    new = after.lost & ~before.lost & torch.isfinite(after.position).all(-1)
+    return new.any().double().reshape(1)
 
 
 def check_state(solver: MPMSolver, state: MPMState) -> None:

@@ -139,16 +139,20 @@ class Run:
             if simulation.device.type == "cuda" and first < self.frames:
                 with walls("startup"):
                     self.warm_up(state, first)
-            frames = simulation.frames_from(state, first, self.frames)
+            drawn = self.drawing_stream()
+            frames = simulation.frames_from(state, first, self.frames, drawn)
+            bar.begin(first)
             for index in range(first, self.frames):
-                bar.begin(index)
+                if drawn is None:
+                    bar.begin(index)
                 with walls("simulation"):
                     frame = next(frames)
                 state = frame.state
-                self.record(state, index)
-                self.log.append(frame.health.as_dict())
-                with walls("writing"):
-                    self.keep(state, index)
+                with torch.cuda.stream(drawn):  # nothing changes without one
+                    self.record(state, index)
+                    self.log.append(frame.health.as_dict())
+                    with walls("writing"):
+                        self.keep(state, index)
                 done = index + 1
                 bar.end(frame.health.substeps, frame.health.displacement_mean)
             with walls("writing"):
@@ -192,6 +196,17 @@ class Run:
             state, _ = self.simulation.advance(state)
         if self.recorder.images:
             self.painter.render(state, frame)
+
+    def drawing_stream(self) -> torch.cuda.Stream | None:
+        """A stream for pictures and files, so that the next frame is simulated at the same time; None on a CPU.
+
+        Also None if the host calls a force of the user in every substep.
+        """
+        simulation = self.simulation
+        forces = all(force.recordable for force in simulation.forces)
+        if simulation.device.type != "cuda" or simulation.solver.fused() is None or not forces:
+            return None
+        return torch.cuda.Stream(simulation.device)
 
     def keep(self, state: MPMState, frame: int) -> None:
         """Write a checkpoint, if one is due."""

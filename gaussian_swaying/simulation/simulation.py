@@ -56,6 +56,7 @@ from gaussian_swaying.simulation.diagnostics import (
 )
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.frame import Frame
+from gaussian_swaying.simulation.launch import Launched, Outlook, needs_of
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.physgaussian.space import Normalisation
 from gaussian_swaying.simulation.progress import RunProgress
@@ -66,10 +67,7 @@ from gaussian_swaying.simulation.scene import Material, SimulatedScene
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-MAX_RETRIES = 4
-CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
 CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
-MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first ends the run
 MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastest GPU
@@ -173,12 +171,13 @@ class Simulation(nn.Module):
         self.progress: RunProgress | None = None  # of the current run
         self.files: list[Path] = []  # what the last run wrote
         self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
-        self._most_substeps = MAX_SUBSTEPS
+        self.most_substeps = MAX_SUBSTEPS
         self._wind_force: list[WindForce] = []  # in a list, so that it is not part of the module's state
         self._wind_parts: tuple[object, ...] = ()
         self._idle: tuple[tuple[object, ...], bool] | None = None
         self._tearing: TearingGauge | None = None
         self._gauge = Gauge()
+        self.outlook: Outlook | None = None  # on the next frame
         self._started = 0  # how often; a loop over frames ends when another one begins
         self._text, self._changed, self._given = "", set(given), given
 
@@ -305,15 +304,21 @@ class Simulation(nn.Module):
         check_count("count", count)
         return self.frames_from(self.start(), 0, count)
 
-    def frames_from(self, state: MPMState, first: int, count: int) -> Iterator[Frame]:
+    def frames_from(
+        self, state: MPMState, first: int, count: int, drawn: torch.cuda.Stream | None = None
+    ) -> Iterator[Frame]:
         """The frames from number ``first`` up to ``count``.
 
         Args:
             state: The state at rest from :meth:`start` if ``first`` is 0, otherwise the state of the frame before.
             first: Number of the first frame.
             count: Number of frames of the whole run.
+            drawn: A stream on which the frames are drawn and recorded. The next frame is then simulated at the same
+                time, so that the GPU does not wait for the host, and what is assigned between two frames applies from
+                the next but one on.
         """
         started = self._started
+        launched: Launched | None = None
         for index in range(first, count):
             if self._started != started:
                 raise RuntimeError(
@@ -323,8 +328,15 @@ class Simulation(nn.Module):
             if index == 0:
                 health = diagnose(self.solver, state, 0, 0.0)
             else:
-                state, health = self.advance(state)
+                state, health = self.advance(state) if launched is None else launched.finish()
+                if drawn is not None:  # the frame before may still be drawn from memory that is now free
+                    torch.cuda.current_stream(self.device).wait_stream(drawn)
                 state = self.edit_due(state)
+            if drawn is not None and index + 1 < count:
+                drawn.wait_stream(torch.cuda.current_stream(self.device))
+                if self.progress is not None:
+                    self.progress.begin(index + 1)
+                launched = self.launch(state)
             yield Frame(self, index, state, health, self.editor.version)
 
     def start(self) -> MPMState:
@@ -358,7 +370,7 @@ class Simulation(nn.Module):
                 f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
                 f"than the limit of {MAX_SUBSTEPS:,}: {remedy}."
             )
-        self._most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
+        self.most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
         return state
 
@@ -401,8 +413,8 @@ class Simulation(nn.Module):
             start = torch.where(changed, start, state.internal)
         state = state.replace(internal=start)
         self.solver.fused()
-        self._most_substeps = max(
-            self._most_substeps, min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
+        self.most_substeps = max(
+            self.most_substeps, min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
         )
         if self._tearing is not None:
             elastic = self.solver.laws.elastic_particles()
@@ -432,46 +444,48 @@ class Simulation(nn.Module):
         Raises:
             SimulationDiverged: If the simulation diverges in the frame.
         """
-        margin = 0
-        try:
-            steps = self._substeps(state)
-            for retry in range(MAX_RETRIES + 1):
-                if steps > self._most_substeps:
-                    cause = f"a frame would take {steps:,} substeps, more than the limit of {self._most_substeps:,}"
-                    self._give_up(state, cause, "weaken the wind or the boundary that drives the particle")
-                end, courant = self._roll(self.solver.fit_grid(state, self.frame_dt, margin), steps)
-                work = (end.work - state.work).sum()
-                # everything is launched before the host waits for the first time
-                health = self._measured(end, steps, courant, work, state)
-                outran = (end.lost & ~state.lost & torch.isfinite(end.position).all(-1)).any()
-                cfl, outrun = torch.stack([courant.double(), outran.double()]).tolist()
-                too_long = self.solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * self.solver.cfl)
-                if retry == MAX_RETRIES or not (outrun or too_long):
-                    break
-                if outrun:
-                    margin = 4 * max(margin, 4)
-                if too_long:
-                    growth = cfl / self.solver.cfl if math.isfinite(cfl) else 4.0
-                    steps = int(steps * min(growth * 1.1, 4.0)) + 1
-        except (FloatingPointError, ValueError) as error:
-            if not _raised_here(error):  # by a custom wind, force or boundary
-                raise
-            # a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN
-            self._give_up(state, str(error).rstrip("."))
-        measured = health.read(check=True)
-        if not cfl <= MAX_CFL:
-            self._give_up(
-                end, f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
-            )
-        return end, measured
+        return self.launch(state).finish()
 
-    def _measured(self, end: MPMState, steps: int, courant: Tensor, work: Tensor, state: MPMState) -> Measurement:
-        """Start the measurements of a frame from ``state`` to ``end``."""
-        if self._tearing is None:
-            return self._gauge(self.solver, end, steps, courant, work, state)
-        return measure(self.solver, end, steps, courant, work, self._tearing, state)
+    def launch(self, state: MPMState) -> Launched:
+        """Pass a frame to the device; ``launch(state).finish()`` is :meth:`advance`, and the host can work between.
 
-    def _give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
+        Args:
+            state: The state at the start of the frame.
+
+        Returns:
+            The frame. An error of it is raised by its ``finish``.
+        """
+        return Launched(self, state)
+
+    def measured(
+        self,
+        end: MPMState,
+        steps: int,
+        courant: Tensor,
+        work: Tensor,
+        state: MPMState,
+        parts: tuple[object, ...] | None,
+    ) -> Measurement:
+        """Start the measurements of a frame from ``state`` to ``end``, and of what the next one needs.
+
+        Args:
+            end: The state at its end.
+            steps: Its substeps.
+            courant: Its largest Courant number.
+            work: Work of the wind in it [J].
+            state: The state at its start.
+            parts: From :func:`~gaussian_swaying.simulation.launch.parts_of`.
+        """
+        if self._tearing is not None or not self.foresees:
+            return measure(self.solver, end, steps, courant, work, self._tearing, state)
+        winds = None if self.idle else self.wind_force.samples(end, self.frame_dt / 4, 5)
+
+        def needs(at: MPMState, given: Tensor) -> Tensor:
+            return needs_of(self, at, None if winds is None else given)
+
+        return self._gauge(self.solver, end, steps, courant, work, state, needs, winds, (winds is None, parts))
+
+    def give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, naming the particle with the largest deformation."""
         particle = int(state.F_elastic.square().sum((-1, -2)).reshape(-1).argmax())
         if remedy is None:
@@ -479,28 +493,30 @@ class Simulation(nn.Module):
             remedy = f"lower `{field}`, or weaken the wind or the boundary that drives it"
         raise SimulationDiverged(float(state.time), particle, cause, remedy)
 
-    def _substeps(self, state: MPMState) -> int:
-        return max(self.solver.substeps(state, self.frame_dt), self._drag_substeps(state))
+    @property
+    def foresees(self) -> bool:
+        """Whether the needs of the next frame are measured at the end of a frame, so that the host waits once."""
+        simple = self.solver.substep is None and self.solver.stiffness_damping == 0
+        return simple and self.solver.fused() is not None and self.wind_force.uniform and self.wind_force.recordable
+
+    def substeps(self, state: MPMState) -> int:
+        """How many substeps the next frame takes, for waves in the material and explicit drag on light patches."""
+        if self.outlook is not None and self.outlook.holds(self, state):
+            cells, rate, blowing = self.outlook.needs
+        else:
+            winds = None if self.idle else self.wind_force.samples(state, self.frame_dt / 4, 5)
+            cells, rate, blowing = needs_of(self, state, winds).tolist()
+        steps = self.solver.substeps(state, self.frame_dt, cells)
+        if not (math.isfinite(rate) and blowing < MAX_WIND):
+            cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
+            self.give_up(state, cause, "check the flow and the modulations of the wind")
+        return steps if self.aero.drag_step == "semi_implicit" else max(steps, int(rate * self.frame_dt) + 1)
 
     def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
         """The state some substeps later, and the largest Courant number on the way."""
         progress = self.progress
         watch = None if progress is None else lambda done: progress.substep(done, steps)
         return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch)
-
-    def _drag_substeps(self, state: MPMState) -> int:
-        """Substeps that keep explicit drag on light patches stable."""
-        if self.idle:
-            return 1
-        winds = self.wind_force.samples(state, self.frame_dt / 4, 5)
-        wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
-        speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
-        fastest = self.aero.rate(speed, self.wind_force.area, self.solver.points.mass).amax()
-        rate, blowing = torch.stack([fastest.double(), wind.double()]).tolist()
-        if not (math.isfinite(rate) and blowing < MAX_WIND):
-            cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
-            self._give_up(state, cause, "check the flow and the modulations of the wind")
-        return 1 if self.aero.drag_step == "semi_implicit" else int(rate * self.frame_dt) + 1
 
     # ---- what is measured
 
@@ -560,11 +576,3 @@ class Simulation(nn.Module):
         self.recorder = recorder or self.recorder
         count = self.frames_wanted if frames is None else check_count("frames", frames)
         return run(self, Path(output), count, resume, dict(settings or {}), progress)
-
-
-def _raised_here(error: BaseException) -> bool:
-    """Whether an error was raised by this package, and not by code that it called."""
-    place = error.__traceback__
-    while place is not None and place.tb_next is not None:
-        place = place.tb_next
-    return place is not None and str(place.tb_frame.f_globals.get("__name__")).startswith("gaussian_swaying.")

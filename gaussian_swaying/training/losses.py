@@ -9,65 +9,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape
+from gaussian_swaying.metrics.ssim import PADDINGS, check_pictures, ssim_map
 
-SSIM_TAPS = 11
-"""Width of the window of :func:`ssim_map` [pixels]."""
-_SSIM_SIGMA = 1.5
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 _MIN_OPACITY = 1e-7
-_PADDINGS = ("valid", "reflect", "zeros")
 _REDUCTIONS = ("mean", "sum")
-
-
-def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
-    r"""Structural similarity of two pictures around each pixel (Wang et al. 2004, equation 13).
-
-    Means, variances and covariance under a Gaussian window of 11 x 11 pixels with a standard deviation of 1.5, applied
-    along rows and columns in turn, for values from 0 to 1.
-
-    Args:
-        image: Picture, shape (..., H, W, C).
-        target: Picture to compare it with, of the same shape.
-        padding: ``valid`` uses only windows inside the picture, like fused-ssim's option with that name. ``reflect``
-            mirrors both pictures at their edges, and its mean is the SSIM of torchmetrics 1.9. ``zeros`` pads them with
-            zeros, as Kerbl et al. 2023 do.
-
-    Returns:
-        Similarity up to 1, shape (..., H - 10, W - 10, C) with ``valid``, else that of the pictures.
-
-    Raises:
-        ValueError: If the shapes differ, the picture is smaller than the window, or ``padding`` is none of these.
-    """
-    check_choice("padding", padding, _PADDINGS)
-    _check_pictures(image, target)
-    height, width, channels = image.shape[-3:]
-    if min(height, width) < SSIM_TAPS:
-        raise ValueError(f"Expected pictures of at least {SSIM_TAPS} x {SSIM_TAPS} pixels, but got {width} x {height}.")
-    # One plane per channel: (1, planes, H, W).
-    x, y = (picture.movedim(-1, -3).reshape(1, -1, height, width) for picture in (image, target))
-    planes = x.shape[1]
-    offsets = torch.arange(SSIM_TAPS, dtype=x.dtype, device=x.device) - SSIM_TAPS // 2
-    window = torch.exp(-0.5 * (offsets / _SSIM_SIGMA).square())
-    window = window / window.sum()
-    if padding != "valid":
-        mode = "constant" if padding == "zeros" else padding
-        x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, mode) for plane in (x, y))
-    moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
-    # planes as groups, not as a batch: the gradient of a convolution of one channel is slow
-    groups = moments.shape[1]
-    moments = functional.conv2d(moments, window.view(1, 1, 1, -1).expand(groups, 1, 1, -1), groups=groups)
-    moments = functional.conv2d(moments, window.view(1, 1, -1, 1).expand(groups, 1, -1, 1), groups=groups)
-    mean_x, mean_y, square_x, square_y, product = moments.split(planes, dim=1)
-    variance_x = (square_x - mean_x.square()).clamp_min(0.0)
-    variance_y = (square_y - mean_y.square()).clamp_min(0.0)
-    covariance = product - mean_x * mean_y
-    similarity = ((2 * mean_x * mean_y + _SSIM_C1) * (2 * covariance + _SSIM_C2)) / (
-        (mean_x.square() + mean_y.square() + _SSIM_C1) * (variance_x + variance_y + _SSIM_C2)
-    )
-    return similarity.reshape(*image.shape[:-3], channels, *similarity.shape[-2:]).movedim(-3, -1)
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, padding: str = "valid") -> Tensor:
@@ -87,7 +34,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, pa
     Raises:
         ValueError: If shapes or options are not those above.
     """
-    _check_pictures(image, target)
+    check_pictures(image, target)
     difference = (image - target).abs().mean()
     if ssim_weight == 0.0:
         return difference
@@ -167,12 +114,6 @@ def _reduce(values: Tensor, reduction: str) -> Tensor:
     return values.mean() if reduction == "mean" and values.numel() else values.sum()
 
 
-def _check_pictures(image: Tensor, target: Tensor) -> None:
-    check_shape("image", image, "H", "W", "C")
-    if image.shape != target.shape:
-        raise ValueError(f"Expected `target` of shape {tuple(image.shape)}, but got {tuple(target.shape)}.")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LossInputs:
     """The inputs of a loss term in a training step.
@@ -223,7 +164,7 @@ class PhotometricLoss(LossTerm):
         super().__init__()
         if not 0.0 <= ssim_weight <= 1.0:
             raise ValueError(f"Expected `ssim_weight` between 0 and 1, but got {ssim_weight}.")
-        check_choice("padding", padding, _PADDINGS)
+        check_choice("padding", padding, PADDINGS)
         self.ssim_weight, self.padding = float(ssim_weight), padding
 
     def forward(self, inputs: LossInputs) -> Tensor:

@@ -21,12 +21,13 @@ from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
-from gaussian_swaying.training.losses import SSIM_TAPS, LossInputs, LossTerm, TotalLoss
+from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
 from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
 from gaussian_swaying.training.random_stream import random_state, set_random_state
 from gaussian_swaying.training.rates import LearningRates, means_rate

@@ -5,8 +5,9 @@ import copy
 import pytest
 import torch
 
-from gaussian_swaying.metrics import chamfer
-from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance, nearest_distances
+from gaussian_swaying.metrics import nearest
+from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
+from gaussian_swaying.metrics.nearest import nearest_distances
 
 
 def _brute(source, target):
@@ -39,7 +40,7 @@ def test_slabs_find_the_nearest_of_all(moved):
     """Sheets, clusters and points that coincide, large enough for a CPU not to look at all pairs."""
     sheet = torch.rand(2500, 3) * torch.tensor([1.2, 0.05, 0.8])
     clusters = torch.cat([torch.rand(1200, 3) * 0.01 + c for c in (0.0, 0.7)] + [sheet[:300]]) + torch.tensor(moved)
-    assert len(sheet) * len(clusters) > chamfer._SLABS_FROM
+    assert len(sheet) * len(clusters) > nearest._SLABS_FROM
     every = torch.cdist(sheet, clusters, compute_mode="donot_use_mm_for_euclid_dist")
     forward, backward = nearest_distances(sheet, clusters)
     assert torch.equal(forward, every.amin(1))

@@ -1,13 +1,17 @@
 """The gsplat renderer against the torch renderer."""
 
 import math
+import sys
+import threading
+import types
 
 import pytest
 import torch
+from filelock import FileLock
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.factory import make_renderer
-from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, rasterize_splat, render_gsplat
+from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, load_kernels, rasterize_splat, render_gsplat
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, render_torch
 
 
@@ -112,6 +116,59 @@ def test_a_splat_as_it_is_stored_matches_the_torch_renderer():
         assert float(difference.mean()) <= 1e-3
     for actual, expected in zip(*gradients, strict=True):
         assert float((actual - expected).norm() / expected.norm()) < 0.02
+
+
+@pytest.mark.gpu
+def test_a_picture_is_that_of_gsplat_s_rasterization():
+    gsplat = pytest.importorskip("gsplat")
+    means, covariances, opacities, colors = _scene(3000)
+    view = _camera().to("cuda", torch.float32)
+    ours = render_gsplat(means, covariances, opacities, colors, view)
+    pixels, alpha, _ = gsplat.rasterization(
+        means=means,
+        quats=None,
+        scales=None,
+        opacities=opacities,
+        colors=colors,
+        viewmats=view.world_to_camera[None],
+        Ks=view.intrinsics[None],
+        width=view.width,
+        height=view.height,
+        near_plane=view.near,
+        packed=True,
+        render_mode="RGB+D",
+        covars=covariances,
+    )
+    assert float(alpha.mean()) > 0.05
+    for actual, expected in (
+        (ours.color, pixels[0, ..., :3]),
+        (ours.depth, pixels[0, ..., 3:]),
+        (ours.alpha, alpha[0]),
+    ):
+        assert float((actual - expected).abs().amax()) <= 1e-3  # Gaussians of equal depth in another order
+
+
+def test_one_process_compiles_the_kernels_of_gsplat_at_a_time(tmp_path, monkeypatch, capsys):
+    """The others say that they wait; afterwards the kernels are loaded once."""
+    monkeypatch.setattr("torch.utils.cpp_extension._get_build_directory", lambda *a, **k: str(tmp_path / "gsplat_cuda"))
+    backend = types.ModuleType("gsplat.cuda._backend")
+    backend._C = object()
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+    load_kernels.cache_clear()
+    other, loaded = FileLock(tmp_path / "gsplat_cuda.lock", thread_local=False), []
+    other.acquire()
+    waiting = threading.Thread(target=lambda: loaded.append(load_kernels()))
+    waiting.start()
+    waiting.join(0.3)
+    assert waiting.is_alive()
+    assert loaded == []
+    other.release()
+    waiting.join(10)
+    load_kernels.cache_clear()
+    assert loaded == [True]
+    assert "Another process is compiling" in capsys.readouterr().err
+    other.acquire(timeout=0)  # it was released
+    other.release()
 
 
 @pytest.mark.gpu

@@ -426,17 +426,17 @@ def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_simu
     simulation = _on_gpu(simulation)
     if not isinstance(simulation.painter.renderer, GsplatRenderer):
         pytest.skip("gsplat cannot compile its kernels here")
-    state, rasterization = simulation.start(), gsplat.rasterization
+    state, isect_tiles = simulation.start(), gsplat.isect_tiles
 
-    def let_wait(**arguments):
+    def let_wait(*arguments):
         mode = torch.cuda.get_sync_debug_mode()
         torch.cuda.set_sync_debug_mode("default")
         try:
-            return rasterization(**arguments)
+            return isect_tiles(*arguments)
         finally:
             torch.cuda.set_sync_debug_mode(mode)
 
-    monkeypatch.setattr(gsplat, "rasterization", let_wait)
+    monkeypatch.setattr(gsplat, "isect_tiles", let_wait)
     for frame in range(2):
         simulation.painter.render(state, frame)
     torch.cuda.set_sync_debug_mode("error")

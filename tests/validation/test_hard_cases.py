@@ -428,7 +428,7 @@ def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
     simulation = _flag(WindField([30.0, 95.0, 0.0]), formulation, material, aero, width=0.4, frame_dt=0.01)
     if drag_step == "explicit":
         rate = 1.225 * 1.3 * 99.6 / 0.02
-        assert simulation._substeps(simulation.start()) >= 0.01 * rate / 2
+        assert simulation.substeps(simulation.start()) >= 0.01 * rate / 2
     _, log = _advance(simulation, 4)
     work = sum(health.wind_work for health in log)
     assert work > 0

@@ -139,13 +139,8 @@ def test_the_estimate_is_within_a_factor_of_two_of_the_run(make, tmp_path):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("make", [flag, vase])
-def test_the_estimate_is_within_a_factor_of_two_of_the_run_on_a_gpu(make, tmp_path):
-    """The kernels are compiled before, as they are for the second run on a machine."""
-    make("cuda").run(tmp_path / "first", 3, progress=False)
-    simulation, frames = make("cuda"), 250
-    estimate = estimate_cost(simulation, frames)
-    assert 0 < estimate.startup_seconds <= 3
-    begin = time.perf_counter()
-    make("cuda").run(tmp_path / "run", frames, progress=False)
-    assert 0.5 < estimate.total_seconds / (time.perf_counter() - begin) < 2
+def test_kernels_are_loaded_before_a_gpu_is_timed():
+    """They are a part of the start, and not of a frame; ``bench.py previews`` compares the estimate with runs."""
+    first, second = (estimate_cost(flag("cuda"), 250) for _ in range(2))
+    assert 0 < second.startup_seconds <= first.startup_seconds <= 3
+    assert first.substeps == second.substeps
