@@ -586,7 +586,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     """Across the end of a part, with particles sorted again, and with a batch; all forces and their work."""
     name, resistance = case
     monkeypatch.setattr(fused, "MAX_STEPS", 3)
-    monkeypatch.setattr(fused_updated, "RESORT", 2)
+    monkeypatch.setattr(fused_updated, "sorted_for", lambda position, dx: 2)
     points = _points(kernel_device, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)
 
@@ -811,7 +811,7 @@ def test_a_substep_that_changes(kernel_device, formulation):
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     """Longer than the schedule and the sorting of the particles; the wind and the work continue."""
     monkeypatch.setattr(fused, "MAX_STEPS", 4)
-    monkeypatch.setattr(fused_updated, "RESORT", 2)
+    monkeypatch.setattr(fused_updated, "sorted_for", lambda position, dx: 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
     points = _points(kernel_device, count=12, batch=(2,))
     load = _load(points, [wind, WIND])
@@ -836,7 +836,7 @@ def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
 )
 def test_looks_on_the_way(kernel_device, case, monkeypatch):
     """The largest Courant number seen, and the same motion; some checks fall between two sorts of the particles."""
-    monkeypatch.setattr(fused_updated, "RESORT", 2)
+    monkeypatch.setattr(fused_updated, "sorted_for", lambda position, dx: 2)
     law, formulation = case
     points = _points(kernel_device, (ELASTIC | PLASTIC)[law])
 
@@ -891,6 +891,10 @@ BOUNDARIES = {
     "impulse": lambda: [Impulse(TOP, [0.01, 0.0, 0.02], **WINDOW)],
     "plane": lambda: [Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.4, **WINDOW)],
     "box": lambda: [EnclosingBox([0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)],
+    "walls": lambda: [
+        Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "sticky", **WINDOW),
+        EnclosingBox([0.11, 0.1, 0.1], [0.2, 0.2, 0.2], "separate", 0.1, end=1.5 * DT),
+    ],
     "velocity box": lambda: [VelocityBox(TOP, [0.0, 1.0, 0.0], **WINDOW)],
     "pin and plane": lambda: [PinnedRegion(LEFT, "nodes"), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")],
     "knock and release": lambda: [SequentialRelease(LEFT, end=1.5 * DT), Impulse(Everything(), [0, 0, 0.02], end=DT)],
@@ -901,7 +905,10 @@ BOUNDARIES = {
     ("kernel_device", "name"),
     [
         *(pytest.param("cuda", name, marks=pytest.mark.gpu) for name in BOUNDARIES),
-        *(("interpreted", name) for name in ("two pins", "hinge", "handle", "hinged handle", "knock and release")),
+        *(
+            ("interpreted", name)
+            for name in ("two pins", "hinge", "handle", "hinged handle", "knock and release", "plane", "box", "walls")
+        ),
     ],
     indirect=["kernel_device"],
 )
@@ -933,6 +940,26 @@ POINT_HOLDS = {
 @pytest.mark.parametrize(("kernel_device", "name"), _on(*POINT_HOLDS), indirect=["kernel_device"])
 def test_points_that_are_held(kernel_device, name):
     _boundaries_case(kernel_device, "total", POINT_HOLDS[name])
+
+
+def test_planes_and_boxes_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
+    """Of one scene in `updated`, if nothing else acts; in torch an enclosing box takes as long as the substep."""
+    points = _points(kernel_device, count=12)
+    with_walls, with_pin, batch = (
+        _solver("triton", "updated", boundaries=BOUNDARIES[name]()) for name in ("walls", "pin and plane", "walls")
+    )
+    for solver in (with_walls, with_pin):
+        solver.init_state(points)
+    batch.init_state(_points(kernel_device, count=12, batch=(2,)))
+    assert len(with_walls.fused().walls[0]) == 7
+    assert with_pin.fused().walls is None
+    assert batch.fused().walls is None
+
+
+@pytest.mark.parametrize(("side", "least", "most"), [(3, 8, 8), (2, 9, 16), (1, 64, 64)])
+def test_crowded_cells_are_sorted_more_often(side, least, most):
+    axis = (torch.arange(16) + 0.5) * DX / side
+    assert least <= fused_updated.sorted_for(torch.cartesian_prod(axis, axis, axis), DX) <= most
 
 
 def test_points_held_in_a_batch(kernel_device):

@@ -11,6 +11,8 @@ from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundaries.boundary import Boundary, Nodes
 
+KINDS = ("sticky", "slip", "separate")
+
 
 def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float) -> Tensor:
     """Velocity of nodes in contact with a plane at rest.
@@ -63,7 +65,7 @@ class Plane(Boundary):
         end: float | None = None,
     ) -> None:
         super().__init__(start, end)
-        check_choice("kind", kind, ("sticky", "slip", "separate"))
+        check_choice("kind", kind, KINDS)
         check_positive("friction", friction, allow_zero=True)
         self.kind, self.friction = kind, float(friction)
         n = torch.tensor(check_vector("normal", normal), dtype=torch.float64)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaussian_swaying.mpm.body import Held
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.plane import KINDS, Plane
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, check_indices
 
-RESORT = 32
-"""Substeps after which the particles are sorted by cell again."""
+SORTED_FOR = (8, 64)
+"""Fewest and most substeps between two sorts of the particles by cell."""
 
 
 class FusedUpdated(Fused):
@@ -44,6 +47,12 @@ class FusedUpdated(Fused):
         self.inverse_mass = torch.zeros(0, device=self.device)
         self.weight = torch.zeros(0, device=self.device)
         self.node_position: Tensor | None = None
+        self.walls = wall_table(bound.body.boundaries, self.device) if self.scenes == 1 else None
+        self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
+        self.sorted_for = sorted_for(points.position, bound.settings.dx)
+        self.spare = (torch.zeros(0, device=self.device),) * 3  # for a sort: rows, order, work
+        self.filled = torch.zeros(0, dtype=torch.int32, device=self.device)
+        self.place = torch.zeros(2, self.count, dtype=torch.int32, device=self.device)  # cell, rank in it
         self.grid = GridSpec(bound.settings.dx, (0, 0, 0), (0, 0, 0))
 
     def _take_values(self, values: Tensor) -> None:
@@ -55,7 +64,7 @@ class FusedUpdated(Fused):
         check_indices(nodes * width)
         if nodes > len(self.velocity) or width != self.momentum.shape[1]:
             room = max(len(self.velocity), 1 << (nodes - 1).bit_length() if nodes < 1 << 20 else nodes + nodes // 8)
-            held = room if len(self.body.boundaries) else 0
+            held = room if self._acting else 0
             self.repeater.forget()  # free their memory before allocating more
             with torch.inference_mode(False):  # they can be written inside and outside inference mode
                 self.momentum = torch.zeros(room, width, device=self.device)
@@ -64,32 +73,64 @@ class FusedUpdated(Fused):
         if grid != self.grid:
             self.repeater.forget()  # they read the node positions
             self.grid, self.node_position = grid, None
-            if self.bound.needs_position or self.bound.needs_lattice:
+            if self._acting and (self.bound.needs_position or self.bound.needs_lattice):
                 self.node_position = grid.node_positions(self.velocity)
 
     def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
-        fields: dict[str, Any] = {}
-        marks = sorted({*looks, *range(RESORT, steps, RESORT), steps})
-        load, done = True, 0
-        for mark in marks:
-            if load:
-                self._load(state.replace(**fields))
-                if self.asked:
-                    self._push()
-                self._particles(0, options, gather=False, scatter=True)
-            sort = mark == steps or mark % RESORT == 0
-            self._several(mark - done - (1 if sort else 0), options)
-            if sort:  # the end of a substep without the start of the next
+        self.clock.copy_(torch.stack([self.time, self.dt]))
+        self._load(state)
+        self._start(options)
+        done = 0
+        for mark in sorted({*looks, *range(self.sorted_for, steps, self.sorted_for), steps}):
+            ends = mark == steps or mark % self.sorted_for == 0
+            self._several(mark - done - (1 if ends else 0), options)
+            if ends:  # the end of a substep without the start of the next
                 self._nodes(0, options)
                 self._particles(1, options, gather=True, scatter=False)
                 self.first_step.add_(1)
-                fields = self._read(state)
+                if mark < steps:
+                    self._sort()
+                    self._start(options)
             if mark in looks:
                 self._look()
-            load, done = sort, mark
-        return {**fields, "impulse": state.impulse + self.impulse}
+            done = mark
+        return {**self._read(state), "impulse": state.impulse + self.impulse}
+
+    @property
+    def _acting(self) -> bool:
+        """Whether boundary conditions act in torch."""
+        return len(self.body.boundaries) > 0 and self.walls is None
+
+    def _start(self, options: dict[str, Any]) -> None:
+        """The start of a substep without the end of the one before."""
+        if self.asked:
+            self._push()
+        self._particles(0, options, gather=False, scatter=True)
+
+    def _sort(self) -> None:
+        """Sort the rows of the particles by cell: count those of each cell, and move each to its place."""
+        grid, block = self.grid, 128
+        nx, ny, nz = grid.resolution
+        cells = self.scenes * (nx + 1) * (ny + 1) * (nz + 1)
+        if len(self.filled) < cells:
+            self.filled = torch.zeros(cells, dtype=torch.int32, device=self.device)
+        if len(self.spare[0]) == 0:
+            self.spare = torch.zeros_like(self.moving), torch.zeros_like(self.order), torch.zeros_like(self.load[0])
+        filled, (cell, rank) = self.filled[:cells].zero_(), self.place
+        programs = (-(-self.count // block),)
+        kernels.updated_count[programs](
+            self.moving, self.order, self.count, *grid.offset, *grid.resolution, grid.dx, self.particles, filled, cell,
+            rank, BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        kernels.updated_sort[programs](
+            self.moving, self.order, self.load[0], self.count, cell, rank, filled.cumsum(0, dtype=torch.int32),
+            *self.spare, ROWS=len(self.moving), BLOCK=block, num_warps=4,
+        )  # fmt: skip
+        rows, order, work = self.spare
+        self.load[0].copy_(work)  # of a batch, it follows its particle; the forces are zero here
+        self.spare, self.moving, self.order = (self.moving, self.order, work), rows, order
 
     def _load(self, state: MPMState) -> None:
         """Sort the particles by cell and copy their fields to the buffers."""
@@ -101,10 +142,7 @@ class FusedUpdated(Fused):
         key = ((x - ox).clamp(0, nx) * (ny + 1) + (y - oy).clamp(0, ny)) * (nz + 1) + (z - oz).clamp(0, nz)
         if self.scenes > 1:
             key = key + self.scene * ((nx + 1) * (ny + 1) * (nz + 1))
-        order = torch.argsort(key)
-        if self.scenes > 1:  # the work done so far follows its particle; the forces are zero here
-            self.load[0].copy_(self.load[0][torch.argsort(self.order)][order])
-        self.order.copy_(order)
+        self.order.copy_(torch.argsort(key))
         block = 128
         programs = (-(-self.count // block),)
         internal = state.internal is not None
@@ -117,7 +155,8 @@ class FusedUpdated(Fused):
 
     def _several(self, steps: int, options: dict[str, Any]) -> None:
         """Run substeps, from the start of one to the start of a later one."""
-        self._repeat(steps, (*options.values(), self.grid), lambda offset: self._substep(offset, options))
+        key = (*options.values(), self.grid, self.moving.data_ptr())
+        self._repeat(steps, key, lambda offset: self._substep(offset, options))
 
     def _look(self) -> None:
         block = 128
@@ -148,11 +187,13 @@ class FusedUpdated(Fused):
     def _nodes(self, offset: int, options: dict[str, Any]) -> None:
         nodes = self.grid.node_count * self.scenes
         block = 256
-        acting = self.body.boundaries
+        acting, (_, ny, nz) = self._acting, self.grid.resolution
+        walls, windows = (self.clock, self.clock) if self.walls is None else self.walls
         kernels.updated_nodes[(-(-nodes // block),)](
             self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
-            *self.gravity, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=len(acting) > 0,
-            BLOCK=block, num_warps=4,
+            *self.gravity, walls, windows, self.clock, self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
+            IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
+            WALLS=0 if self.walls is None else len(walls), BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()
@@ -231,3 +272,42 @@ class FusedUpdated(Fused):
         internal = self._room("internal", *shape[:-1]) if self.internal else None
         fields = self._read_into(position, velocity, affine, F, F_total, lost, internal)
         return MPMState(**fields, time=self.time, grid=self.grid)
+
+
+def sorted_for(position: Tensor, dx: float) -> int:
+    """After how many substeps to sort again, from the points of a cell at rest (one synchronisation).
+
+    In a crowded cell more atomic sums meet as the order gets stale, and a sort pays off sooner: on an H200 after about
+    10 substeps with eight points in a cell, as in a solid, and after about 40 with four, as in a sheet.
+
+    Args:
+        position: Rest positions [m], shape (..., P, 3).
+        dx: Grid spacing [m].
+    """
+    flat = position.reshape(-1, *position.shape[-2:])[0]
+    crowd = torch.unique(torch.floor(flat / dx - 0.5).int(), dim=0, return_counts=True)[1].double()
+    shared = float(crowd.square().sum() / max(len(flat), 1))  # points in the cell of a point, on average
+    return int(min(max(round(640 / max(shared, 1.0) ** 2), SORTED_FOR[0]), SORTED_FOR[1]))
+
+
+def wall_table(boundaries: Sequence[nn.Module], device: torch.device) -> tuple[Tensor, Tensor] | None:
+    """The planes of all boundaries, rows of ``kernels.WALL`` numbers, and their times; None if not all are planes.
+
+    Args:
+        boundaries: The boundary conditions of a body.
+        device: Where the tables are used.
+    """
+    rows, windows = [], []
+    for k, boundary in enumerate(boundaries):
+        if type(boundary) not in (Plane, EnclosingBox):
+            return None
+        for plane in (part for part in boundary.modules() if isinstance(part, Plane)):
+            numbers = [float(KINDS.index(plane.kind)), plane.friction, float(k)]
+            rows.append([*plane.point.tolist(), *plane.normal.tolist(), *numbers])
+            windows.append([plane.start, plane.end])
+    if not rows:
+        return None
+    return (
+        torch.tensor(rows, dtype=torch.float32, device=device),
+        torch.tensor(windows, dtype=torch.float64, device=device),
+    )

@@ -287,13 +287,40 @@ def updated_particles(
         store9(moving + 15 * count, count, index, C, mask)
 
 
+WALL = 9
+"""Columns of the table of walls: point, normal, kind (0 sticky, 1 slip, 2 separate), friction, boundary."""
+
+
+@triton.jit
+def _stop(v, x, wall):
+    """Velocity of a node at x in contact with a wall, as :func:`boundaries.plane.plane_velocity`, and where it is."""
+    p = (tl.load(wall), tl.load(wall + 1), tl.load(wall + 2))
+    n = (tl.load(wall + 3), tl.load(wall + 4), tl.load(wall + 5))
+    kind = tl.load(wall + 6)
+    friction = tl.load(wall + 7)
+    behind = ((x[0] - p[0]) * n[0] + (x[1] - p[1]) * n[1] + (x[2] - p[2]) * n[2]) <= 0
+    along = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
+    removed = tl.where(kind == 2, tl.minimum(along, 0.0), along)
+    t = (v[0] - along * n[0], v[1] - along * n[1], v[2] - along * n[2])
+    speed = tl.maximum(tl.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), 1.1754944e-38)
+    left = tl.where(friction > 0, tl.maximum(1 - friction * tl.abs(removed) / speed, 0.0), 1.0)
+    left = tl.where(kind == 0, 0.0, left)
+    rest = tl.where(kind == 0, 0.0, along - removed)
+    return (left * t[0] + rest * n[0], left * t[1] + rest * n[1], left * t[2] + rest * n[2]), behind
+
+
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z,
-    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, BLOCK: tl.constexpr,
+    gravity_x, gravity_y, gravity_z, walls, windows, clock, impulse, ox, oy, oz, ny, nz, dx,
+    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, WALLS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``updated``: nodal velocities from momenta and masses, which are set back to zero; KEEP for boundaries."""
+    """``updated``: nodal velocities from momenta and masses, which are set back to zero; KEEP for boundaries.
+
+    With WALLS, the number of planes, they are applied here, in order. ``walls`` has a row of :data:`WALL` numbers for
+    each, ``windows`` their first and last time [s], ``clock`` the time at step 0 and the substep [s], all float64 but
+    ``walls``; ``impulse`` (B, 3) collects the momentum that each boundary takes.
+    """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     decay = tl.load(schedule + (step + 1) * 4 + 2)
@@ -309,10 +336,32 @@ def updated_nodes(
         yielding = 1.0 / (1 + kick * tl.load(row + 4, mask, 0.0) * inverse)
         push = push * yielding
         share = inverse * yielding
-    place = velocity + k * 4
-    tl.store(place, (tl.load(row, mask, 0.0) * share + push * gravity_x) * decay, mask)
-    tl.store(place + 1, (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay, mask)
-    tl.store(place + 2, (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay, mask)
+    v = (
+        (tl.load(row, mask, 0.0) * share + push * gravity_x) * decay,
+        (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay,
+        (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay,
+    )
+    if WALLS > 0:
+        now = tl.load(clock) + step * tl.load(clock + 1) + 1e-9  # boundary.CLOCK
+        x = (
+            (k // (ny * nz) + ox).to(tl.float32) * dx,
+            (k // nz % ny + oy).to(tl.float32) * dx,
+            (k % nz + oz).to(tl.float32) * dx,
+        )
+        for w in tl.static_range(WALLS):
+            stopped, behind = _stop(v, x, walls + w * 9)
+            begun = now >= tl.load(windows + 2 * w)
+            over = now >= tl.load(windows + 2 * w + 1)
+            hit = tl.where(begun, tl.where(over, False, behind & some & mask), False)
+            u = (
+                tl.where(hit, stopped[0], v[0]), tl.where(hit, stopped[1], v[1]), tl.where(hit, stopped[2], v[2])
+            )  # fmt: skip
+            if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a wall
+                to = impulse + 3 * tl.load(walls + w * 9 + 8).to(tl.int32)
+                for c in tl.static_range(3):
+                    tl.atomic_add(to + c, tl.sum((mass * (v[c] - u[c])).to(tl.float64)), sem="relaxed")
+            v = u
+    store3(velocity, 1, k * 4, v, mask)
     if KEEP:
         tl.store(inverse_mass + k, inverse, mask)
     zero = mass * 0
@@ -340,6 +389,44 @@ def updated_load(
     store9(moving + 26 * count, count, index, load9(constants, 1, where * 9, mask), mask)
     if PLASTIC:
         store9(moving + 35 * count, count, index, load9(F_total, 1, where * 9, mask), mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_count(
+    moving, order, count, ox, oy, oz, nx, ny, nz, dx, scene_size, filled, cell, rank, BLOCK: tl.constexpr
+):  # fmt: skip
+    """``updated``: the cell of each particle and its rank in it; ``filled`` counts them."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    first = (tl.load(order + index, mask, 0) // scene_size) * (nx + 1)
+    x = load3(moving, count, index, mask)
+    key = first + _cell(x[0], dx, ox, nx)
+    key = key * (ny + 1) + _cell(x[1], dx, oy, ny)
+    key = key * (nz + 1) + _cell(x[2], dx, oz, nz)
+    tl.store(cell + index, key, mask)
+    tl.store(rank + index, tl.atomic_add(filled + key, 1, mask, sem="relaxed"), mask)
+
+
+@triton.jit
+def _cell(x, dx, o, n):
+    """First node of the stencil on one axis, within the grid."""
+    first = tl.floor(tl.div_rn(x, dx + x * 0) - 0.5).to(tl.int32) - o
+    return tl.minimum(tl.maximum(first, 0), n)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def updated_sort(
+    moving, order, work, count, cell, rank, ends, sorted_moving, sorted_order, sorted_work,
+    ROWS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``updated``: the rows of ``moving`` in the order of the cells, which end at ``ends``."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    place = tl.load(ends + tl.load(cell + index, mask, 0), mask, 0) - 1 - tl.load(rank + index, mask, 0)
+    tl.store(sorted_order + place, tl.load(order + index, mask, 0), mask)
+    tl.store(sorted_work + place, tl.load(work + index, mask, 0.0), mask)
+    for row in tl.static_range(ROWS):
+        tl.store(sorted_moving + row * count + place, tl.load(moving + row * count + index, mask, 0.0), mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
