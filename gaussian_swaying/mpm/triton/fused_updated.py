@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, check_indices
 
-SORTED_FOR = (8, 64)
+LEAST, MOST = 4, 64
 """Fewest and most substeps between two sorts of the particles by cell."""
 
 
@@ -49,7 +50,10 @@ class FusedUpdated(Fused):
         self.node_position: Tensor | None = None
         self.walls = wall_table(bound.body.boundaries, self.device) if self.scenes == 1 else None
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
-        self.sorted_for = sorted_for(points.position, bound.settings.dx)
+        self.crowd = crowd_of(points.position, bound.settings.dx)
+        self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
+        self._measured = torch.zeros(1, pin_memory=self.device.type == "cuda")
+        self._copied: torch.cuda.Event | None = None
         self.spare = (torch.zeros(0, device=self.device),) * 3  # for a sort: rows, order, work
         self.filled = torch.zeros(0, dtype=torch.int32, device=self.device)
         self.place = torch.zeros(2, self.count, dtype=torch.int32, device=self.device)  # cell, rank in it
@@ -82,9 +86,9 @@ class FusedUpdated(Fused):
         self.clock.copy_(torch.stack([self.time, self.dt]))
         self._load(state)
         self._start(options)
-        done = 0
-        for mark in sorted({*looks, *range(self.sorted_for, steps, self.sorted_for), steps}):
-            ends = mark == steps or mark % self.sorted_for == 0
+        done, every = 0, self._sorted_for()
+        for mark in sorted({*looks, *range(every, steps, every), steps}):
+            ends = mark == steps or mark % every == 0
             self._several(mark - done - (1 if ends else 0), options)
             if ends:  # the end of a substep without the start of the next
                 self._nodes(0, options)
@@ -96,7 +100,22 @@ class FusedUpdated(Fused):
             if mark in looks:
                 self._look()
             done = mark
+        self._measure_crossing()
         return {**self._read(state), "impulse": state.impulse + self.impulse}
+
+    def _sorted_for(self) -> int:
+        """How many substeps to go without a sort, from the speed at the end of the last rollout that is done."""
+        if self._copied is None or self._copied.query():
+            self.crossing = float(self._measured) or self.crossing
+        return sorted_for(self.crowd, self.crossing, self.count)
+
+    def _measure_crossing(self) -> None:
+        """Measure how many cells a particle enters in a substep, on average, without waiting."""
+        moved = self.moving[12:15].abs().mean() * 3 * self.dt.float() / self.settings.dx
+        self._measured.copy_(moved.nan_to_num(0.0, 0.0)[None], non_blocking=True)
+        if self.device.type == "cuda":
+            self._copied = torch.cuda.Event()
+            self._copied.record()
 
     @property
     def _acting(self) -> bool:
@@ -274,20 +293,34 @@ class FusedUpdated(Fused):
         return MPMState(**fields, time=self.time, grid=self.grid)
 
 
-def sorted_for(position: Tensor, dx: float) -> int:
-    """After how many substeps to sort again, from the points of a cell at rest (one synchronisation).
-
-    In a crowded cell more atomic sums meet as the order gets stale, and a sort pays off sooner: on an H200 after about
-    10 substeps with eight points in a cell, as in a solid, and after about 40 with four, as in a sheet.
+def crowd_of(position: Tensor, dx: float) -> float:
+    """Points in the cell of a point at rest, on average (one synchronisation).
 
     Args:
         position: Rest positions [m], shape (..., P, 3).
         dx: Grid spacing [m].
     """
     flat = position.reshape(-1, *position.shape[-2:])[0]
-    crowd = torch.unique(torch.floor(flat / dx - 0.5).int(), dim=0, return_counts=True)[1].double()
-    shared = float(crowd.square().sum() / max(len(flat), 1))  # points in the cell of a point, on average
-    return int(min(max(round(640 / max(shared, 1.0) ** 2), SORTED_FOR[0]), SORTED_FOR[1]))
+    sizes = torch.unique(torch.floor(flat / dx - 0.5).int(), dim=0, return_counts=True)[1].double()
+    return float(sizes.square().sum() / max(len(flat), 1))
+
+
+def sorted_for(crowd: float, crossing: float, count: int) -> int:
+    r"""After how many substeps to sort again.
+
+    As the order gets stale, particles in a row no longer share their cell, and more atomic sums meet: the time of a
+    substep grows with their share, and a sort takes about half a substep. The sum of both is least after
+    :math:`\sqrt{S / r}` substeps, with the rate r at which particles enter other cells; S was measured on an H200 with
+    eight points in a cell. A small body waits for the host, not for sums.
+
+    Args:
+        crowd: Points in a cell.
+        crossing: Cells that a particle enters in a substep.
+        count: Number of particles.
+    """
+    best = math.sqrt(0.4 / max(crossing, 1e-9)) * 8 / max(crowd, 1.0)
+    least = min(max(round(2e6 / max(count, 1)), LEAST), 32)
+    return int(min(max(round(best), least), MOST))
 
 
 def wall_table(boundaries: Sequence[nn.Module], device: torch.device) -> tuple[Tensor, Tensor] | None:
