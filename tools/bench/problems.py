@@ -38,6 +38,21 @@ def block(particles: int, device: torch.device) -> MaterialPoints:
     )
 
 
+def cube(particles: int, device: torch.device) -> MaterialPoints:
+    """An elastic cube with eight points in a cell of 1/128 m."""
+    side, spacing = round(particles ** (1 / 3)), 1 / 256
+    axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) * spacing + 0.1
+    position = torch.cartesian_prod(axis, axis, axis)
+    return MaterialPoints.create(position, volume=spacing**3, density=1000.0, youngs_modulus=1e5, poisson_ratio=0.3)
+
+
+def spin(position: Tensor) -> Tensor:
+    """Velocity of a body that turns with 2.3 rad/s and drifts with 0.5 m/s: its points soon enter other cells."""
+    arm = position - position.mean(0)
+    axis = torch.tensor([0.6, 1.0, 2.0], device=position.device).expand_as(arm)
+    return torch.linalg.cross(axis, arm) + torch.tensor([0.5, 0.0, 0.0], device=position.device)
+
+
 def waves(position: Tensor) -> Tensor:
     """A smooth velocity across the sheet, up to 1 m/s, so that the motion is larger than round-off."""
     x, y, _ = position.unbind(-1)

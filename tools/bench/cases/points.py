@@ -26,18 +26,20 @@ SCENES = ("guitar", "ficus", "alocasia", "telephone")
 WAYS: dict[str, dict[str, Any]] = {
     "gaussian": {"points": "gaussian"},
     "nudged": {"points": "gaussian"},
-    **{f"grid {n}": {"points": "grid", "points_per_cell": n} for n in (1, 2, 3, 4)},
+    **{f"grid {n}": {"points": "grid", "points_per_cell": n} for n in (1, 2, 3, 4, 6)},
 }
 NUDGE = 1.01
 """Factor on dx of the row ``nudged``, one point to a Gaussian on another grid: what any change does to the motion."""
 
 
-def configuration(scene: str, way: str, ply: str | None) -> dict[str, Any]:
-    """The YAML of a scene with one way to choose its points."""
+def configuration(scene: str, way: str | None, ply: str | None = None) -> dict[str, Any]:
+    """The YAML of a scene, with one way to choose its points."""
     name = "hanging_object" if scene == "guitar" else scene
     found: dict[str, Any] = yaml.safe_load((ROOT / "configs" / "sim" / f"{name}.yaml").read_text())
     if scene == "guitar":
         found["scene"]["ply"] = ply
+    if way is None:
+        return found
     found["scene"] |= WAYS[way]
     if way == "nudged":
         found["solver"]["dx"] *= NUDGE

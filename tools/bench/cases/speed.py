@@ -17,8 +17,9 @@ from torch import Tensor
 
 from bench import record
 from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
-from bench.problems import CUBE, block, fewest_bytes, nodes_in_reach, sheet, waves, wind, wind_load
+from bench.problems import CUBE, block, cube, fewest_bytes, nodes_in_reach, sheet, spin, waves, wind, wind_load
 from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.simulation import Simulation
@@ -28,7 +29,7 @@ Row = dict[str, Any]
 CONFIG = record.ROOT / "configs" / "sim" / "flag.yaml"
 DT = 1e-4  # s
 FORMULATIONS = ("total", "updated")
-SECTIONS = ("substep", "sand", "batch", "frame")
+SECTIONS = ("substep", "sand", "cube", "batch", "frame")
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Plan:
         torch_limit: Most particles for which the torch path is timed as well as the Triton path.
         exact_limit: Most particles for which the error against float64 is measured.
         sand: Particles of the block of sand.
+        cubes: Points of elastic cubes.
         scenes: Flags of the batch.
         side: Particles along a side of each of them.
         steps: Substeps of the timed rollout, and of the longer one that gives the slope.
@@ -51,6 +53,7 @@ class Plan:
         picture: Width and height of the picture.
         spacing: Distance between the Gaussians of the flag [m].
         dx: Grid spacings of the flag [m]; the goals are for the first.
+        small: Whether frames of the flag as it is configured are measured, too.
     """
 
     counts: tuple[int, ...]
@@ -62,6 +65,8 @@ class Plan:
     picture: tuple[int, int]
     spacing: float
     dx: tuple[float, ...]
+    cubes: tuple[int, ...] = ()
+    small: bool = False
     side: int = 64
     steps: tuple[int, int] = (64, 192)
     torch_steps: int = 8
@@ -81,6 +86,8 @@ PLANS = {
         picture=(1920, 1080),
         spacing=0.0031,
         dx=(0.0125, 0.025, 0.00625),
+        cubes=(200_000, 1_000_000, 4_000_000),
+        small=True,
     ),
     "cpu": Plan(
         counts=(5_000, 20_000, 100_000),
@@ -104,7 +111,7 @@ def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
     if quick:
         plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
         plan = replace(plan, torch_steps=2, warm=2, repeats=(2, 2), copy_bytes=2**20)
-        plan = replace(plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,))
+        plan = replace(plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,), cubes=(1000,), small=False)
     return plan if counts is None else replace(plan, counts=tuple(int(n) for n in counts.split(",")))
 
 
@@ -211,44 +218,73 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
     return row
 
 
-def bench_frame(plan: Plan, dx: float, device: torch.device) -> Row:
-    """Frames of configs/sim/flag.yaml: from the state of one frame to the picture of the next, on the device."""
-    width, height = plan.picture
-    arguments = ["--config", str(CONFIG), "--device", device.type, "--solver.dx", str(dx)]
-    arguments += ["--scene.generator.init_args.spacing", str(plan.spacing)]
-    arguments += ["--camera.init_args.width", str(width), "--camera.init_args.height", str(height)]
+def bench_cube(plan: Plan, asked: int, walls: bool, turning: bool, device: torch.device) -> Row:
+    """Substeps of an elastic cube in `updated`, from rest or turning, with or without an enclosing box."""
+    points = cube(asked, device)
+    box = [EnclosingBox([0.03] * 3, [1.6] * 3)] if walls else []
+    solver = MPMSolver(dx=1 / 128, formulation="updated", boundaries=box)
+    start = solver.init_state(points, spin(points.position) if turning else None, margin=24)
+    dt, steps = 0.7 * solver.stable_substep(start), 96
+    state = start
+
+    def go() -> None:
+        nonlocal state
+        state = solver.rollout(state, dt, steps)
+
+    row: Row = timed(go, device, 4, plan.warm, 1 / steps)
+    return row | {"particles": points.count, "substeps": steps, "grid_nodes": state.grid.node_count}
+
+
+def bench_frame(plan: Plan, dx: float | None, device: torch.device) -> Row:
+    """Frames of configs/sim/flag.yaml: from the state of one frame to the picture of the next, on the device.
+
+    On a GPU, a run draws a frame while it simulates the next one, and so do these. The parts are measured one after
+    the other, afterwards. Without ``dx`` the flag is as it is configured.
+    """
+    arguments = ["--config", str(CONFIG), "--device", device.type]
+    if dx is not None:
+        arguments += ["--solver.dx", str(dx), "--scene.generator.init_args.spacing", str(plan.spacing)]
+        for name, size in zip(("width", "height"), plan.picture, strict=True):
+            arguments += [f"--camera.init_args.{name}", str(size)]
     parser = Simulation.parser()
     peak = Peak(device)
     simulation = Simulation.from_settings(parser, parser.parse_args(arguments))
+    painter = simulation.painter
     state = simulation.start()
     build_memory = peak.read()
     peak.start()
+    drawn = torch.cuda.Stream(device) if device.type == "cuda" else None
+    warm, count = plan.frames
+    samples, substeps = [], []
+    begin = time.perf_counter()
+    for frame in simulation.frames_from(state, 0, 1 + warm + count, drawn):
+        with torch.cuda.stream(drawn):
+            painter.render(frame.state, frame.index)
+        now = time.perf_counter()
+        if frame.index > warm:
+            samples.append(1e3 * (now - begin))
+            substeps.append(frame.health.substeps)
+        begin, state = now, frame.state
     parts: list[list[float]] = []
-    substeps = []
-    for frame in range(1, 1 + sum(plan.frames)):
+    for index in range(max(count // 3, 2)):
         clock = Clock(device)
         clock.mark()
-        state, health = simulation.advance(state)
+        state, _ = simulation.advance(state)
         clock.mark()
-        camera = simulation.painter.camera_at(frame)
-        gaussians = simulation.painter.deformed(state)
-        colours = simulation.painter.colors(gaussians, camera)
+        camera = painter.camera_at(index)
+        gaussians = painter.deformed(state)
+        colours = painter.colors(gaussians, camera)
         clock.mark()
-        simulation.painter.draw(gaussians, colours, camera)
+        painter.draw(gaussians, colours, camera)
         clock.mark()
-        if frame > plan.frames[0]:
-            parts.append(clock.read())
-            substeps.append(health.substeps)
-    row: Row = spread([sum(part) for part in parts])
+        parts.append(clock.read())
+    row: Row = spread(samples)
     names = ("simulation_ms", "shading_ms", "rendering_ms")
     row |= {name: statistics.median(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
-    row |= {
-        "particles": len(simulation.scene.simulated),
-        "width": width,
-        "height": height,
-    }
-    row |= {"substeps": statistics.median(substeps), "renderer": type(simulation.painter.renderer).__name__}
-    return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory}
+    row |= {"particles": len(simulation.scene.simulated), "points": simulation.scene.points.count}
+    row |= {"width": camera.width, "height": camera.height}
+    row |= {"substeps": statistics.median(substeps), "renderer": type(painter.renderer).__name__}
+    return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory, "dx_m": simulation.solver.dx}
 
 
 @torch.inference_mode()
@@ -288,6 +324,12 @@ def measure(
     if "sand" in wanted:
         known = {"formulation": "updated", "asked": plan.sand}
         case("sand", known, lambda: bench_rollout(plan, plan.sand, "updated", device, copy, sand=True))
+    if "cube" in wanted:
+        for asked in plan.cubes:
+            for turning in (False, True):
+                for walls in (False, True):
+                    known = {"asked": asked, "turning": turning, "walls": walls}
+                    case("cube", known, lambda a=asked, w=walls, t=turning: bench_cube(plan, a, w, t, device))
     if "batch" in wanted:
         for name in FORMULATIONS:
             for gusts in (False, True):
@@ -296,6 +338,8 @@ def measure(
     if "frame" in wanted:
         for dx in plan.dx:
             case("frame", {"dx_m": dx, "main": dx == plan.dx[0]}, lambda dx=dx: bench_frame(plan, dx, device))
+        if plan.small:
+            case("frame", {"small": True}, lambda: bench_frame(plan, None, device))
     del result["partial"]
     save(result)
 

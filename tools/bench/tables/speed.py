@@ -89,6 +89,21 @@ def substeps(result: Row) -> list[str]:
     return _cases(head, [(label(row), row, cells) for row in rows])
 
 
+@table(PAGE, "speed.cubes", "speed_*")
+def cubes(result: Row) -> list[str]:
+    """Elastic cubes in `updated`, with and without walls."""
+    known = {(row["asked"], row["turning"], row["walls"]): row for row in result.get("cube", [])}
+    shown = []
+    for asked in dict.fromkeys(row["asked"] for row in result.get("cube", [])):
+        for turning in (False, True):
+            rows = [known.get((asked, turning, walls), {}) for walls in (False, True)]
+            times = [row.get("failed") or _digits(row.get("median_ms")) for row in rows]
+            shown.append(
+                [f"{rows[0].get('particles', asked):,}", "turning" if turning else "falling from rest", *times]
+            )
+    return grid(["points", "motion", "substep [ms]", "with an enclosing box [ms]"], shown)
+
+
 @table(PAGE, "speed.batches", "speed_*")
 def batches(result: Row) -> list[str]:
     """Many flags in one rollout, and one after another."""
@@ -129,7 +144,7 @@ def frames(result: Row) -> list[str]:
 
     def label(row: Row) -> str:
         size = f", {row['particles']:,} Gaussians, {row['width']}x{row['height']}" if "particles" in row else ""
-        return f"dx = {row['dx_m']:g} m{size}"
+        return f"dx = {row['dx_m']:g} m{size}" if "dx_m" in row else "as it is configured"
 
     return _cases(head, [(label(row), row, cells) for row in rows])
 

@@ -17,7 +17,9 @@ SUBSTEP_GOALS = {
 SCALING_GOAL = (1.1, 1.0)
 SAND_GOAL = (1_000_000, (0.6, 0.4))
 BATCH_GOAL = 20.0
-FRAME_GOAL = (8.0, 4.0)
+FRAME_GOAL = (5.0, 3.5)
+SMALL_FRAME_GOAL = (2.0, 1.0)
+CUBE_GOALS = {False: (0.32, 0.27), True: (0.35, 0.28)}  # without and with walls
 MEMORY_GOAL = (0.3, 0.15)  # GiB
 
 Goal = tuple[str, str, bool | None, str, bool | None]  # as in goals.py
@@ -55,6 +57,9 @@ def goals(result: Row) -> list[Goal]:
         found.append(goal(text, row, "ratio", SCALING_GOAL, "times"))
     asked, limits = SAND_GOAL
     found.append(goal(f"substep of {asked:,} particles of sand", find("sand", asked=asked), "median_ms", limits, "ms"))
+    for walls, limits in CUBE_GOALS.items():
+        what = f"substep of a falling cube of 1,000,000 points, `updated`, {'in a box' if walls else 'no walls'},"
+        found.append(goal(what, find("cube", asked=1_000_000, turning=False, walls=walls), "median_ms", limits, "ms"))
     for name in FORMULATIONS:
         for gusts in (False, True):
             text = f"one H200: many flags at once, `{name}`, {'gusts' if gusts else 'steady winds'}: throughput"
@@ -67,5 +72,7 @@ def goals(result: Row) -> list[Goal]:
     row = find("frame", main=True)
     what = "frame of a flag of 100,000 Gaussians at 1920x1080"
     found.append(goal(what, row, "median_ms", FRAME_GOAL, "ms"))
+    small = "frame of the flag as it is configured, at 480x270,"
+    found.append(goal(small, find("frame", small=True), "median_ms", SMALL_FRAME_GOAL, "ms"))
     found.append(goal("device memory of such a frame", row, "memory_bytes", MEMORY_GOAL, "GiB", 2**-30))
     return found
