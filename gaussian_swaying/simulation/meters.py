@@ -15,8 +15,9 @@ class WallClock:
     """Seconds spent in each part of the run.
 
     Startup: on a GPU, a first frame that is thrown away, which loads and compiles the kernels. Simulation, shading and
-        rendering: from start to end; on a GPU this is measured on its stream, so that the host need not wait. Writing:
-        the time that the main thread spends in the recorder, not the time of the recorder's own threads.
+        rendering: from start to end; on a GPU this is measured on its stream, so that the host need not wait, and as
+        a frame is drawn while the next one is simulated, the parts may add up to more than the whole. Writing: the time
+        that the main thread spends in the recorder, not the time of the recorder's own threads.
     """
 
     def __init__(self, device: torch.device) -> None:

@@ -25,8 +25,9 @@ BATCH = {
     "apart_per_s",
 }
 BATCH |= {"ratio", "difference"}
+CUBE = SPREAD | {"asked", "turning", "walls", "particles", "substeps", "grid_nodes"}
 FRAME = SPREAD | {"dx_m", "main", "simulation_ms", "shading_ms", "rendering_ms", "particles", "width", "height"}
-FRAME |= {"substeps", "renderer", "memory_bytes", "build_memory_bytes"}
+FRAME |= {"points", "substeps", "renderer", "memory_bytes", "build_memory_bytes"}
 
 
 PAGE = """# Benchmarks
@@ -66,7 +67,8 @@ def test_everything_is_measured_and_shown(bench, tmp_path):
     assert (found["seed"], found["kind"], found["quick"], found["dt_s"]) == (0, "cpu", True, 1e-4)
     assert "partial" not in found
     assert found["copy"]["bytes_per_s"] > 0
-    for section, keys in (("substep", ROLLOUT), ("sand", ROLLOUT), ("batch", BATCH), ("frame", FRAME)):
+    for section, keys in (("substep", ROLLOUT), ("sand", ROLLOUT), ("batch", BATCH), ("cube", CUBE), ("frame", FRAME)):
+        assert found[section]
         for row in found[section]:
             assert set(row) == keys
     assert [(r["formulation"], r["asked"]) for r in found["substep"]] == [
@@ -191,10 +193,15 @@ def _recorded(factor):
         {"formulation": name, "asked": 10_000_000, "median_ms": factor**2 * 11 * limit}
         for name, limit in million.items()
     ]
-    frame = {"main": True, "median_ms": factor * 8.0, "memory_bytes": int(factor * 0.3 * 2**30)}
+    frame = {"main": True, "median_ms": factor * 5.0, "memory_bytes": int(factor * 0.3 * 2**30)}
+    small = {"small": True, "median_ms": factor * 2.0}
+    cube = [
+        {"asked": 1_000_000, "turning": False, "walls": walls, "median_ms": factor * limit}
+        for walls, (limit, _) in speed_goals.CUBE_GOALS.items()
+    ]
     batch = [{"formulation": f, "gusts": g, "ratio": 20 / factor} for f in ("total", "updated") for g in (False, True)]
     sand = [{"asked": 1_000_000, "median_ms": 0.6 * factor}]
-    return {"kind": "cuda", "substep": rows, "sand": sand, "batch": batch, "frame": [frame]}
+    return {"kind": "cuda", "substep": rows, "sand": sand, "batch": batch, "frame": [frame, small], "cube": cube}
 
 
 @pytest.mark.parametrize(
@@ -202,11 +209,11 @@ def _recorded(factor):
 )
 def test_goals_are_reached_or_not(factor, reached, stretched):
     found = speed_goals.goals(_recorded(factor))
-    assert len(found) == 13
+    assert len(found) == 16
     assert {goal[2] for goal in found} == {reached}
     assert {goal[4] for goal in found} - {None} == {stretched}
     lines = goals.goals([_recorded(factor) | {"copy": {}}])[2:]
-    assert len(lines) == 13
+    assert len(lines) == 16
     assert all(line.split(" | ")[2] == ("yes" if reached else "no") for line in lines)
     assert all(line.count(" | ") == 4 for line in lines)
 
@@ -214,7 +221,7 @@ def test_goals_are_reached_or_not(factor, reached, stretched):
 def test_goals_of_what_is_missing_or_failed():
     assert {goal[1:3] for goal in speed_goals.goals({"kind": "cuda"})} == {("not measured", None)}
     failed = _recorded(0.5)
-    for section in ("substep", "sand", "batch", "frame"):
+    for section in ("substep", "sand", "cube", "batch", "frame"):
         failed[section] = [row | {"failed": "out of memory"} for row in failed[section]]
     assert {goal[1:3] for goal in speed_goals.goals(failed)} == {("out of memory", False)}
     assert speed_goals.goals({"kind": "cpu"}) == []

@@ -17,6 +17,7 @@ from bench.tables import (
     long_flag,
     pareto,
     pareto_plot,
+    peers,
     pins,
     points,
     previews,
@@ -27,7 +28,7 @@ from bench.tables import (
 )
 from gaussian_swaying._files import write_text
 
-TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, pins, points, previews, runs, speed, training)
+TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, peers, pins, points, previews, runs, speed, training)
 """The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {

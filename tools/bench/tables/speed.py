@@ -89,7 +89,7 @@ def substeps(result: Row) -> list[str]:
     return _cases(head, [(label(row), row, cells) for row in rows])
 
 
-@table(PAGE, "speed.cubes", "speed_*")
+@table(PAGE, "speed.cubes", "speed_cuda")
 def cubes(result: Row) -> list[str]:
     """Elastic cubes in `updated`, with and without walls."""
     known = {(row["asked"], row["turning"], row["walls"]): row for row in result.get("cube", [])}
