@@ -1,4 +1,4 @@
-"""The installed program: ``gaussian-swaying sim``, ``train``, ``preview``, ``eval``, ``export`` and ``convert``."""
+"""The installed program: ``gaussian-swaying`` and the name of a command."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": ("gaussian_swaying.cli.evaluate", "compare a run with a reference"),
     "export": ("gaussian_swaying.cli.export", "convert a splat, or a run's splats to USD"),
     "convert": ("gaussian_swaying.cli.convert", "turn a PhysGaussian configuration into a YAML file"),
+    "warm": ("gaussian_swaying.cli.warm", "compile what the first runs on a GPU would compile"),
 }
 """For each command a module with ``main(arguments)``, and a description."""
 

@@ -74,8 +74,9 @@ class Scene:
             much finer than the grid, and needs ``solver.formulation: total``. Null for ``grid`` in ``total`` and
             ``gaussian`` in ``updated``.
         points_per_cell: Points along the side of a cell with ``points: grid``: a sheet then has the square of it in a
-            cell, a solid the cube, a cord as many. With 1 an object falls apart. An even number keeps the second moments of a group too (see
-            :func:`~gaussian_swaying.simulation.sampling.matched_points`), so 2 is more accurate than 3.
+            cell, a solid the cube, a cord as many. With 1 an object falls apart. An even number keeps the second
+            moments of a group too (see :func:`~gaussian_swaying.simulation.sampling.matched_points`), so 2 is more
+            accurate than 3.
     """
 
     def __init__(
