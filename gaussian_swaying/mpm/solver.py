@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
-from gaussian_swaying._graphs import Repeater
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -23,7 +22,7 @@ from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.recompute import recompute
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.mpm.timestep import kick_time, substeps_per_frame
+from gaussian_swaying.mpm.timestep import kick_time, look_marks, substeps_per_frame
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.triton.fused import Fused
@@ -288,7 +287,7 @@ class MPMSolver(nn.Module):
         Args:
             state: The state now.
             frame_dt: Length of the frame [s].
-            cells: What :meth:`cells_per_second` says, where it is known: then the host need not wait.
+            cells: What :meth:`cells_per_second` says, if it is known; then the host need not wait.
 
         Raises:
             ValueError: If the fixed substep is longer than the stable one; the message gives the limit.
@@ -302,8 +301,7 @@ class MPMSolver(nn.Module):
                 )
             steps = substeps_per_frame(frame_dt, self.substep, exact=True)
             return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
-        fastest = float(self.cells_per_second(state)) if cells is None else cells
-        longest = self.cfl / max(fastest, 1e-30)
+        longest = self.cfl / max(float(self.cells_per_second(state)) if cells is None else cells, 1e-30)
         return substeps_per_frame(frame_dt, damped_substep(longest, self.bound.viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
@@ -474,8 +472,7 @@ class MPMSolver(nn.Module):
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
         """
-        marks = _marks(steps, looks)
-        acting = as_forces(forces)
+        marks, acting = look_marks(steps, looks), as_forces(forces)
         if self.stiffness_damping == 0:
             fused = self._fused_for(state, acting)
             if fused is not None and fused.watches:
@@ -508,18 +505,11 @@ class MPMSolver(nn.Module):
 
     def momenta(self, state: MPMState) -> dict[str, Tensor]:
         """Linear [kg m/s] and angular momentum about the origin [kg m²/s], each of shape (..., 3)."""
-        linear, angular = self.bound.momenta(state)
-        return {"linear": linear, "angular": angular}
+        return dict(zip(("linear", "angular"), self.bound.momenta(state), strict=True))
 
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
-
-
-def _marks(steps: int, looks: int) -> list[int]:
-    """Numbers of the substeps after which to look: multiples of what a CUDA graph repeats, and the last one."""
-    unit = max(size for size in Repeater.SIZES if size == 1 or looks * size <= 2 * steps)
-    return sorted({min(unit * math.ceil((k + 1) * steps / (looks * unit)), steps) for k in range(looks)})
 
 
 def _told(watch: WatchFunction, before: int, done: int) -> None:

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from gaussian_swaying._graphs import Repeater
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.laws.shared import lame_parameters
@@ -115,3 +116,14 @@ def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | 
     """Largest Courant number ``dt (c + |v|) / dx``; leave out ``velocity`` where stencils do not move."""
     total = speed if velocity is None else speed + torch.linalg.vector_norm(velocity, dim=-1)
     return (dt * total / dx).amax()
+
+
+def look_marks(steps: int, looks: int) -> list[int]:
+    """Numbers of the substeps after which to look: multiples of what a CUDA graph repeats, and the last one.
+
+    Args:
+        steps: Number of substeps.
+        looks: How often to look, at most.
+    """
+    unit = max(size for size in Repeater.SIZES if size == 1 or looks * size <= 2 * steps)
+    return sorted({min(unit * math.ceil((k + 1) * steps / (looks * unit)), steps) for k in range(looks)})

@@ -98,5 +98,5 @@ def test_output_of_the_first_command_is_the_recorded_one():
 
 def test_the_guitar_moves_faster_than_real_time_on_a_gpu():
     row = json.loads((RESULTS / "sim_cuda.json").read_text())["runs"][1]
-    assert row["particles"] == 90_854
+    assert row["simulated_gaussians"] == 90_854
     assert sum(value for part, value in row["wall_s"].items() if part != "startup") < 0.04 * row["frames"]

@@ -94,6 +94,8 @@ def test_the_preset_is_a_small_version(name):
     for one, other in zip(small.material.regions, full.material.regions, strict=True):
         assert one.region == other.region
         assert one.thickness <= other.thickness
+    if "points_per_cell" in changed["scene"]:
+        assert changed["scene"].pop("points_per_cell") < full.scene.points_per_cell
     assert set(changed["scene"]) == {"generator"}
     assert small.scene.generator.init_args.spacing > 2 * full.scene.generator.init_args.spacing
     assert small.solver.dx > full.solver.dx
