@@ -73,7 +73,7 @@ def render_gsplat(
 ) -> RenderOutput:
     """Draw Gaussians as ``gsplat.rasterization`` (Ye et al. 2025, arXiv 2409.06765) does, in float32.
 
-    It is built from gsplat's functions: ``rasterization`` makes the host wait four times, and this once. gsplat
+    It is built from gsplat's functions: ``rasterization`` makes the host wait several times, and this once. gsplat
     compiles its kernels at the first call, see :func:`load_kernels`.
 
     Args:

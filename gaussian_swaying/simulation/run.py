@@ -141,10 +141,7 @@ class Run:
                     self.warm_up(state, first)
             drawn = self.drawing_stream()
             frames = simulation.frames_from(state, first, self.frames, drawn)
-            bar.begin(first)
             for index in range(first, self.frames):
-                if drawn is None:
-                    bar.begin(index)
                 with walls("simulation"):
                     frame = next(frames)
                 state = frame.state

@@ -328,16 +328,21 @@ class Simulation(nn.Module):
             if index == 0:
                 health = diagnose(self.solver, state, 0, 0.0)
             else:
+                if launched is None:
+                    self._begin(index)
                 state, health = self.advance(state) if launched is None else launched.finish()
                 if drawn is not None:  # the frame before may still be drawn from memory that is now free
                     torch.cuda.current_stream(self.device).wait_stream(drawn)
                 state = self.edit_due(state)
             if drawn is not None and index + 1 < count:
                 drawn.wait_stream(torch.cuda.current_stream(self.device))
-                if self.progress is not None:
-                    self.progress.begin(index + 1)
+                self._begin(index + 1)
                 launched = self.launch(state)
             yield Frame(self, index, state, health, self.editor.version)
+
+    def _begin(self, index: int) -> None:
+        if self.progress is not None:
+            self.progress.begin(index)
 
     def start(self) -> MPMState:
         """The state at rest at time zero, with the edits of that time applied.

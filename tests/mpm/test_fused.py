@@ -951,9 +951,22 @@ def test_planes_and_boxes_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
     for solver in (with_walls, with_pin):
         solver.init_state(points)
     batch.init_state(_points(kernel_device, count=12, batch=(2,)))
-    assert len(with_walls.fused().walls[0]) == 7
-    assert with_pin.fused().walls is None
-    assert batch.fused().walls is None
+    assert len(with_walls.fused().planes) == 7
+    assert with_pin.fused().planes == []
+    assert batch.fused().planes == []
+
+
+def test_a_plane_that_is_moved_in_place(kernel_device):
+    """Between two rollouts, and without another buffer."""
+    points, ends = _points(kernel_device, count=12), []
+    for transfer in ("torch", "triton"):
+        plane = Plane([0.0, 0.0, -1.0], [0.0, 0.0, 1.0], "sticky")
+        solver = _solver(transfer, "updated", boundaries=[plane])
+        state = solver.rollout(_start(solver, points), DT, 1)
+        plane.point[2] = 0.13
+        ends.append(solver.rollout(state, DT, 1))
+    _agree(ends)
+    assert float(ends[1].impulse.abs().max()) > 1e-4
 
 
 def test_crowded_cells_and_fast_particles_are_sorted_more_often():

@@ -228,14 +228,17 @@ def test_goals_of_what_is_missing_or_failed():
 
 
 def test_goals_of_the_other_runs():
-    """The substep on a CPU, and the captured object on a GPU."""
+    """The substep on a CPU, and the captured object on a GPU and on a CPU."""
     slow = {"device": "a CPU", "substep": [{"particles": 19_881, "formulation": "updated", "median_ms": 41.0}]}
     assert goals.goals([slow])[2].endswith("within 40 ms | 41.0 ms (`updated`) | no | - | - |")
-    wall = {"simulation": 3.0, "shading": 1.0, "rendering": 1.0}
+    wall = {"simulation": 0.8, "shading": 0.2, "rendering": 0.2}
     run = {"name": "guitar, 1920x1080", "frames": 250, "wall_s": wall, "peak_memory_bytes": {"device": 10**8}}
     run |= {"lost_particles": 0, "stretch_min": 0.9, "stretch_max": 1.1}
-    rows = [row for row in goals.goals([{"device": "NVIDIA H200", "runs": [run]}]) if "within 6 s" in row]
-    assert [row.split(" | ", 1)[1] for row in rows] == ["5.0 s | yes | 3 s | no |"]
+    rows = [row for row in goals.goals([{"device": "NVIDIA H200", "runs": [run]}]) if "within 1.5 s" in row]
+    assert [row.split(" | ", 1)[1] for row in rows] == ["1.2 s, 0.09 GiB | yes | 1 s | no |"]
+    run |= {"name": "guitar, 960x540", "process_wall_s": 185.0}
+    rows = [row for row in goals.goals([{"device": "a CPU", "runs": [run]}]) if "within 180 s" in row]
+    assert [row.split(" | ", 1)[1] for row in rows] == ["185 s | no | 90 s | no |"]
 
 
 def test_goals_of_rollouts_are_not_those_of_a_single_substep():

@@ -48,7 +48,10 @@ class FusedUpdated(Fused):
         self.inverse_mass = torch.zeros(0, device=self.device)
         self.weight = torch.zeros(0, device=self.device)
         self.node_position: Tensor | None = None
-        self.walls = wall_table(bound.body.boundaries, self.device) if self.scenes == 1 else None
+        self.planes = planes_of(bound.body.boundaries) if self.scenes == 1 else []
+        self.walls = torch.zeros(len(self.planes), kernels.WALL.value, device=self.device)
+        self.windows = torch.zeros(len(self.planes), 2, dtype=torch.float64, device=self.device)
+        self._walls_of: list[int] | None = None  # versions of the tensors that the tables were made from
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
         self.crowd = crowd_of(points.position, bound.settings.dx)
         self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
@@ -84,6 +87,7 @@ class FusedUpdated(Fused):
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
         self.clock.copy_(torch.stack([self.time, self.dt]))
+        self._take_walls()
         self._load(state)
         self._start(options)
         done, every = 0, self._sorted_for()
@@ -120,7 +124,19 @@ class FusedUpdated(Fused):
     @property
     def _acting(self) -> bool:
         """Whether boundary conditions act in torch."""
-        return len(self.body.boundaries) > 0 and self.walls is None
+        return len(self.body.boundaries) > 0 and not self.planes
+
+    def _take_walls(self) -> None:
+        """Fill the tables of the planes, again if one of their tensors was written to; graphs know the addresses."""
+        tensors = [tensor for plane, _ in self.planes for tensor in (plane.point, plane.normal)]
+        known_versions = not any(tensor.is_inference() for tensor in tensors)
+        versions = [tensor._version for tensor in tensors] if known_versions else None
+        if not self.planes or (versions is not None and versions == self._walls_of):
+            return
+        self._walls_of, places = versions, torch.stack(tensors).to(self.device).reshape(-1, 6)
+        known = [[float(KINDS.index(plane.kind)), plane.friction, float(k)] for plane, k in self.planes]
+        self.walls.copy_(torch.cat([places, torch.tensor(known, device=self.device)], dim=1))
+        self.windows.copy_(torch.tensor([[plane.start, plane.end] for plane, _ in self.planes], dtype=torch.float64))
 
     def _start(self, options: dict[str, Any]) -> None:
         """The start of a substep without the end of the one before."""
@@ -207,12 +223,11 @@ class FusedUpdated(Fused):
         nodes = self.grid.node_count * self.scenes
         block = 256
         acting, (_, ny, nz) = self._acting, self.grid.resolution
-        walls, windows = (self.clock, self.clock) if self.walls is None else self.walls
         kernels.updated_nodes[(-(-nodes // block),)](
             self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
-            *self.gravity, walls, windows, self.clock, self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
+            *self.gravity, self.walls, self.windows, self.clock, self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
             IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
-            WALLS=0 if self.walls is None else len(walls), BLOCK=block, num_warps=4,
+            WALLS=len(self.planes), BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()
@@ -309,9 +324,9 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
     r"""After how many substeps to sort again.
 
     As the order gets stale, particles in a row no longer share their cell, and more atomic sums meet: the time of a
-    substep grows with their share, and a sort takes about half a substep. The sum of both is least after
-    :math:`\sqrt{S / r}` substeps, with the rate r at which particles enter other cells; S was measured on an H200 with
-    eight points in a cell. A small body waits for the host, not for sums.
+    substep grows with their share. Together with the time of the sorts it is least after :math:`\sqrt{S / r}` substeps,
+    with the rate r at which particles enter other cells. S suits a cube with eight points in a cell, turning and sorted
+    after 4 to 64 substeps, on an H200. A small body waits for the host, not for sums.
 
     Args:
         crowd: Points in a cell.
@@ -323,24 +338,12 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
     return int(min(max(round(best), least), MOST))
 
 
-def wall_table(boundaries: Sequence[nn.Module], device: torch.device) -> tuple[Tensor, Tensor] | None:
-    """The planes of all boundaries, rows of ``kernels.WALL`` numbers, and their times; None if not all are planes.
+def planes_of(boundaries: Sequence[nn.Module]) -> list[tuple[Plane, int]]:
+    """The planes of all boundaries, each with the number of its boundary; none if not all boundaries are planes.
 
     Args:
         boundaries: The boundary conditions of a body.
-        device: Where the tables are used.
     """
-    rows, windows = [], []
-    for k, boundary in enumerate(boundaries):
-        if type(boundary) not in (Plane, EnclosingBox):
-            return None
-        for plane in (part for part in boundary.modules() if isinstance(part, Plane)):
-            numbers = [float(KINDS.index(plane.kind)), plane.friction, float(k)]
-            rows.append([*plane.point.tolist(), *plane.normal.tolist(), *numbers])
-            windows.append([plane.start, plane.end])
-    if not rows:
-        return None
-    return (
-        torch.tensor(rows, dtype=torch.float32, device=device),
-        torch.tensor(windows, dtype=torch.float64, device=device),
-    )
+    if any(type(boundary) not in (Plane, EnclosingBox) for boundary in boundaries):
+        return []
+    return [(part, k) for k, one in enumerate(boundaries) for part in one.modules() if isinstance(part, Plane)]

@@ -287,8 +287,7 @@ def updated_particles(
         store9(moving + 15 * count, count, index, C, mask)
 
 
-WALL = 9
-"""Columns of the table of walls: point, normal, kind (0 sticky, 1 slip, 2 separate), friction, boundary."""
+WALL = tl.constexpr(9)  # columns of the table of walls: point, normal, kind (in plane.KINDS), friction, boundary
 
 
 @triton.jit
@@ -349,7 +348,7 @@ def updated_nodes(
             (k % nz + oz).to(tl.float32) * dx,
         )
         for w in tl.static_range(WALLS):
-            stopped, behind = _stop(v, x, walls + w * 9)
+            stopped, behind = _stop(v, x, walls + w * WALL)
             begun = now >= tl.load(windows + 2 * w)
             over = now >= tl.load(windows + 2 * w + 1)
             hit = tl.where(begun, tl.where(over, False, behind & some & mask), False)
@@ -357,7 +356,7 @@ def updated_nodes(
                 tl.where(hit, stopped[0], v[0]), tl.where(hit, stopped[1], v[1]), tl.where(hit, stopped[2], v[2])
             )  # fmt: skip
             if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a wall
-                to = impulse + 3 * tl.load(walls + w * 9 + 8).to(tl.int32)
+                to = impulse + 3 * tl.load(walls + w * WALL + 8).to(tl.int32)
                 for c in tl.static_range(3):
                     tl.atomic_add(to + c, tl.sum((mass * (v[c] - u[c])).to(tl.float64)), sem="relaxed")
             v = u
