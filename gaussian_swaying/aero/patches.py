@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying.geometry.groups import sums
+from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.linalg import cofactor
 
 MOST = 243
@@ -157,9 +157,11 @@ def joined_directions(
     for level, angle in enumerate(_COARSE if coarse else _ANGLES):
         rows = torch.cat([(on_face[pending] / angle).round().long(), major[pending]], -1)
         cell[pending] = torch.cat([rows, torch.full_like(rows[:, :1], level)], -1)
-        used = torch.unique(torch.cat([point[pending, None], rows], -1), dim=0)[:, 0].bincount(minlength=len(tensor))
+        group = equal_rows(torch.cat([point[pending, None], rows], -1))
+        count = int(group.max()) + 1 if len(group) else 0
+        used = group.new_zeros(count).index_put((group,), point[pending]).bincount(minlength=len(tensor))
         pending = pending[used[point[pending]] > MOST]
-    group = torch.unique(torch.cat([point[:, None], cell], -1), dim=0, return_inverse=True)[1]
+    group = equal_rows(torch.cat([point[:, None], cell], -1))
     total = sums(sign * area[:, None] * normal, group)
     size = sums(area, group)
     owner = torch.zeros(len(size), dtype=torch.long).index_put((group,), point)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 _RAYS = 32  # number of directions in which the cell of a patch is measured
@@ -90,7 +91,9 @@ def coverage_area(
     if count == 0:
         return means.new_zeros(0)
     # Gaussians with the same centre form one site; in the end its cell is shared among them by weight.
-    site, owner = torch.unique(means.detach().cpu().double(), dim=0, return_inverse=True)
+    centres = means.detach().cpu().double()
+    owner = equal_rows(centres)
+    site = centres.new_empty(int(owner.max()) + 1, 3).index_put((owner,), centres)
     own_area = patch_area(log_scales.detach().cpu().double())
     load = weight * own_area
     order = torch.argsort(load, stable=True)

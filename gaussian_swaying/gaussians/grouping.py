@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
-from gaussian_swaying.geometry.groups import sums
+from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 LOOSE = 0.01  # share of the largest part; what is smaller and connected to nothing is loose
@@ -62,7 +62,7 @@ def grid_groups(
     if label is not None:
         check_shape("label", label, len(position), None)
         rows.append(label)
-    group = torch.unique(torch.cat(rows, -1), dim=0, return_inverse=True)[1]
+    group = equal_rows(torch.cat(rows, -1))
     if normal is None or len(group) == 0:
         return group
     check_shape("normal", normal, len(position), 3)
@@ -103,7 +103,7 @@ def loose_points(points: Tensor, side: float) -> Tensor:
     check_positive("side", side)
     where = points.double()
     cell = torch.floor((where - where.amin(0)) / side).long()
-    group = torch.unique(cell, dim=0, return_inverse=True)[1]
+    group = equal_rows(cell)
     centre = sums(where, group) / sums(torch.ones_like(where[:, :1]), group)
     order = (where - centre[group]).square().sum(-1).argsort(stable=True)
     first = torch.full((len(centre),), len(points))

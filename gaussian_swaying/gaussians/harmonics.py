@@ -87,7 +87,7 @@ def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
     check_shape("directions", directions, 3)
     degree = sh_degree(sh.shape[-2])
     if degree == 0:  # the same in every direction
-        return SH_DC * sh[..., 0, :].expand(torch.broadcast_shapes((*sh.shape[:-2], 3), directions.shape))
+        return SH_DC * torch.broadcast_tensors(sh[..., 0, :], directions)[0]
     unit = torch.nn.functional.normalize(directions, dim=-1)
     basis = sh_basis(unit, degree) if unit.device.type == "cpu" else _basis_by_product(unit, degree)
     return (basis[..., None] * sh).sum(-2)
@@ -164,8 +164,7 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     check_shape("sh", sh, None, 3)
     check_shape("rotation", rotation, 3, 3)
     degree = sh_degree(sh.shape[-2])
-    batch = torch.broadcast_shapes(sh.shape[:-2], rotation.shape[:-2])
-    bands = [sh[..., :1, :].expand(*batch, 1, 3)]
+    bands = [torch.broadcast_tensors(sh[..., :1, :], rotation[..., :1, :])[0]]
     for band in range(1, degree + 1):
         directions, inverse = _sampling(band)
         turned = directions.to(rotation) @ rotation  # each row is R^T d_k

@@ -1,8 +1,49 @@
-"""Sums over the members of groups."""
+"""Groups of equal rows, and sums over their members."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
+
+_LARGEST = 2**62  # of a key
+
+
+def equal_rows(rows: Tensor) -> Tensor:
+    """The group of each row, where equal rows are one group.
+
+    The same as ``torch.unique(rows, dim=0, return_inverse=True)[1]``, but many times faster on a CPU.
+
+    Args:
+        rows: Finite numbers, shape (N, K).
+
+    Returns:
+        Groups from 0 on, in the lexicographic order of their rows, shape (N,).
+    """
+    if len(rows) == 0:
+        return rows.new_zeros(0, dtype=torch.long)
+    key, size = torch.zeros(len(rows), dtype=torch.long, device=rows.device), 1
+    for column in rows.unbind(-1):
+        place, width = _places(column)
+        if size * width >= _LARGEST:
+            key, size = _ranks(key)
+        if size * width >= _LARGEST:
+            place, width = _ranks(place)
+        key, size = key * width + place, size * width
+    return _ranks(key)[0]
+
+
+def _places(column: Tensor) -> tuple[Tensor, int]:
+    """Whole numbers from 0 on in the order of a column's values, and a number above all of them."""
+    if column.is_floating_point():
+        return _ranks(column)
+    whole = column.long()
+    low, high = (int(value) for value in whole.aminmax())
+    return (whole - low, high - low + 1) if high - low < _LARGEST else _ranks(whole)
+
+
+def _ranks(values: Tensor) -> tuple[Tensor, int]:
+    found, rank = torch.unique(values, return_inverse=True)
+    return rank, len(found)
 
 
 def sums(values: Tensor, group: Tensor, count: int | None = None) -> Tensor:

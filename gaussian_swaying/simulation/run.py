@@ -22,7 +22,7 @@ from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.meters import PeakMemory, WallClock
 from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.recording.checkpoint import check_state, unreadable
+from gaussian_swaying.simulation.recording.checkpoint import check_state, log_lines, unreadable
 from gaussian_swaying.simulation.recording.recorder import frame_folder
 
 if TYPE_CHECKING:
@@ -119,6 +119,7 @@ class Run:
         self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
         self.frames, self.splat, self.config = frames, splat, config
         self.log: list[dict[str, Any]] = []
+        self._lines: list[str] = []  # the log as a checkpoint holds it, which is written every frame
         self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
         self.force_end = self.recorder.force_scale or simulation.force_scale()
 
@@ -212,7 +213,7 @@ class Run:
                 {
                     "frame": frame,
                     "state": state.state_dict(),
-                    "log": self.log,
+                    "log": log_lines(self.log, self._lines),
                     "config": self.config,
                     "wall_s": self.walls.read(),
                     "splat": self.splat,

@@ -12,7 +12,7 @@ from gaussian_swaying.aero.patches import joined_directions, second_moments
 from gaussian_swaying.gaussians.filling import Filling
 from gaussian_swaying.gaussians.grouping import grid_groups
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.groups import sums
+from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
@@ -157,8 +157,8 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
         Volume [m³], shape (P,).
     """
     cell = torch.floor(position / dx).long()
-    _, inverse, counts = torch.unique(cell, dim=0, return_inverse=True, return_counts=True)
-    return dx**3 / counts[inverse].to(position.dtype)
+    group = equal_rows(cell)
+    return dx**3 / group.bincount()[group].to(position.dtype)
 
 
 @torch.no_grad()
@@ -184,7 +184,7 @@ def grouped(
         group of each point, shape (P,).
     """
     kinds = torch.stack([getattr(samples, name) for name in _PROPERTIES], -1)
-    kind = torch.unique(kinds, dim=0, return_inverse=True)[1]
+    kind = equal_rows(kinds)
     where = frame.point_to_scene(samples.position)
     masks = [region.contains(where) for region in apart]
     label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks], -1).long()

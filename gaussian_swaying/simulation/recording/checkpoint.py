@@ -6,7 +6,9 @@ field by field, against the initial state of the scene.
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,20 @@ _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": di
 def write_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
     """Write a checkpoint with its checksum, whole or not at all."""
     save_sealed(path, checkpoint)
+
+
+def log_lines(log: Sequence[Mapping[str, float]], known: list[str]) -> list[str]:
+    """A log of frames as a checkpoint holds it: a line of JSON per frame.
+
+    Args:
+        log: Diagnostics of all frames so far.
+        known: The lines of the first of them; the others are appended, so that each is made once.
+
+    Returns:
+        A copy of ``known``.
+    """
+    known += [json.dumps(entry) for entry in log[len(known) :]]
+    return list(known)
 
 
 def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
@@ -50,6 +66,7 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
                 raise ValueError(f"it has no `{name}`")
             if type(checkpoint[name]) is not kind:
                 raise ValueError(f"its `{name}` is not of type {kind.__name__}")
+        checkpoint["log"] = [json.loads(line) for line in checkpoint["log"]]
     except Exception as error:
         raise unreadable(path, error) from error
     if config and checkpoint["config"] != config:

@@ -1,5 +1,8 @@
 """A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it."""
 
+import io
+import json
+import math
 import pickle
 import random
 import shutil
@@ -11,7 +14,7 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.runs.seal import check_seal, seal
 from gaussian_swaying.simulation.diagnostics import entry_names
-from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.simulation.recording.checkpoint import log_lines, read_checkpoint, write_checkpoint
 from gaussian_swaying.simulation.recording.recorder import Recorder
 
 CONFIG = "material:\n  E: 3000.0\nwind:\n  flow:\n  - 6.0\n  - 1.5\n  - 0.0\n"
@@ -128,11 +131,19 @@ def _fields(checkpoint):
 HARMLESS = {("state.F_total", None), ("state.internal", None), ("splat", None)}
 
 
+def _with_lines(checkpoint):
+    """As it is written: its log as lines, of whatever is in it."""
+    if isinstance(checkpoint, dict) and isinstance(checkpoint.get("log"), list):
+        return checkpoint | {"log": [json.dumps(entry, default=str) for entry in checkpoint["log"]]}
+    return checkpoint
+
+
 def _broken_fields(file):
     """A checkpoint with a right checksum for each field that is missing, renamed or of another kind."""
 
     def fresh():
-        return torch.load(file, weights_only=True)
+        checkpoint = torch.load(file, weights_only=True)
+        return checkpoint | {"log": [json.loads(line) for line in checkpoint["log"]]}
 
     for prefix, fields, find in _fields(fresh()):
         for name, value in fields.items():
@@ -179,9 +190,13 @@ def test_forty_bits_and_more_than_a_hundred_other_damages(run):
     file.write_bytes(content)
     broken = list(_broken_fields(file))
     for case, checkpoint in broken:
-        write_checkpoint(file, checkpoint)
+        write_checkpoint(file, _with_lines(checkpoint))
         _refused(resume, folder, case)
     assert len(broken) > 300
+    held = torch.load(io.BytesIO(content), weights_only=True)
+    for junk in (*JUNK, "[1", {"cfl": 0.1}):  # instead of a line
+        write_checkpoint(file, held | {"log": [held["log"][0], junk]})
+        _refused(resume, folder, f"log[1] = {junk!r}")
     file.write_bytes(content)
     assert resume()["status"] == "complete"
 
@@ -190,7 +205,7 @@ def test_a_checkpoint_executes_no_code(tmp_path, run):
     folder, resume = run
     held = read_checkpoint(folder / "checkpoint.pt")
     held["wall_s"]["fuse"] = Fuse(tmp_path / "burnt")
-    write_checkpoint(folder / "checkpoint.pt", held)
+    write_checkpoint(folder / "checkpoint.pt", _with_lines(held))
     assert "cannot be read as a checkpoint" in _refused(resume, folder, "a fuse")
     assert not (tmp_path / "burnt").exists()
 
@@ -199,7 +214,7 @@ def test_a_configuration_that_is_no_yaml(run):
     folder, resume = run
     held = read_checkpoint(folder / "checkpoint.pt")
     for text in ("{", "a: [" * 5000, "x: !!python/object/apply:os.getcwd []"):
-        write_checkpoint(folder / "checkpoint.pt", held | {"config": text})
+        write_checkpoint(folder / "checkpoint.pt", _with_lines(held | {"config": text}))
         assert "`config` is not valid YAML" in _refused(resume, folder, text[:20])
 
 
@@ -243,7 +258,7 @@ def test_edits_that_bring_an_internal_variable(make_simulation, tmp_path, formul
     assert held["state"]["internal"] is not None
     make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
     held["state"]["internal"] = torch.full_like(held["state"]["internal"], torch.nan)
-    write_checkpoint(tmp_path / "run" / "checkpoint.pt", held | {"frame": 2})
+    write_checkpoint(tmp_path / "run" / "checkpoint.pt", _with_lines(held | {"frame": 2}))
     with pytest.raises(ValueError, match="its `internal` is NaN"):
         make().run(tmp_path / "run", 4, resume=True, progress=False, recorder=recorder)
 
@@ -253,6 +268,16 @@ def test_the_diagnostics_of_a_frame_are_what_a_log_holds(run):
     assert list(held["log"][0]) == entry_names(1)
     assert entry_names(1)[-3:] == ["support_0_x", "support_0_y", "support_0_z"]
     assert held["log"][-1]["support_0_z"] != 0.0 == held["log"][0]["support_0_z"]
+
+
+def test_the_lines_of_a_log_are_made_once():
+    """Numbers come back to the last bit, and so does what is not finite."""
+    log, known = [{"a": 1, "b": 0.1}], []
+    first = log_lines(log, known)
+    log += [{"a": 2, "b": math.inf}]
+    log[0]["b"] = 7.0  # its line is known
+    assert log_lines(log, known) == known and len(first) == 1
+    assert [json.loads(line) for line in known] == [{"a": 1, "b": 0.1}, {"a": 2, "b": math.inf}]
 
 
 def test_a_seal(tmp_path):
