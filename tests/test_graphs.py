@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from gaussian_swaying._graphs import Repeater, fingerprint
+from gaussian_swaying._graphs import Repeater, Replayed, fingerprint, tensors_in
 from gaussian_swaying.aero.wind import GaussianGust, Modulation, SineSway, UniformGust, WindField
 from gaussian_swaying.geometry.regions import Box, Everything, Not, Union
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
@@ -62,6 +62,13 @@ def test_fingerprint_sees_what_was_replaced():
     wind.flows.fill_(2.0)
     assert fingerprint(parts) == seen[-1]
     del kept  # until here, so that nothing new lies where they did
+
+
+def test_tensors_of_modules():
+    wind = WindField(modulations=[UniformGust(), nn.Linear(2, 3)])
+    expected = [*wind.parameters(), *wind.buffers()]
+    assert {id(tensor) for tensor in tensors_in([wind])} == {id(tensor) for tensor in expected}
+    assert len(tensors_in([wind, WindField()])) == len(expected) + 2
 
 
 def test_regions_say_for_themselves_whether_they_can_be_recorded():
@@ -223,6 +230,45 @@ def test_no_more_than_some_works_are_kept(driver):
     assert called == [1, 1]  # 0 was forgotten, and 16, the oldest, is now
 
 
+def test_a_whole_is_recorded_when_it_comes_again(driver):
+    """The first time the caller runs it in another way; the oldest are dropped, and what they took is given back."""
+    repeater, called = Repeater(torch.device("cuda")), []
+
+    def work():
+        called.append(driver.capturing is not None)
+        driver.allocate(10)
+
+    for count in (1, 2, 3):
+        assert repeater.once("key", work) is (count > 1)
+    assert called == [True]  # recorded, and replayed
+    for key in range(2 * Repeater.WHOLE):
+        repeater.once("key", work)  # the newest stays
+        for _ in range(2):
+            repeater.once(key, work)
+        assert len(driver.alive) <= Repeater.WHOLE
+    assert driver.reserved <= 20
+    assert called == [True] * (1 + 2 * Repeater.WHOLE)
+    repeater.forget()
+    assert not driver.alive
+    assert not repeater.once("key", work)
+
+
+def test_a_whole_without_cuda():
+    done, repeater = [], Repeater(torch.device("cpu"))
+    assert [repeater.once("key", lambda: done.append(1)) for _ in range(3)] == [False, True, True]
+    assert len(done) == 2
+
+
+def test_a_function_without_cuda_is_called():
+    called = []
+    replayed = Replayed()
+    for k in range(3):
+        (found,) = replayed("key", lambda x: called.append(1) or [2 * x], torch.full((2,), float(k)))
+        assert found.tolist() == [2 * k] * 2
+    assert len(called) == 3
+    assert not replayed.recorded
+
+
 def test_a_work_that_can_no_longer_be_recorded_leaves_no_pool_behind(driver):
     """Its graphs were the only ones of their pool, which nothing else may join then."""
     repeater = Repeater(torch.device("cuda"))
@@ -287,3 +333,26 @@ def test_work_is_recorded_from_the_second_time_on_and_after_forgetting():
     repeater.run(1, "other", several, recordable=False)
     assert called[9:] == [1, 1]
     assert float(total) == 3 + 23 + 23 + 1 + 5 + 2
+
+
+@pytest.mark.gpu
+def test_a_function_is_replayed_with_its_inputs_of_now():
+    called, replayed = [], Replayed()
+
+    def function(x, y):
+        called.append(1)
+        return [x + y, x.sum()[None]]
+
+    kept = []
+    with torch.no_grad():
+        for k in range(5):
+            x, y = torch.full((3,), float(k), device="cuda"), torch.ones(3, device="cuda")
+            kept.append(replayed("key", function, x, y))
+        for k, found in enumerate(kept):
+            assert [values.tolist() for values in found] == [[k + 1.0] * 3, [3.0 * k]]
+        assert len(called) == 2  # as it is, and recorded
+        replayed("key", function, x.double(), y.double())
+        replayed("other", function, x, y)
+        assert len(called) == 4
+    function(x.requires_grad_(), y)
+    assert replayed("other", function, x, y)[0].requires_grad

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying._graphs import fingerprint, record
+from gaussian_swaying._graphs import fingerprint, record, tensors_in
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -109,7 +109,7 @@ class WindForce(Force):
         return found.pop() if len(found) == 1 else None
 
     def _wind_tensors(self) -> list[Tensor]:
-        return [*self._fields.parameters(), *self._fields.buffers()]
+        return tensors_in([self._fields])
 
     def winds(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         """Velocity of a uniform wind [m/s] at the start of ``steps`` substeps of ``dt`` [s] from ``time`` [s] on.
@@ -126,6 +126,8 @@ class WindForce(Force):
         Returns:
             Shape (steps, 3), or (steps, B, 1, 3) with one wind for each scene; float64, on the device of ``time``.
         """
+        if time.is_cuda and torch.cuda.is_current_stream_capturing():  # a part of another graph
+            return self._winds(time, dt, steps)
         on_gpu = time.is_cuda and self.device == time.device
         if not (on_gpu and self.recordable and steps <= MOST_STEPS) or (
             torch.is_grad_enabled() and any(t.requires_grad for t in self._wind_tensors())
@@ -222,7 +224,11 @@ class WindForce(Force):
 
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
-        half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
+
+        def numbers() -> Tensor:
+            half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
+            return torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest])
+
         if self.sums is not None:
             return ForceTwin(
                 function=wind_on_groups,
@@ -230,7 +236,7 @@ class WindForce(Force):
                 implicit=implicit,
                 sources=(self.sums.tensor, self.sums.vector),
                 values=self.sums.lists,
-                numbers=torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest]),
+                numbers=numbers,
                 vectors=self.winds,
                 table=self.sums.table,
             )
@@ -240,7 +246,7 @@ class WindForce(Force):
             implicit=implicit,
             sources=(self.normal, self.area),
             values=lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1),
-            numbers=torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest]),
+            numbers=numbers,
             vectors=self.winds,
         )
 

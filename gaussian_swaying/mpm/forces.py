@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying._graphs import Recordable
+from gaussian_swaying._graphs import Recordable, tensors_in
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.state import MPMState
 
@@ -41,7 +41,8 @@ class ForceTwin:
         sources: The tensors that the values are computed from: ``values`` is called again when one of them is replaced
             or changed in place.
         values: Returns up to four numbers for each particle, shape (..., P, n).
-        numbers: Up to eight numbers, shape (n,).
+        numbers: Returns up to eight numbers, shape (n,); called for every rollout. If the force is ``recordable``, it
+            and ``vectors`` may be recorded in a CUDA graph.
         table: Returns more numbers, shape (m,), float32, which follow eight places after the first of ``numbers``, such
             as lists that the values point to; called when ``values`` is. None for none.
         vectors: ``vectors(time, dt, steps)`` returns what depends only on time: a vector for the start of each of
@@ -54,7 +55,7 @@ class ForceTwin:
     implicit: bool
     sources: tuple[Tensor, ...]
     values: Callable[[], Tensor]
-    numbers: Tensor
+    numbers: Callable[[], Tensor]
     vectors: Callable[[Tensor, Tensor, int], Tensor]
     table: Callable[[], Tensor] | None = None
 
@@ -192,7 +193,7 @@ def added(parts: Sequence[tuple[Tensor | None, Tensor | None]]) -> tuple[Tensor 
 
 def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
     """Parameters and buffers of forces, which may require gradients."""
-    return [tensor for force in forces for tensor in (*force.parameters(), *force.buffers())]
+    return tensors_in(forces)
 
 
 def divide(forces: Sequence[Force]) -> tuple[Force | None, tuple[Force, ...]]:

@@ -207,6 +207,12 @@ class MPMSolver(nn.Module):
             raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
         return obstacle
 
+    @property
+    def has_kernels(self) -> bool:
+        """Whether the Triton substep is used where no gradient is needed."""
+        self.bound  # noqa: B018  (raises an error without a material)
+        return self._fused_obstacle is None
+
     def fused(self, *tensors: Tensor | None) -> Fused | None:
         """The Triton substep of this material; None if the torch substep is used.
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
+from gaussian_swaying._graphs import Recordable
 
 REST_FLOOR = 0.1
 """Relative shading clamps the factors of the moving and the rest normal to at least this before it divides them."""
@@ -152,8 +153,12 @@ def _check_rest(relative: bool, rest_normal: Tensor | None) -> Tensor | None:
     return rest_normal if relative else None
 
 
-class Shader(nn.Module, ABC):
-    """Base class of the shaders that a configuration can name."""
+class Shader(Recordable, nn.Module, ABC):
+    """Base class of the shaders that a configuration can name.
+
+    For a custom shader, write a subclass with a ``forward``. If that never makes the host wait, set ``recordable =
+    True``, and on a GPU it is replayed from a CUDA graph.
+    """
 
     @abstractmethod
     def forward(
@@ -190,6 +195,7 @@ class DiffuseShader(Shader):
         ValueError: If ``light`` is zero or ``ambient`` is out of range.
     """
 
+    recordable = True
     light: Tensor
 
     def __init__(
@@ -247,6 +253,7 @@ class PhongShader(Shader):
         ValueError: If ``light`` is zero or a coefficient is out of range.
     """
 
+    recordable = True
     light: Tensor
 
     def __init__(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import record
+from gaussian_swaying._graphs import Replayed
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -211,19 +211,19 @@ class Measurement:
     def __init__(self, solver: MPMSolver, substeps: int, parts: dict[str, Tensor], given: list[Tensor | float]) -> None:
         self._solver, self._substeps, self._given = solver, substeps, given
         self._sizes = {name: len(part) for name, part in parts.items()}
-        self._values = torch.cat(list(parts.values()))
+        self.values = torch.cat(list(parts.values()))
         self._found: dict[str, list[Any]] = {}
 
-    def again(self, substeps: int) -> Measurement:
-        """The same measurements with the values that a replayed graph has written now."""
+    def again(self, substeps: int, values: Tensor) -> Measurement:
+        """The same measurements of another frame, with its numbers in the order of ``values``."""
         new = copy.copy(self)
-        new._substeps, new._values, new._found = substeps, self._values.clone(), {}
+        new._substeps, new.values, new._found = substeps, values, {}
         return new
 
     def _wait(self) -> dict[str, list[Any]]:
         """All numbers by name (one GPU synchronisation, the first time)."""
         if not self._found:
-            values = iter(self._values.tolist())
+            values = iter(self.values.tolist())
             self._found = {name: [next(values) for _ in range(size)] for name, size in self._sizes.items()}
         return self._found
 
@@ -316,18 +316,12 @@ class Gauge:
     """:func:`measure` from a CUDA graph, where possible: some 150 small kernels take longer to start than to run.
 
     That is on a GPU, for a solver whose grid does not move, and at most :data:`RECORDED` particles, as a graph keeps
-    its memory. The first call with a body runs without recording.
+    its memory.
     """
 
     def __init__(self) -> None:
-        self._key: tuple[object, ...] = ()
-        self._graph: torch.cuda.CUDAGraph | None = None
-        self._inputs: list[Tensor] = []
+        self.replayed = Replayed()
         self._made: Measurement | None = None
-
-    def __getstate__(self) -> dict[str, object]:
-        """The state without a graph, which cannot be copied."""
-        return vars(Gauge())
 
     def __call__(
         self,
@@ -337,9 +331,8 @@ class Gauge:
         cfl: Tensor,
         work: Tensor,
         before: MPMState,
-        more: Callable[[MPMState, Tensor], Tensor] | None = None,
-        given: Tensor | None = None,
-        same: tuple[object, ...] = (),
+        more: Callable[[MPMState], Tensor],
+        same: tuple[object, ...] | None,
     ) -> Measurement:
         """As :func:`measure`, without counting torn particles.
 
@@ -350,41 +343,24 @@ class Gauge:
             cfl: Largest Courant number of the frame.
             work: Work of the wind during the frame [J].
             before: The state at the start of the frame.
-            more: Function of the state and ``given`` that computes further numbers; it may be recorded.
-            given: What it gets besides the state.
-            same: What it depends on besides; another value is another recording.
+            more: Function of the state that computes further numbers.
+            same: What it depends on besides; another value is another recording. None if it must not be recorded.
         """
-        given = cfl if given is None else given
-
-        def now() -> Measurement:
-            return measure(
-                solver, state, substeps, cfl, work, None, before, None if more is None else more(state, given)
-            )
-
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
-        if not small or not solver.neighbours_fixed or state.F_elastic is not state.F_total or torch.is_grad_enabled():
-            return now()
-        key = (solver.bound, state.grid, state.position.shape, state.impulse.shape, more is None, given.shape, *same)
-        if key != self._key:
-            self._key, self._graph = key, None
-            return now()
-        wanted = (*_fields(state), cfl, work, given, before.impulse, before.time)
-        if self._graph is None:
-            with torch.inference_mode(False), torch.no_grad():
-                self._inputs = [tensor.clone() for tensor in wanted]
-            *fields, its_cfl, its_work, its_given, impulse, began = self._inputs
+        fixed = solver.neighbours_fixed and state.F_elastic is state.F_total
+        if not (small and fixed) or same is None or torch.is_grad_enabled():
+            return measure(solver, state, substeps, cfl, work, None, before, more(state))
+
+        def values(its_cfl: Tensor, its_work: Tensor, impulse: Tensor, began: Tensor, *fields: Tensor) -> list[Tensor]:
             end = _with_fields(state, fields)
             start = end.replace(impulse=impulse, time=began)
+            self._made = measure(solver, end, substeps, its_cfl, its_work, None, start, more(end))
+            return [self._made.values]
 
-            def launch() -> None:
-                others = None if more is None else more(end, its_given)
-                self._made = measure(solver, end, substeps, its_cfl, its_work, None, start, others)
-
-            self._graph = record(state.position.device, launch)
-        torch._foreach_copy_(self._inputs, list(wanted))
-        self._graph.replay()
+        key = (solver.bound, state.grid, *same)
+        (found,) = self.replayed(key, values, cfl, work, before.impulse, before.time, *_fields(state))
         assert self._made is not None
-        return self._made.again(substeps)
+        return self._made.again(substeps, found)
 
 
 def _fields(state: MPMState) -> list[Tensor]:
@@ -393,7 +369,7 @@ def _fields(state: MPMState) -> list[Tensor]:
     return [*found, *(t for t in (state.node_displacement, state.node_velocity, state.internal) if t is not None)]
 
 
-def _with_fields(state: MPMState, fields: list[Tensor]) -> MPMState:
+def _with_fields(state: MPMState, fields: Sequence[Tensor]) -> MPMState:
     """A state with other tensors in the order of :func:`_fields`."""
     names = ["position", "velocity", "F_total", "lost", "time", "impulse"]
     names += [name for name in ("node_displacement", "node_velocity", "internal") if getattr(state, name) is not None]

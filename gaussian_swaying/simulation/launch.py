@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import fingerprint
+from gaussian_swaying._graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, Measurement
 
@@ -36,7 +36,8 @@ class Launched:
         self._error: Exception | None = None
         try:
             with self._explained():
-                self._steps = simulation.substeps(before)
+                self._parts = parts_of(simulation)
+                self._steps = simulation.substeps(before, self._parts)
                 self._end, self._measurement = self._launch(0)
         except Exception as error:  # `finish` raises it
             self._error = error
@@ -79,7 +80,6 @@ class Launched:
             cause = f"a frame would take {steps:,} substeps, more than the limit of {simulation.most_substeps:,}"
             simulation.give_up(before, cause, "weaken the wind or the boundary that drives the particle")
         end, courant = simulation._roll(simulation.solver.fit_grid(before, simulation.frame_dt, margin), steps)
-        self._parts = parts_of(simulation)
         work = (end.work - before.work).sum()
         return end, simulation.measured(end, steps, courant, work, before, self._parts)
 
@@ -110,10 +110,10 @@ class Outlook:
         self.needs, self._parts = needs, parts
         self._read = [weakref.ref(tensor) for tensor in _read(state)]
 
-    def holds(self, simulation: Simulation, state: MPMState) -> bool:
-        """Whether the frame starts from this state, with nothing changed since."""
+    def holds(self, state: MPMState, parts: tuple[object, ...] | None) -> bool:
+        """Whether the frame starts from this state, with nothing changed since; ``parts`` is what they are now."""
         same = all(known() is tensor for known, tensor in zip(self._read, _read(state), strict=False))
-        return same and self._parts is not None and self._parts == parts_of(simulation)
+        return same and self._parts is not None and self._parts == parts
 
 
 def _read(state: MPMState) -> list[Tensor]:
@@ -123,10 +123,10 @@ def _read(state: MPMState) -> list[Tensor]:
 
 
 def parts_of(simulation: Simulation) -> tuple[object, ...] | None:
-    """What the needs depend on besides the state; None if a change inside a tensor would not be noticed."""
+    """What the needs depend on besides the state; None if that cannot be told, or if it is on another device."""
     wind = simulation.wind_force
-    tensors = [*wind.parameters(), *wind.buffers()]
-    if any(tensor.is_inference() for tensor in tensors):
+    tensors = tensors_in([wind])
+    if any(tensor.is_inference() or tensor.device != simulation.device for tensor in tensors):
         return None
     return (simulation.solver.bound, fingerprint([wind]), tuple(tensor._version for tensor in tensors))
 

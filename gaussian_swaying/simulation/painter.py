@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying._graphs import Replayed, fingerprint
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import rotate_sh
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -19,10 +20,14 @@ from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCame
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.simulation.followers import GridFollowers
 from gaussian_swaying.simulation.recording.layout import check_camera_name
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
+
+RECORDED = 200_000
+"""Most Gaussians whose motion and colours are recorded in CUDA graphs, which keep their memory."""
 
 
 class Painter(nn.Module):
@@ -62,6 +67,8 @@ class Painter(nn.Module):
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
         self.background: Tensor
         self._renderer = renderer
+        self._moved, self._coloured = Replayed(), Replayed()
+        self._still: dict[str, tuple[tuple[object, ...], Camera]] = {}  # cameras of the last frame that do not move
 
     @property
     def device(self) -> torch.device:
@@ -86,7 +93,16 @@ class Painter(nn.Module):
             frame: Frame number.
             name: Which of ``cameras``; empty for ``camera``.
         """
-        return self._camera(frame, name).to(self.device, self.scene.model.means.dtype)
+        means, path = self.scene.model.means, self.cameras[name] if name else self.camera
+        if not path.still:
+            return self._camera(frame, name).to(means.device, means.dtype)
+        # its numbers may be changed between two frames, also within a list
+        numbers = [tuple(value) if isinstance(value, list) else value for value in vars(path).values()]
+        key = (path, *numbers, means.device, means.dtype)
+        if self._still.get(name, ((), None))[0] != key:
+            with torch.inference_mode(False):  # it outlives the call
+                self._still[name] = (key, self._camera(frame, name).to(means.device, means.dtype))
+        return self._still[name][1]
 
     def _camera(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, in float64 on the host."""
@@ -118,20 +134,40 @@ class Painter(nn.Module):
 
     def deformed(self, state: MPMState) -> DeformedGaussians:
         """The Gaussians of a state, in scene units, with the rotations that their colours need."""
-        return self.scene.deformed(state, rotations=self.scene.model.view_dependent)
+        scene, turned = self.scene, self.scene.model.view_dependent
+        given = state.node_displacement
+        if given is None or not isinstance(scene.follow, GridFollowers) or len(scene.model.means) > RECORDED:
+            return scene.deformed(state, rotations=turned)
+
+        def moved(displacement: Tensor) -> list[Tensor]:
+            found = scene.deformed(state.replace(node_displacement=displacement), rotations=turned)
+            return [found.means, found.covariances, found.normals, *([found.rotations] if turned else [])]
+
+        found = self._moved((fingerprint([scene]), state.grid), moved, given)
+        means, covariances, normals = found[:3]
+        return DeformedGaussians(means, covariances, normals, found[3] if turned else scene.rest().rotations)
 
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
         """Shaded colours, shape (N, 3): harmonics evaluated in the rest frame of each patch, times the shading."""
+        means, shader = gaussians.means, self.shader
+        given = [camera.position.to(means), means, gaussians.normals]
+        given += [gaussians.rotations] if self.scene.model.view_dependent else []
+        if len(means) > RECORDED or not (shader is None or shader.recordable):
+            return self._colors(*given)
+        key = fingerprint([self.scene, *([] if shader is None else [shader])])
+        return self._coloured(key, lambda *known: [self._colors(*known)], *given)[0]
+
+    def _colors(self, eye: Tensor, means: Tensor, normals: Tensor, rotations: Tensor | None = None) -> Tensor:
         scene = self.scene
-        view = torch.nn.functional.normalize(gaussians.means - camera.position.to(gaussians.means), dim=-1)
-        at_rest = (view[..., None] * gaussians.rotations).sum(-2) if scene.model.view_dependent else view
+        view = torch.nn.functional.normalize(means - eye, dim=-1)
+        at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
         colours = scene.model.colors(at_rest)
         if self.shader is None:
             return colours
         index = scene.moving
-        parts = (colours, gaussians.normals, view)
+        parts = (colours, normals, view)
         if not scene.all_move:
-            parts = (colours[index], gaussians.normals[index], view[index])
+            parts = (colours[index], normals[index], view[index])
         normal, to_eye = (scene.frame.direction_to_sim(part) for part in (parts[1], -parts[2]))
         shaded = self.shader(parts[0], normal, rest_normal=scene.rest_facing, view_direction=to_eye)
         return shaded if scene.all_move else colours.index_copy(0, index, shaded)

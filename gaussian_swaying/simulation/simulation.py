@@ -429,6 +429,8 @@ class Simulation(nn.Module):
 
     def edit_due(self, state: MPMState, resumed: bool = False) -> MPMState:
         """Apply the edits up to the time of a state; a resumed state contains them already."""
+        if not self.editor.edits:  # the host need not wait for the time
+            return state
         edits = self.editor.due(float(state.time) + 1e-3 * self.frame_dt)
         edited = self._take(state, self._edit(edits, flowed=True))
         return state if resumed else edited
@@ -483,12 +485,13 @@ class Simulation(nn.Module):
         """
         if self._tearing is not None or not self.foresees:
             return measure(self.solver, end, steps, courant, work, self._tearing, state)
-        winds = None if self.idle else self.wind_force.samples(end, self.frame_dt / 4, 5)
+        idle = self.idle
 
-        def needs(at: MPMState, given: Tensor) -> Tensor:
-            return needs_of(self, at, None if winds is None else given)
+        def needs(at: MPMState) -> Tensor:
+            return needs_of(self, at, None if idle else self.wind_force.samples(at, self.frame_dt / 4, 5))
 
-        return self._gauge(self.solver, end, steps, courant, work, state, needs, winds, (winds is None, parts))
+        same = None if parts is None else (idle, self.frame_dt, parts)
+        return self._gauge(self.solver, end, steps, courant, work, state, needs, same)
 
     def give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, naming the particle with the largest deformation."""
@@ -502,11 +505,16 @@ class Simulation(nn.Module):
     def foresees(self) -> bool:
         """Whether the needs of the next frame are measured at the end of a frame, so that the host waits once."""
         simple = self.solver.substep is None and self.solver.stiffness_damping == 0
-        return simple and self.solver.fused() is not None and self.wind_force.uniform and self.wind_force.recordable
+        return simple and self.solver.has_kernels and self.wind_force.uniform and self.wind_force.recordable
 
-    def substeps(self, state: MPMState) -> int:
-        """How many substeps the next frame takes, for waves in the material and explicit drag on light patches."""
-        if self.outlook is not None and self.outlook.holds(self, state):
+    def substeps(self, state: MPMState, parts: tuple[object, ...] | None = None) -> int:
+        """How many substeps the next frame takes, for waves in the material and explicit drag on light patches.
+
+        Args:
+            state: The state at its start.
+            parts: From :func:`~gaussian_swaying.simulation.launch.parts_of`; with it, what is known is not measured.
+        """
+        if self.outlook is not None and self.outlook.holds(state, parts):
             cells, rate, blowing = self.outlook.needs
         else:
             winds = None if self.idle else self.wind_force.samples(state, self.frame_dt / 4, 5)

@@ -16,7 +16,7 @@ import torch
 from gaussian_swaying import _graphs
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
-from gaussian_swaying.aero.wind import FlowKey, SpatialWind, WindField
+from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Box, Everything
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -704,7 +704,7 @@ class _Toward(Force):
             implicit=self.resists,
             sources=(self.share,),
             values=lambda: self.share,
-            numbers=torch.tensor([2.5], device=self.share.device),
+            numbers=lambda: torch.tensor([2.5], device=self.share.device),
             vectors=lambda time, dt, steps: self.along(
                 time + dt * torch.arange(steps, dtype=torch.float64, device=time.device)
             ),
@@ -872,6 +872,94 @@ def test_many_substeps(formulation):
 
     ends = _wind_case(_points("cuda", count=2000), formulation, steps=50, start=start)
     _agree(ends, tolerance=2e-4)
+
+
+# ---- a rollout from one graph
+
+
+def _gusty(device):
+    """A wind that is another in every substep."""
+    gusts = [SineSway(period=0.01), GaussianGust(1.0, interval=2 * DT)]
+    return WindField(schedule=[FlowKey(0.0, [5.0, 0.0, 0.0]), FlowKey(0.004, [0.0, 5.0, 1.0])], modulations=gusts)
+
+
+WHOLE = {
+    "a hinge": {"boundaries": lambda: [PinnedRegion(LEFT)], "count": 12},
+    "nodes, crowded cells": {"boundaries": lambda: [PinnedRegion(LEFT, "nodes")], "count": 40},
+    "a batch": {"boundaries": lambda: [PinnedRegion(LEFT)], "count": 12, "batch": (2,)},
+    "no wind": {"boundaries": lambda: [], "count": 12, "wind": False},
+}
+
+
+@pytest.mark.parametrize("case", WHOLE)
+def test_a_whole_rollout_gives_the_same_bits(kernel_device, case, monkeypatch):
+    """The second and the third time it runs as one piece, with substeps at its end that do nothing."""
+    steps = 70 if kernel_device.type == "cuda" else 5
+    if kernel_device.type == "cpu":
+        monkeypatch.setattr(fused, "whole_steps", lambda count: 8 * -(-count // 8))
+    monkeypatch.setattr(fused_total, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
+    given = WHOLE[case]
+    points = _points(kernel_device, count=given["count"], batch=given.get("batch", ()))
+    solver = _solver("triton", "total", boundaries=given["boundaries"]())
+    forces = [_load(points, _gusty(kernel_device))] if given.get("wind", True) and "batch" not in given else []
+    forces = [_load(points)] if "batch" in given else forces
+    start, ran = _start(solver, points, strain=0.05), []
+    kernels = solver.fused()
+    whole = kernels._whole
+    monkeypatch.setattr(kernels, "_whole", lambda *given: (ran.append(1), whole(*given)))
+
+    def go(state, count=steps):
+        with torch.no_grad():
+            return solver.watched_rollout(state, DT, count, forces, 3)
+
+    first, cells = go(start)
+    assert not ran
+    kept = {name: getattr(first, name).clone() for name in (*FIELDS, "work", "impulse", "time") if name != "internal"}
+    for _ in range(2):
+        again, its_cells = go(start)
+        assert float(its_cells) == float(cells)
+        for name, value in kept.items():
+            assert torch.equal(getattr(again, name), value), name
+    assert len(ran) == (1 if kernel_device.type == "cuda" else 2)  # recorded once
+    go(again)  # another rollout leaves the results of the earlier ones alone
+    for name, value in kept.items():
+        assert torch.equal(getattr(first, name), value), name
+        assert torch.equal(getattr(again, name), value), name
+    with torch.no_grad():
+        ends = [solver.rollout(start, DT, count, forces) for count in (steps - 1, steps, steps - 1)]
+    assert len(ran) == (2 if kernel_device.type == "cuda" else 5)  # one piece of work, with one idle substep more
+    assert torch.equal(ends[0].position, ends[2].position)
+    assert torch.equal(ends[0].work, ends[2].work)
+    assert torch.equal(ends[1].position, first.position)
+
+
+def test_a_whole_rollout_follows_what_changes(kernel_device):
+    """Numbers of the wind and patches that change in place, and a force that is another one."""
+    points = _points(kernel_device, count=12)
+    load, other = _load(points), _load(points, seed=7)
+
+    def run(solver, state):
+        states = [solver.rollout(state, DT, 2, load) for _ in range(3)]
+        load.area *= 2
+        load.aero.C_D += 1.0
+        states += [solver.rollout(state, DT, 2, load) for _ in range(2)]
+        load.wind.seed = 3
+        load.wind.flows *= 0.5
+        states += [solver.rollout(state, DT, 2, load) for _ in range(3)]
+        states += [solver.rollout(state, DT, 2, other) for _ in range(3)]
+        load.area /= 2
+        load.aero.C_D -= 1.0
+        load.wind.flows *= 2
+        return states
+
+    _agree(_both(points, run, "total"))
+
+
+def test_steps_of_a_whole_rollout():
+    assert [fused.whole_steps(n) for n in (1, 31, 33, 63, 65, 68, 69, 100, 129, 212, 255, 256)] == [
+        1, 31, 34, 64, 68, 68, 72, 100, 136, 216, 256, 256
+    ]  # fmt: skip
+    assert all(n <= fused.whole_steps(n) <= n + n / 16 for n in range(1, 257))
 
 
 # ---- boundaries

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.simulation.recording.layout import frame_folder, video_file
@@ -152,3 +152,26 @@ def test_bad_names_and_renders(make_cloud, make_simulation):
     for name, value in (("depth_step", 0.0), ("force_scale", -1.0), ("normal_axes", "scene")):
         with pytest.raises(ValueError, match=name):
             Recorder(**{name: value})
+
+
+def test_a_camera_that_does_not_move_is_made_once(make_simulation):
+    """And again when a number of its path changes, also in place."""
+    painter = make_simulation().painter
+    painter.camera = OrbitCamera(width=8, height=8)
+    first = painter.camera_at(0)
+    assert painter.camera_at(3) is first
+    painter.camera.azimuth += 10.0
+    second = painter.camera_at(3)
+    assert not torch.equal(second.world_to_camera, first.world_to_camera)
+    painter.camera.degrees_per_second = 5.0
+    assert not torch.equal(painter.camera_at(4).position, painter.camera_at(3).position)
+    painter.camera = LookAtCamera([0.0, -3.0, 0.0], [0.0, 0.0, 0.0], width=8, height=8)
+    painter.cameras = {"top": OrbitCamera(elevation=80.0, width=8, height=8)}
+    third, top = painter.camera_at(0), painter.camera_at(0, "top")
+    assert (painter.camera_at(1), painter.camera_at(1, "top")) == (third, top)
+    painter.camera.eye = list(painter.camera.eye)
+    assert painter.camera_at(1) is not None
+    kept = painter.camera_at(1)
+    painter.camera.eye[0] = 1.0
+    assert float(painter.camera_at(1).position[0]) == pytest.approx(1.0)
+    assert float(kept.position[0]) == pytest.approx(0.0, abs=1e-6)

@@ -11,6 +11,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.mpm.body import Body
-from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, Force, ForceTwin, added, divide, split
+from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, Force, ForceTwin, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
@@ -33,6 +34,35 @@ MAX_INDEX = 2**31
 """Number of entries of a buffer that the kernels can address, with 32-bit indices."""
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a rollout whose schedule fits in the buffers.
+
+    Attributes:
+        steps: Number of substeps.
+        rows: Rows of the schedule with a length; as many substeps may run, and those after ``steps`` do nothing.
+        options: Constants of the kernels.
+        looks: Numbers of the substeps after which the wave speed is measured.
+        loaded: Whether the work of a load is counted.
+        begin: ``begin(n)`` fills what n substeps read besides the state and the schedule.
+        key: What ``begin`` depends on; None if it cannot be recorded.
+    """
+
+    steps: int
+    rows: int
+    options: dict[str, Any]
+    looks: list[int]
+    loaded: bool
+    begin: Callable[[int], None]
+    key: tuple[object, ...] | None
+
+
+def whole_steps(steps: int) -> int:
+    """A number of substeps from few, so that a graph serves several frames: at most a sixteenth more than ``steps``."""
+    unit = max(1, 1 << (steps.bit_length() - 5)) if steps >= 32 else 1
+    return min(-(-steps // unit) * unit, MAX_STEPS)
 
 
 class Fused(ABC):
@@ -140,7 +170,7 @@ class Fused(ABC):
             fused, self.asked = divide(forces)
             twin = None if fused is None else fused.twin()
             if twin is not None:
-                self._take_twin(twin)
+                self._take_values_of(twin)
             options: dict[str, Any] = {
                 "LAWS": self.laws,
                 "MULTI": len(self.law_table) > 1,
@@ -159,7 +189,7 @@ class Fused(ABC):
                 part = min(steps - first, MAX_STEPS)
                 marks = [look - first for look in looks if first < look <= first + part]
                 before = state.work
-                state = self._advance(state, dt, part, twin, options, marks)
+                state = self._advance(state, dt, part, fused, twin, options, marks)
                 if force is None and not forces:  # the work of a drag alone is not counted
                     state = state.replace(work=before)
                 if watch is not None:
@@ -167,30 +197,57 @@ class Fused(ABC):
             return state, self.speed[0] / self.settings.dx
 
     def _advance(
-        self, state: MPMState, dt: float, steps: int, twin: ForceTwin | None, options: dict[str, Any], looks: list[int]
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        force: Force | None,
+        twin: ForceTwin | None,
+        options: dict[str, Any],
+        looks: list[int],
     ) -> MPMState:
         """Run a part of a rollout whose schedule fits in the buffers."""
-        kick = kick_time(state, dt)
-        decay = [math.exp(-self.settings.damping * t) for t in (kick, dt)]
-        rows = [[0.0, dt, 1.0, 0.0], [kick, dt, decay[0], 0.0], *[[dt, dt, decay[1], 0.0]] * steps]
-        self.schedule[: steps + 2].copy_(_upload(rows, self.device), non_blocking=True)
-        self.first_step.zero_()
+        rows = whole_steps(steps)
+        self.schedule[: rows + 2].copy_(self._table(kick_time(state, dt), dt, steps, rows), non_blocking=True)
         self.time.copy_(state.time)
         self.dt.fill_(dt)
-        if twin is not None:
-            vectors = twin.vectors(self.time, self.dt, steps)
-            self.vectors[:steps].copy_(vectors.reshape(steps, -1, 3).expand(-1, self.scenes, -1))
         loaded = twin is not None or options["FORCE"]
+
+        def begin(count: int) -> None:
+            """What the substeps read besides the state and the schedule."""
+            self.first_step.zero_()
+            if twin is not None:
+                numbers = twin.numbers()
+                self.numbers[: len(numbers)].copy_(numbers)
+                vectors = twin.vectors(self.time, self.dt, count)
+                self.vectors[:count].copy_(vectors.reshape(count, -1, 3).expand(-1, self.scenes, -1))
+            if loaded:
+                self.load.zero_()
+
+        part = Part(steps, rows, options, looks, loaded, begin, self._key_of(force))
+        changes = self._run(state, part)
+        changes["impulse"] = state.impulse + changes["impulse"]
         if loaded:
-            self.load.zero_()
-        changes = self._run(state, steps, options, looks)
-        if loaded:
-            changes["work"] = state.work + self._work().reshape(self.body.points.mass.shape[:-1])
+            changes["work"] = state.work + changes["work"]
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _take_twin(self, twin: ForceTwin) -> None:
-        """Copy the numbers of a twin to the buffers, and its particle values if they have changed."""
-        self.numbers[: len(twin.numbers)].copy_(twin.numbers)
+    def _table(self, kick: float, dt: float, steps: int, rows: int) -> Tensor:
+        """The schedule on the host, which can be copied without making it wait; rows after ``steps`` have no length."""
+        first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
+        table = torch.zeros(rows + 2, SCHEDULE, pin_memory=self.device.type == "cuda")
+        table[: steps + 1] = torch.tensor([dt, dt, other, 0.0])
+        table[:2] = torch.tensor([[0.0, dt, 1.0, kick if steps == 1 else dt], [kick, dt, first, 0.0]])
+        return table
+
+    def _key_of(self, force: Force | None) -> tuple[object, ...] | None:
+        """What the recorded vectors and numbers of a force depend on; None if they cannot be recorded."""
+        if force is None:
+            return ()
+        here = all(tensor.device == self.device for tensor in tensors_of([force]))
+        return (force, fingerprint([force])) if force.recordable and here else None
+
+    def _take_values_of(self, twin: ForceTwin) -> None:
+        """Copy the particle values of a twin to the buffers, if they have changed."""
         sources = [(t, None if t.is_inference() else t._version) for t in twin.sources]
         known = zip(self._values_of, sources, strict=False)
         if not self._values_of or any(a is not b or v is None or v != w for (a, v), (b, w) in known):
@@ -202,7 +259,6 @@ class Fused(ABC):
                 if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `_repeat`
                     check_indices(TWIN_NUMBERS + len(table))
                     self.numbers = torch.zeros(TWIN_NUMBERS + len(table), device=self.device)
-                    self.numbers[: len(twin.numbers)].copy_(twin.numbers)
                 self.numbers[TWIN_NUMBERS : TWIN_NUMBERS + len(table)].copy_(table)
 
     # ---- forces in torch
@@ -249,12 +305,16 @@ class Fused(ABC):
         """Copy the values of a twin, shape (N, n), to the buffers."""
 
     @abstractmethod
-    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
-        """Copy the state to the buffers, run the substeps, and return the fields of the new state."""
+    def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
+        """Copy the state to the buffers, run the substeps, and return the fields of the new state.
+
+        ``impulse`` is what the boundaries took in this part, and ``work``, if it is loaded, the work of the load in it.
+        """
 
     def _work(self) -> Tensor:
-        """Work of the load in each scene [J], shape (scenes,), float64; particles are sorted by scene."""
-        return self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
+        """Work of the load in each scene [J], shape (...), float64; particles are sorted by scene."""
+        work = self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
+        return work.reshape(self.body.points.mass.shape[:-1])
 
     def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
         """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.
@@ -290,12 +350,6 @@ def check_indices(entries: int) -> None:
 
 def _nothing() -> None:
     """The placeholder for a Fused in a copy."""
-
-
-def _upload(rows: list[list[float]], device: torch.device) -> Tensor:
-    """A small table on the device, without making the host wait."""
-    table = torch.tensor(rows, dtype=torch.float32)
-    return table.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else table
 
 
 def _made_from(body: Body) -> tuple[object, ...]:

@@ -15,7 +15,7 @@ from gaussian_swaying.mpm.boundaries.plane import KINDS, Plane
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import Fused, check_indices
+from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
 
 LEAST, MOST = 4, 64
 """Fewest and most substeps between two sorts of the particles by cell."""
@@ -83,7 +83,9 @@ class FusedUpdated(Fused):
             if self._acting and (self.bound.needs_position or self.bound.needs_lattice):
                 self.node_position = grid.node_positions(self.velocity)
 
-    def _run(self, state: MPMState, steps: int, options: dict[str, Any], looks: list[int]) -> dict[str, Any]:
+    def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
+        steps, options, looks = part.steps, part.options, part.looks
+        part.begin(steps)
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
         self.clock.copy_(torch.stack([self.time, self.dt]))
@@ -105,7 +107,7 @@ class FusedUpdated(Fused):
                 self._look()
             done = mark
         self._measure_crossing()
-        return {**self._read(state), "impulse": state.impulse + self.impulse}
+        return {**self._read(state), "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
 
     def _sorted_for(self) -> int:
         """How many substeps to go without a sort, from the speed at the end of the last rollout that is done."""

@@ -89,14 +89,14 @@ def total_particles(
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
     Lanes without a particle have no volume, values of a twin or mass, so they add nothing. The first step of a rollout
-    takes the previous substep from row 0 of the schedule.
+    takes the previous substep from row 0 of the schedule, and a substep without a length does nothing.
     """
     LOADED: tl.constexpr = (TWIN is not None) or FORCE
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
     cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
-    real = cell < cells
+    real = cell < tl.where(tl.load(schedule + (step + 1) * 4 + 1) > 0, cells, 0)
     start = tl.load(cell_start + cell, real, 0)
     end = tl.load(cell_start + cell + 1, real, 0)
     node = tl.load(cell_node + cell, real, 0)[:, None]
@@ -214,7 +214,7 @@ def total_nodes(
     dt = tl.load(schedule + (step + 1) * 4 + 1)
     decay = tl.load(schedule + (step + 1) * 4 + 2)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = k < nodes
+    mask = k < tl.where(dt > 0, nodes, 0)
     node = tl.load(active + k, mask, 0)
     inverse = tl.load(inverse_mass + k, mask, 0.0)
     f0 = tl.zeros([BLOCK], tl.float32)
@@ -270,10 +270,13 @@ def total_nodes(
 
 
 @triton.jit(do_not_specialize=VARIES)
-def total_rows(node, weight, rows, fields, residual, BLOCK: tl.constexpr):
+def total_rows(
+    node, weight, rows, fields, residual, schedule, first_step, step_offset, BLOCK: tl.constexpr
+):  # fmt: skip
     """``total``: velocities of the held points, and their sums since the start of the rollout."""
+    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = k < rows
+    mask = k < tl.where(dt > 0, rows, 0)
     o = tl.arange(0, 32)[None, :]  # all 27 at once: one after the other would wait 27 times for the memory
     each = o * rows + k[:, None]
     known = mask[:, None] & (o < 27)
@@ -300,7 +303,7 @@ def total_hold(
     """``total``: velocities and displacements of the nodes around held points, of which a scene has ``rows``."""
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = n < nodes
+    mask = n < tl.where(dt > 0, nodes, 0)
     first = tl.load(scene + n, mask, 0) * rows
     a0 = tl.zeros([BLOCK], tl.float32)
     a1 = tl.zeros([BLOCK], tl.float32)

@@ -58,7 +58,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
-    _eye: Tensor | None = field(default=None, init=False, repr=False)  # kept when a camera is copied from the host
+    _eye: Tensor | None = field(default=None, init=False, repr=False)  # if known, as an inverse takes long
 
     def __post_init__(self) -> None:
         check_shape("world_to_camera", self.world_to_camera, 4, 4)
@@ -165,6 +165,7 @@ def look_at_camera(
         [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
     camera = Camera(world_to_camera, intrinsics, width, height, near)
+    object.__setattr__(camera, "_eye", torch.tensor(eye_point, dtype=torch.float64))  # known without an inverse
     return camera.to(device, dtype or torch.get_default_dtype())
 
 

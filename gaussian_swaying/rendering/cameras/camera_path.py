@@ -24,9 +24,11 @@ class CameraPath(ABC):
 
     Attributes:
         captured: Whether the cameras are those of photographs. Such cameras may be inside the object's box.
+        still: Whether the camera is the same in every frame, as long as no attribute of the path changes.
     """
 
     captured: bool = False
+    still: bool = False
 
     @abstractmethod
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
@@ -89,6 +91,11 @@ class OrbitCamera(CameraPath):
         check_positive("near", near)
         self.near = float(near)
 
+    @property
+    def still(self) -> bool:  # type: ignore[override]
+        """Whether it does not move."""
+        return self.degrees_per_second == 0
+
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         check_positive("size", size)
@@ -123,6 +130,8 @@ class LookAtCamera(CameraPath):
         TypeError: If an argument has the wrong type.
         ValueError: If a number is out of range, or the line of sight is not defined.
     """
+
+    still = True
 
     def __init__(
         self,
@@ -174,6 +183,7 @@ class TransformsCamera(CameraPath):
     """
 
     captured = True
+    still = True
 
     def __init__(
         self,

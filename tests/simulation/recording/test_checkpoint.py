@@ -276,7 +276,8 @@ def test_the_lines_of_a_log_are_made_once():
     first = log_lines(log, known)
     log += [{"a": 2, "b": math.inf}]
     log[0]["b"] = 7.0  # its line is known
-    assert log_lines(log, known) == known and len(first) == 1
+    assert log_lines(log, known) == known
+    assert len(first) == 1
     assert [json.loads(line) for line in known] == [{"a": 1, "b": 0.1}, {"a": 2, "b": math.inf}]
 
 
