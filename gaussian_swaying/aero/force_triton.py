@@ -85,6 +85,24 @@ def _times(a, x):
 
 
 @triton.jit
+def _add_direction(s, u, b, w, known, UNIT: tl.constexpr):
+    """Add the area vector b to the sums of signed vectors and (UNIT) of tangents of length |b|."""
+    along = dot3(b, w)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    s = (s[0] + sign * b[0], s[1] + sign * b[1], s[2] + sign * b[2])
+    if UNIT:
+        squared = tl.maximum(dot3(b, b), 1.2e-38)
+        share = along / squared
+        x0 = w[0] - share * b[0]
+        x1 = w[1] - share * b[1]
+        x2 = w[2] - share * b[2]
+        scale = tl.sqrt(squared) / tl.maximum(tl.sqrt(x0 * x0 + x1 * x1 + x2 * x2), 1.2e-38)
+        scale = tl.where(known, scale, 0.0)
+        u = (u[0] + scale * x0, u[1] + scale * x1, u[2] + scale * x2)
+    return s, u
+
+
+@triton.jit
 def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
     """Triton twin of ``WindForce`` on groups of patches; the reference is ``aero.patches.grouped_force``.
 
@@ -129,26 +147,19 @@ def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
     across = _times(c, _times(tensor, w))
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
     zero = rest * 0
-    s0, s1, s2, u0, u1, u2 = zero, zero, zero, zero, zero, zero
-    for k in range(0, tl.max(count)):
-        b = load3(numbers, 1, first + 8 + 4 * k, k < count)
-        along = dot3(b, w)
-        sign = tl.where(along < 0, -1.0, 1.0)
-        s0 += sign * b[0]
-        s1 += sign * b[1]
-        s2 += sign * b[2]
-        if OPTIONS[2]:
-            squared = tl.maximum(dot3(b, b), 1.2e-38)
-            share = along / squared
-            x0 = w[0] - share * b[0]
-            x1 = w[1] - share * b[1]
-            x2 = w[2] - share * b[2]
-            scale = tl.sqrt(squared) / tl.maximum(tl.sqrt(x0 * x0 + x1 * x1 + x2 * x2), 1.2e-38)
-            scale = tl.where(k < count, scale, 0.0)
-            u0 += scale * x0
-            u1 += scale * x1
-            u2 += scale * x2
-    facing = _times(c, (s0, s1, s2))
+    s = (zero, zero, zero)
+    u = (zero, zero, zero)
+    for k in range(0, tl.max(count), 4):  # four rows at once, so that they wait for the memory together
+        row = first + 8 + 4 * k
+        b0 = load3(numbers, 1, row, k < count)
+        b1 = load3(numbers, 1, row + 4, k + 1 < count)
+        b2 = load3(numbers, 1, row + 8, k + 2 < count)
+        b3 = load3(numbers, 1, row + 12, k + 3 < count)
+        s, u = _add_direction(s, u, b0, w, k < count, OPTIONS[2])
+        s, u = _add_direction(s, u, b1, w, k + 1 < count, OPTIONS[2])
+        s, u = _add_direction(s, u, b2, w, k + 2 < count, OPTIONS[2])
+        s, u = _add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
+    facing = _times(c, s)
     area = growth * rest
     if OPTIONS[0]:
         pressure = (drag * speed * across[0], drag * speed * across[1], drag * speed * across[2])
@@ -156,7 +167,7 @@ def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
         square = drag * speed * speed
         pressure = (square * facing[0], square * facing[1], square * facing[2])
     if OPTIONS[2]:
-        tangent = _times(c, (u0, u1, u2))
+        tangent = _times(c, u)
         square = friction * speed * speed
         shear = (square * tangent[0], square * tangent[1], square * tangent[2])
     else:

@@ -32,6 +32,11 @@ def _mix(x: Tensor) -> Tensor:
     return x ^ ((x >> 31) & ((1 << 33) - 1))
 
 
+def stream_start(seed: int, stream: int) -> int:
+    """Where the counter of a generator starts, as a signed 64-bit number."""
+    return _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
+
+
 def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tensor:
     """Uniform numbers in (0, 1) that depend only on seed, stream, counter and lane.
 
@@ -45,8 +50,7 @@ def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tens
         float64, shape (..., lanes).
     """
     # filled on the device: nothing is copied from the host, so a CUDA graph can record it
-    start = _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
-    key = _mix(torch.full((), start, dtype=torch.int64, device=counter.device))
+    key = _mix(torch.full((), stream_start(seed, stream), dtype=torch.int64, device=counter.device))
     lane = torch.arange(lanes, device=counter.device)
     bits = _mix(_mix(key + counter[..., None] * _signed(0x9E3779B97F4A7C15)) + lane * _signed(0xD1B54A32D192ED03))
     return (((bits >> 11) & ((1 << 53) - 1)).double() + 0.5) / float(1 << 53)

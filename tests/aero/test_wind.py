@@ -109,6 +109,56 @@ def test_modulations_compose_in_order():
     assert float((both - 1.5 * flow).abs().max()) > 1e-3
 
 
+KEYS = [FlowKey(0.1, [1.0, 0.0, -1.5]), FlowKey(0.5, [0.0, 3.0, 1.5]), FlowKey(1.3, [-2.0, 0.5, 0.5])]
+GUSTS = [SineSway(period=0.7, phase=0.3), UniformGust(0.2, interval=0.05), GaussianGust(0.4, interval=0.07)]
+BLOWN = {
+    "steady": lambda: WindField([2.0, -1.0, 0.5]),
+    "gusts": lambda: WindField([2.0, -1.0, 0.5], modulations=GUSTS, seed=7),
+    "in another order": lambda: WindField([0.0, -1.0, 1.0], modulations=[*GUSTS[::-1], SineSway()], seed=-3),
+    "steps": lambda: WindField(schedule=KEYS, modulations=GUSTS[2:]),
+    "ramps": lambda: WindField(schedule=KEYS, interpolation="linear", modulations=GUSTS, seed=2**70),
+    "still air": lambda: WindField(modulations=GUSTS),
+}
+
+
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def blow(request):
+    """The kernel, and where it runs."""
+    pytest.importorskip("triton")
+    from gaussian_swaying.aero.wind_triton import blow
+    from gaussian_swaying.mpm.triton.fused import INTERPRETED
+
+    if request.param == "interpreted" and not INTERPRETED:
+        pytest.skip("on this machine the kernels are compiled")
+    return blow, torch.device("cuda" if request.param == "cuda" else "cpu")
+
+
+@pytest.mark.parametrize("case", BLOWN)
+def test_the_kernel_of_the_wind_is_its_definition(blow, case):
+    kernel, device = blow
+    wind = BLOWN[case]().to(device)
+    times = torch.cat([torch.linspace(-0.2, 3, 90), torch.tensor([0.05, 0.1, 0.5, 1.3, 1e4])]).double().to(device)
+    for _ in range(2):
+        torch.testing.assert_close(kernel(wind, times), wind(times), rtol=1e-11, atol=1e-12)
+        wind.seed += 1
+        wind.flows *= 1.5
+        for part in wind.modulations[:1]:
+            part.amplitude = part.delta = part.std = 0.1
+
+
+def test_the_kernel_refuses_a_wind_that_it_does_not_know(blow):
+    class Own(UniformGust):
+        pass
+
+    class Other(WindField):
+        pass
+
+    kernel, device = blow
+    times = torch.zeros(3, dtype=torch.float64, device=device)
+    for wind in (WindField([1.0, 0, 0], modulations=[Own()]), Other([1.0, 0, 0]), WindField([1.0, 0, 0]).float()):
+        assert kernel(wind.to(device), times) is None
+
+
 def test_schedule_steps_and_ramps():
     keys = [FlowKey(0.0, [0, 0, -1.5]), FlowKey(1.0, [0, 0, 1.5])]
     step = WindField(schedule=keys)

@@ -209,7 +209,7 @@ class FusedTotal(Fused):
             self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
-            HELD=self.plain and "nodes" in self.bound.kinds, MOVE=self.plain, BLOCK=block, num_warps=2,
+            HELD=self.plain and "nodes" in self.bound.kinds, MOVE=self.plain, BLOCK=block, num_warps=4,
         )  # fmt: skip
         if self.points is not None:
             self._hold_points(self.points, offset)

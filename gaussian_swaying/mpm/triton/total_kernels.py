@@ -214,27 +214,21 @@ def total_nodes(
     dt = tl.load(schedule + (step + 1) * 4 + 1)
     decay = tl.load(schedule + (step + 1) * 4 + 2)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = k < tl.where(dt > 0, nodes, 0)
+    mask = k < nodes
     node = tl.load(active + k, mask, 0)
     inverse = tl.load(inverse_mass + k, mask, 0.0)
-    f0 = tl.zeros([BLOCK], tl.float32)
-    f1 = tl.zeros([BLOCK], tl.float32)
-    f2 = tl.zeros([BLOCK], tl.float32)
-    drag = tl.zeros([BLOCK], tl.float32)
-    m0 = tl.zeros([BLOCK], tl.float32)
-    m1 = tl.zeros([BLOCK], tl.float32)
-    m2 = tl.zeros([BLOCK], tl.float32)
-    for o in tl.static_range(27):
-        row = partial + (o * (cells + 1) + tl.load(source + o * nodes + k, mask, cells)) * WIDTH
-        f0 += tl.load(row, mask, 0.0)
-        f1 += tl.load(row + 1, mask, 0.0)
-        f2 += tl.load(row + 2, mask, 0.0)
-        if IMPLICIT:
-            drag += tl.load(row + 3, mask, 0.0)
-        if POSITION:
-            m0 += tl.load(row + 4, mask, 0.0)
-            m1 += tl.load(row + 5, mask, 0.0)
-            m2 += tl.load(row + 6, mask, 0.0)
+    o = tl.arange(0, 32)[:, None]  # all 27 at once: one after the other would wait 27 times for the memory
+    known = mask[None, :] & (o < 27)
+    row = partial + (o * (cells + 1) + tl.load(source + o * nodes + k[None, :], known, cells)) * WIDTH
+    f0 = tl.sum(tl.load(row, known, 0.0), 0)
+    f1 = tl.sum(tl.load(row + 1, known, 0.0), 0)
+    f2 = tl.sum(tl.load(row + 2, known, 0.0), 0)
+    if IMPLICIT:
+        drag = tl.sum(tl.load(row + 3, known, 0.0), 0)
+    if POSITION:
+        m0 = tl.sum(tl.load(row + 4, known, 0.0), 0)
+        m1 = tl.sum(tl.load(row + 5, known, 0.0), 0)
+        m2 = tl.sum(tl.load(row + 6, known, 0.0), 0)
     if IMPLICIT:
         push = kick / (1 + kick * drag * inverse)
     else:
@@ -243,6 +237,7 @@ def total_nodes(
     v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
     v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay
     v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
+    mask = k < tl.where(dt > 0, nodes, 0)  # here, as the loads need not wait for the schedule
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
         stopped = mask & (free == 0)
@@ -276,7 +271,7 @@ def total_rows(
     """``total``: velocities of the held points, and their sums since the start of the rollout."""
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = k < tl.where(dt > 0, rows, 0)
+    mask = k < rows
     o = tl.arange(0, 32)[None, :]  # all 27 at once: one after the other would wait 27 times for the memory
     each = o * rows + k[:, None]
     known = mask[:, None] & (o < 27)
@@ -285,6 +280,7 @@ def total_rows(
     r0 = tl.sum(w * tl.load(place, known, 0.0), 1)
     r1 = tl.sum(w * tl.load(place + 1, known, 0.0), 1)
     r2 = tl.sum(w * tl.load(place + 2, known, 0.0), 1)
+    mask = k < tl.where(dt > 0, rows, 0)
     out = residual + k * 4
     tl.store(out, r0, mask)
     tl.store(out + 1, r1, mask)
@@ -303,7 +299,7 @@ def total_hold(
     """``total``: velocities and displacements of the nodes around held points, of which a scene has ``rows``."""
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = n < tl.where(dt > 0, nodes, 0)
+    mask = n < nodes
     first = tl.load(scene + n, mask, 0) * rows
     a0 = tl.zeros([BLOCK], tl.float32)
     a1 = tl.zeros([BLOCK], tl.float32)
@@ -317,6 +313,7 @@ def total_hold(
         a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
         a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
     at = fields + tl.load(affected + n, mask, 0) * 8
+    mask = n < tl.where(dt > 0, nodes, 0)
     tl.store(at, tl.load(at, mask, 0.0) - dt * a0, mask)
     tl.store(at + 1, tl.load(at + 1, mask, 0.0) - dt * a1, mask)
     tl.store(at + 2, tl.load(at + 2, mask, 0.0) - dt * a2, mask)
