@@ -10,14 +10,14 @@ from weakref import WeakKeyDictionary
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
+from torch import Tensor, nn
 
-from gaussian_swaying.aero.wind import GaussianGust, Modulation, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.aero.wind import GaussianGust, SineSway, UniformGust, WindField, stream_start
 
 SWAY, UNIFORM, GAUSSIAN = 0, 1, 2
 BLOCK = 64
 
-_numbers: WeakKeyDictionary[WindField, tuple[tuple[object, ...], Tensor, Tensor]] = WeakKeyDictionary()
+_numbers: WeakKeyDictionary[nn.Module, tuple[tuple[object, ...], Tensor, Tensor]] = WeakKeyDictionary()
 """What the kernel reads of each wind, on the device, and what it was made from."""
 
 
@@ -97,7 +97,7 @@ def _blow(
     tl.store(out + 3 * index + 2, v2, mask)
 
 
-def blow(wind: WindField, times: Tensor) -> Tensor | None:
+def blow(wind: nn.Module, times: Tensor) -> Tensor | None:
     """Air velocity of a wind; None if the kernel does not know one of its parts.
 
     Also None while a CUDA graph is recorded, if the numbers of the wind are not on the device yet.
@@ -134,7 +134,7 @@ def blow(wind: WindField, times: Tensor) -> Tensor | None:
     return out
 
 
-def _row(part: Modulation) -> tuple[int, float, float, float] | None:
+def _row(part: nn.Module) -> tuple[int, float, float, float] | None:
     """Kind of a modulation and its numbers; None if the kernel does not know it."""
     if type(part) is SineSway:
         return SWAY, part.amplitude, part.period, part.phase

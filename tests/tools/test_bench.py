@@ -4,10 +4,14 @@ import json
 import math
 
 import pytest
+import torch
 from bench.cases import accuracy, pareto
+from bench.cases.runs import comparison
 from bench.tables import accuracy as tables
 from bench.tables import pareto as sweep
+from bench.tables.goals import of_runs
 from bench.tables.rows import order
+from bench.tables.runs import whole
 
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.simulation import Simulation
@@ -115,3 +119,17 @@ def test_what_a_longer_substep_costs():
     rows += [row(4, 0.4, 1.0), row(1, 0.8, 9.0, dtype="float64"), row(2, 0.8, 9.0, substep=1e-3)]
     rows += [row(5, 0.4, 1.0), row(5, 0.8, 9.0, error=None)]
     assert sweep.time_at({"rows": rows}, "0.8") == "0.60"
+
+
+def test_the_time_of_a_comparison():
+    """A short one, and what the page says of it."""
+    found = comparison(torch.device("cpu"), 2)
+    assert (found["frames"], found["points"], found["picture"]) == (2, 10_000, [480, 270])
+    assert found["particles"] > 10_000
+    about = {"device": "a CPU", "seed": 0, "versions": {}}
+    for frames, reached in ((2, None), (250, True)):
+        result = about | {"runs": [], "comparison": found | {"frames": frames, "process_wall_s": 29.0}}
+        goals = [goal for goal in of_runs(result) if "compared with a reference" in goal[0]]
+        assert [goal[2] for goal in goals] == ([] if reached is None else [reached])
+    assert "250 frames" in whole(result)[-1]
+    assert "480 x 270 pixels against a surface of 10,000 points in 29.0 s" in whole(result)[-1]

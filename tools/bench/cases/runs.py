@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -11,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from bench import record
@@ -18,6 +20,9 @@ from bench.clock import timed
 from bench.problems import CUBE, sheet
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.simulation import Simulation
+
+FLAG = record.ROOT / "configs" / "sim" / "flag.yaml"
+COARSE = ("--solver.dx=0.1", "--scene.generator.init_args.spacing=0.0095", "--recorder.trajectory=true")
 
 
 def bench_substep(
@@ -47,6 +52,38 @@ def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, 
     summary.pop("per_frame")
     named = [Path(a).name if a.endswith(".ply") else a for a in arguments]
     return {"name": name, "arguments": named, "process_wall_s": wall} | summary
+
+
+def comparison(device: torch.device, frames: int) -> dict[str, Any]:
+    """The time of tools/eval.py, in its own process: a flag against pictures and a surface of its size.
+
+    The reference is a sheet that waves as a sine; what it looks like makes no difference to the time.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        run, reference = Path(folder) / "run", Path(folder) / "reference"
+        command = [sys.executable, str(record.ROOT / "tools" / "sim.py"), "--config", str(FLAG), *COARSE]
+        command += [f"--frames={frames}", "--device", device.type, "--output", str(run)]
+        subprocess.run(command, check=True, cwd=record.ROOT)
+        shutil.copytree(run / "frames", reference / "frames")
+        positions, faces = waving_sheet(frames)
+        np.savez(reference / "cloth.npz", positions=positions, faces=faces, side=1.0)
+        begin = time.perf_counter()
+        command = [sys.executable, str(record.ROOT / "tools" / "eval.py"), str(run), str(reference), "--no-video"]
+        subprocess.run([*command, "--device", device.type], check=True, cwd=record.ROOT, stdout=subprocess.DEVNULL)
+        wall = time.perf_counter() - begin
+        summary = json.loads((run / "summary.json").read_text())
+        found = json.loads((run / "eval" / "eval.json").read_text())
+    known = {"frames": frames, "particles": summary["recorded_surface"], "picture": found["size"]}
+    return known | {"points": found["reference_points"], "process_wall_s": wall}
+
+
+def waving_sheet(frames: int, rows: int = 41, columns: int = 61) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (T, V, 3) [m] and squares (F, 4) of a sheet of 1.0 m x 0.7 m with waves that run along it."""
+    x, z = np.meshgrid(np.linspace(0, 1, columns), np.linspace(-0.35, 0.35, rows))
+    wave = [0.05 * x * np.sin(6 * x - 0.3 * frame) for frame in range(frames)]
+    positions = np.stack([np.stack([x, y, z], -1).reshape(-1, 3) for y in wave]).astype(np.float32)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
+    return positions, corner + np.array([0, 1, columns + 1, columns])
 
 
 def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
@@ -81,6 +118,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py sim``."""
     command.add_argument("--ply", help="a captured object for configs/sim/hanging_object.yaml")
     command.add_argument("--frames", type=int, help="frames of the captured object; default: all")
+    command.add_argument("--compared", type=int, default=250, help="frames of the comparison with a reference")
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
 
 
@@ -99,4 +137,5 @@ def sim(options: argparse.Namespace) -> None:
         name = f"{Path(options.ply).stem}, {'1920x1080' if size else '960x540'}"
         result["runs"].append(run_sim(name, [*hanging, *size, *frames, *more], device))
         result["round_trip_psnr_db"] = round_trip_psnr(hanging[1], options.ply, device)
+    result["comparison"] = comparison(device, options.compared)
     record.write(Path(options.results), f"sim_{device.type}", result)

@@ -53,4 +53,11 @@ def whole(result: Row) -> list[str]:
     ]
     if "round_trip_psnr_db" in result:
         told.append(f"- PSNR of frame 0 compared with the captured splat: {result['round_trip_psnr_db']:.1f} dB.")
+    if "comparison" in result:
+        one = result["comparison"]
+        told.append(
+            f"- `gaussian-swaying eval`: {one['frames']} frames of {one['particles']:,} Gaussians and of "
+            f"{' x '.join(map(str, one['picture']))} pixels against a surface of {one['points']:,} points in "
+            f"{one['process_wall_s']:.1f} s of process time, without a video."
+        )
     return [source(result), "", *grid(head, rows), "", *told]
