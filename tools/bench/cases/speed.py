@@ -29,7 +29,7 @@ Row = dict[str, Any]
 CONFIG = record.ROOT / "configs" / "sim" / "flag.yaml"
 DT = 1e-4  # s
 FORMULATIONS = ("total", "updated")
-SECTIONS = ("substep", "sand", "cube", "batch", "frame")
+SECTIONS = ("substep", "sand", "cube", "batch", "frame", "large")
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class Plan:
         spacing: Distance between the Gaussians of the flag [m].
         dx: Grid spacings of the flag [m]; the goals are for the first.
         small: Whether frames of the flag as it is configured are measured, too.
+        large: Distance between the Gaussians of a larger flag [m], with the first of ``dx``; None for no such flag.
     """
 
     counts: tuple[int, ...]
@@ -67,6 +68,7 @@ class Plan:
     dx: tuple[float, ...]
     cubes: tuple[int, ...] = ()
     small: bool = False
+    large: float | None = None
     side: int = 64
     steps: tuple[int, int] = (64, 192)
     torch_steps: int = 8
@@ -88,6 +90,7 @@ PLANS = {
         dx=(0.0125, 0.025, 0.00625),
         cubes=(200_000, 1_000_000, 4_000_000),
         small=True,
+        large=0.00098,
     ),
     "cpu": Plan(
         counts=(5_000, 20_000, 100_000),
@@ -111,7 +114,9 @@ def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
     if quick:
         plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
         plan = replace(plan, torch_steps=2, warm=2, repeats=(2, 2), copy_bytes=2**20)
-        plan = replace(plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,), cubes=(1000,), small=False)
+        plan = replace(
+            plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,), cubes=(1000,), small=False, large=None
+        )
     return plan if counts is None else replace(plan, counts=tuple(int(n) for n in counts.split(",")))
 
 
@@ -235,15 +240,15 @@ def bench_cube(plan: Plan, asked: int, walls: bool, turning: bool, device: torch
     return row | {"particles": points.count, "substeps": steps, "grid_nodes": state.grid.node_count}
 
 
-def bench_frame(plan: Plan, dx: float | None, device: torch.device) -> Row:
+def bench_frame(plan: Plan, dx: float | None, device: torch.device, spacing: float | None = None) -> Row:
     """Frames of configs/sim/flag.yaml: from the state of one frame to the picture of the next, on the device.
 
     On a GPU, a run draws a frame while it simulates the next one, and so do these. The parts are measured one after
-    the other, afterwards. Without ``dx`` the flag is as it is configured.
+    the other, afterwards. Without ``dx`` the flag is as it is configured. ``spacing`` [m] replaces that of the plan.
     """
     arguments = ["--config", str(CONFIG), "--device", device.type]
     if dx is not None:
-        arguments += ["--solver.dx", str(dx), "--scene.generator.init_args.spacing", str(plan.spacing)]
+        arguments += ["--solver.dx", str(dx), "--scene.generator.init_args.spacing", str(spacing or plan.spacing)]
         for name, size in zip(("width", "height"), plan.picture, strict=True):
             arguments += [f"--camera.init_args.{name}", str(size)]
     parser = Simulation.parser()
@@ -283,6 +288,7 @@ def bench_frame(plan: Plan, dx: float | None, device: torch.device) -> Row:
     row |= {name: statistics.median(column) for name, column in zip(names, zip(*parts, strict=True), strict=True)}
     row |= {"particles": len(simulation.scene.simulated), "points": simulation.scene.points.count}
     row |= {"width": camera.width, "height": camera.height}
+    row["substep_ms"] = row["simulation_ms"] / statistics.median(substeps)
     row |= {"substeps": statistics.median(substeps), "renderer": type(painter.renderer).__name__}
     return row | {"memory_bytes": peak.read(), "build_memory_bytes": build_memory, "dx_m": simulation.solver.dx}
 
@@ -340,6 +346,8 @@ def measure(
             case("frame", {"dx_m": dx, "main": dx == plan.dx[0]}, lambda dx=dx: bench_frame(plan, dx, device))
         if plan.small:
             case("frame", {"small": True}, lambda: bench_frame(plan, None, device))
+    if "large" in wanted and plan.large is not None:
+        case("large", {"dx_m": plan.dx[0]}, lambda: bench_frame(plan, plan.dx[0], device, plan.large))
     del result["partial"]
     save(result)
 

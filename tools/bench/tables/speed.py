@@ -127,7 +127,7 @@ def batches(result: Row) -> list[str]:
 @table(PAGE, "speed.frames", "speed_*")
 def frames(result: Row) -> list[str]:
     """From the state of a frame to the picture of the next."""
-    rows = result.get("frame", [])
+    rows = [*result.get("frame", []), *result.get("large", [])]
     head = ["frame of 0.04 s of configs/sim/flag.yaml", "substeps", "median [ms]", "quartiles [ms]", "simulation [ms]"]
     head += ["shading [ms]", "rendering [ms]", "renderer", "memory [GiB]", "memory to build [GiB]"]
 
