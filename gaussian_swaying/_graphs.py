@@ -169,26 +169,21 @@ class Replayed:
 
 
 class Repeater:
-    """Runs pieces of work from CUDA graphs: of 16, 4 and 1 repetitions, or of a whole. They share one memory pool.
+    """Repeats pieces of work by replaying CUDA graphs of 16, 4 and 1 repetitions, which share one memory pool.
 
     The pool belongs to the graphs in use. Once all of them are dropped, its memory is freed before the next graph is
     recorded.
 
     Args:
         device: Device on which the work runs; without CUDA nothing is recorded.
+        kept: Number of pieces of work whose graphs are kept; those that ran longest ago are dropped.
     """
 
     SIZES = (16, 4, 1)
-    KEPT = 4
-    """Number of pieces of work whose graphs are kept; the oldest are dropped."""
 
-    WHOLE = 16
-    """Number of graphs that :meth:`once` keeps, and of keys that it remembers; the oldest are dropped."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
+    def __init__(self, device: torch.device, kept: int = 4) -> None:
+        self.device, self.kept = device, kept
         self._graphs: dict[Hashable, dict[int, torch.cuda.CUDAGraph]] = {}
-        self._whole: dict[Hashable, torch.cuda.CUDAGraph | None] = {}
         self._stream: torch.cuda.Stream | None = None
 
     def run(self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True) -> None:
@@ -211,13 +206,13 @@ class Repeater:
             return
         if self.device.type != "cuda" or not recordable or key not in self._graphs:
             self.forget(key)
-            while len(self._graphs) >= self.KEPT:
+            while len(self._graphs) >= self.kept:
                 self.forget(next(iter(self._graphs)))
             self._graphs[key] = {}
             for _ in range(times):
                 several(1)
             return
-        graphs = self._graphs[key]
+        self._graphs[key] = graphs = self._graphs.pop(key)  # the newest now
         for size in self.SIZES:
             while times >= size:
                 if size not in graphs:
@@ -225,48 +220,10 @@ class Repeater:
                 graphs[size].replay()
                 times -= size
 
-    def once(self, key: Hashable, work: Callable[[], None]) -> bool:
-        """Run the work once, from a graph of its own, unless its key is new.
-
-        A piece of work is recorded only if its key comes again, as a recording takes longer than the work.
-
-        Args:
-            key: Identifies the work.
-            work: The work; its kernels have run before the second call with a key.
-
-        Returns:
-            Whether it ran.
-
-        Raises:
-            RuntimeError: If it cannot be recorded.
-            torch.OutOfMemoryError: If there is no memory left to record it.
-        """
-        if key not in self._whole:
-            while len(self._whole) >= self.WHOLE:
-                self._drop(next(iter(self._whole)))
-            self._whole[key] = None
-            return False
-        if self.device.type != "cuda":
-            work()
-            return True
-        graph = self._whole.pop(key)  # and in again, as the newest
-        self._whole[key] = graph = self._recorded(lambda _: work(), 1) if graph is None else graph
-        graph.replay()
-        return True
-
-    def _drop(self, key: Hashable) -> None:
-        graph = self._whole.pop(key)
-        if graph is not None:
-            graph.reset()
-
-    def _alive(self) -> Iterator[torch.cuda.CUDAGraph]:
-        yield from (graph for graphs in self._graphs.values() for graph in graphs.values())
-        yield from (graph for graph in self._whole.values() if graph is not None)
-
     def _recorded(self, several: Callable[[int], None], size: int) -> torch.cuda.CUDAGraph:
         if self._stream is None:
             self._stream = torch.cuda.Stream(self.device)
-        alive = next(self._alive(), None)
+        alive = next((graph for graphs in self._graphs.values() for graph in graphs.values()), None)
         if alive is None:
             # memory of dropped graphs and cached memory cannot be used during a recording; after a failed recording
             # PyTorch refuses to give it back
@@ -294,5 +251,3 @@ class Repeater:
         for known in list(self._graphs) if key is None else [key]:
             for graph in self._graphs.pop(known, {}).values():
                 graph.reset()
-        for known in list(self._whole) if key is None else []:
-            self._drop(known)

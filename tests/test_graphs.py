@@ -218,8 +218,8 @@ def test_no_more_than_some_works_are_kept(driver):
     for key in range(20):
         for _ in range(2):
             repeater.run(1, key, several)
-        assert len(driver.alive) <= Repeater.KEPT
-    assert len(driver.alive) == Repeater.KEPT
+        assert len(driver.alive) <= repeater.kept
+    assert len(driver.alive) == repeater.kept
     assert driver.reserved <= 20  # one block of the works that are recorded, one of those that ran as they are
     del called[:]
     for key in (19, 16):
@@ -227,36 +227,8 @@ def test_no_more_than_some_works_are_kept(driver):
     assert called == []
     repeater.run(1, 0, several)
     repeater.run(1, 16, several)
-    assert called == [1, 1]  # 0 was forgotten, and 16, the oldest, is now
-
-
-def test_a_whole_is_recorded_when_it_comes_again(driver):
-    """The first time the caller runs it in another way; the oldest are dropped, and what they took is given back."""
-    repeater, called = Repeater(torch.device("cuda")), []
-
-    def work():
-        called.append(driver.capturing is not None)
-        driver.allocate(10)
-
-    for count in (1, 2, 3):
-        assert repeater.once("key", work) is (count > 1)
-    assert called == [True]  # recorded, and replayed
-    for key in range(2 * Repeater.WHOLE):
-        repeater.once("key", work)  # the newest stays
-        for _ in range(2):
-            repeater.once(key, work)
-        assert len(driver.alive) <= Repeater.WHOLE
-    assert driver.reserved <= 20
-    assert called == [True] * (1 + 2 * Repeater.WHOLE)
-    repeater.forget()
-    assert not driver.alive
-    assert not repeater.once("key", work)
-
-
-def test_a_whole_without_cuda():
-    done, repeater = [], Repeater(torch.device("cpu"))
-    assert [repeater.once("key", lambda: done.append(1)) for _ in range(3)] == [False, True, True]
-    assert len(done) == 2
+    repeater.run(1, 17, several)
+    assert called == [1, 1]  # 0 was forgotten, and 17, which ran longest ago, is now
 
 
 def test_a_function_without_cuda_is_called():

@@ -42,7 +42,6 @@ class Part:
 
     Attributes:
         steps: Number of substeps.
-        rows: Rows of the schedule with a length; as many substeps may run, and those after ``steps`` do nothing.
         options: Constants of the kernels.
         looks: Numbers of the substeps after which the wave speed is measured.
         loaded: Whether the work of a load is counted.
@@ -51,18 +50,11 @@ class Part:
     """
 
     steps: int
-    rows: int
     options: dict[str, Any]
     looks: list[int]
     loaded: bool
     begin: Callable[[int], None]
     key: tuple[object, ...] | None
-
-
-def whole_steps(steps: int) -> int:
-    """A number of substeps from few, so that a graph serves several frames: at most a sixteenth more than ``steps``."""
-    unit = max(1, 1 << (steps.bit_length() - 5)) if steps >= 32 else 1
-    return min(-(-steps // unit) * unit, MAX_STEPS)
 
 
 class Fused(ABC):
@@ -109,7 +101,7 @@ class Fused(ABC):
         """The forces of the current rollout that are computed in torch, in every substep."""
         self._resist: tuple[object, bool] = ((), False)
         self._seen: dict[str, Tensor] = {}
-        self.repeater = Repeater(self.device)
+        self.repeater = Repeater(self.device, kept=8)
 
     @classmethod
     def unsupported(cls, bound: Formulation, interpret: bool) -> str | None:
@@ -207,8 +199,7 @@ class Fused(ABC):
         looks: list[int],
     ) -> MPMState:
         """Run a part of a rollout whose schedule fits in the buffers."""
-        rows = whole_steps(steps)
-        self.schedule[: rows + 2].copy_(self._table(kick_time(state, dt), dt, steps, rows), non_blocking=True)
+        self.schedule[: steps + 2].copy_(self._table(kick_time(state, dt), dt, steps), non_blocking=True)
         self.time.copy_(state.time)
         self.dt.fill_(dt)
         loaded = twin is not None or options["FORCE"]
@@ -224,18 +215,18 @@ class Fused(ABC):
             if loaded:
                 self.load.zero_()
 
-        part = Part(steps, rows, options, looks, loaded, begin, self._key_of(force))
+        part = Part(steps, options, looks, loaded, begin, self._key_of(force))
         changes = self._run(state, part)
         changes["impulse"] = state.impulse + changes["impulse"]
         if loaded:
             changes["work"] = state.work + changes["work"]
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _table(self, kick: float, dt: float, steps: int, rows: int) -> Tensor:
-        """The schedule on the host, which can be copied without making it wait; rows after ``steps`` have no length."""
+    def _table(self, kick: float, dt: float, steps: int) -> Tensor:
+        """The schedule on the host, which can be copied without making it wait."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
-        table = torch.zeros(rows + 2, SCHEDULE, pin_memory=self.device.type == "cuda")
-        table[: steps + 1] = torch.tensor([dt, dt, other, 0.0])
+        table = torch.empty(steps + 2, SCHEDULE, pin_memory=self.device.type == "cuda")
+        table[2:] = torch.tensor([dt, dt, other, 0.0])
         table[:2] = torch.tensor([[0.0, dt, 1.0, kick if steps == 1 else dt], [kick, dt, first, 0.0]])
         return table
 

@@ -25,7 +25,7 @@ _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 _PROGRAMS = 2048
 
 RECORDED = 200_000
-"""Most particles of a rollout that is recorded as a whole: with more, the GPU takes longer than the host anyway."""
+"""Most particles whose fields at the end of a rollout are recorded in a CUDA graph, which keeps their memory."""
 
 # spilling registers is worth it, because more warps run at once
 _REGISTERS = {64: {"maxnreg": 128}}
@@ -142,37 +142,27 @@ class FusedTotal(Fused):
         assert state.node_velocity is not None
         self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
         self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
-        options, looks = part.options, [part.rows if look == part.steps else look for look in part.looks]
-        # pins act in the kernels; other boundaries and forces ask for the time, which a substep without length moves on
-        simple = self.plain and not self.asked and self.count <= RECORDED and part.key is not None
-        key = (part.rows, *options.values(), *looks, self.numbers.data_ptr(), part.key)
-        if simple and self.repeater.once(key, lambda: self._whole(part, looks)):
-            return self._fields(self.found.clone(), self.taken_and_done.clone(), part)
-        part.begin(part.steps)
-        self._clear()
+        options = part.options
+
+        def begin(_: int) -> None:
+            part.begin(len(self.vectors))
+            for buffer in (self.taken, self.impulse, *([] if self.points is None else [self.residual])):
+                buffer.zero_()
+
+        key = (part.loaded, self.numbers.data_ptr(), part.key)
+        self.repeater.run(1, ("begin", *key), begin, part.key is not None)
         done = 0
         for mark in sorted({*part.looks, part.steps}):
             self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
             done = mark
             if mark in part.looks:
-                self._look()
-        found = torch.empty(self.room, device=self.device)
-        self._read(found, part)
-        return self._fields(found, self.taken_and_done.clone(), part)
-
-    def _clear(self) -> None:
-        for buffer in (self.taken, self.impulse, *([] if self.points is None else [self.residual])):
-            buffer.zero_()
-
-    def _whole(self, part: Part, looks: list[int]) -> None:
-        """The kernels of a whole part, with as many substeps as the schedule has rows, into ``found``."""
-        part.begin(part.rows)
-        self._clear()
-        for step in range(part.rows):
-            self._substep(step, part.options)
-            if step + 1 in looks:
-                self._look()
-        self._read(self.found, part)
+                self.repeater.run(1, "look", lambda _: self._look())
+        if self.count > RECORDED:
+            found = torch.empty(self.room, device=self.device)
+            self._read(found, part)
+            return self._fields(found, self.taken_and_done.clone(), part)
+        self.repeater.run(1, ("read", part.loaded, options["IMPLICIT"]), lambda _: self._read(self.found, part))
+        return self._fields(self.found.clone(), self.taken_and_done.clone(), part)
 
     def _look(self) -> None:
         _, ny, nz = self.grid.resolution
@@ -222,9 +212,8 @@ class FusedTotal(Fused):
         """Stop the held points: their velocities, then those of the nodes around them."""
         rows, block = points.node.shape[1], 4
         kernels.total_rows[(-(-rows // block),)](
-            points.node, points.weight, rows, self.fields, self.residual, self.schedule, self.first_step, offset,
-            BLOCK=block, num_warps=1,
-        )  # fmt: skip
+            points.node, points.weight, rows, self.fields, self.residual, BLOCK=block, num_warps=1
+        )
         nodes, block = len(points.affected), 8
         kernels.total_hold[(-(-nodes // block),)](
             points.affected, points.scene, points.push, self.residual, nodes, points.push.shape[1], self.fields,

@@ -13,7 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue,
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities.
 
-A substep without a length does nothing. Row 0 has a last column: how long forces act in the last substep.
+Row 0 has a last column: how long forces act in the last substep.
 """
 
 # Numbers that differ between bodies and between grids, and are not specialised. Otherwise Triton would compile a kernel

@@ -89,14 +89,14 @@ def total_particles(
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
     Lanes without a particle have no volume, values of a twin or mass, so they add nothing. The first step of a rollout
-    takes the previous substep from row 0 of the schedule, and a substep without a length does nothing.
+    takes the previous substep from row 0 of the schedule.
     """
     LOADED: tl.constexpr = (TWIN is not None) or FORCE
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
     cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
-    real = cell < tl.where(tl.load(schedule + (step + 1) * 4 + 1) > 0, cells, 0)
+    real = cell < cells
     start = tl.load(cell_start + cell, real, 0)
     end = tl.load(cell_start + cell + 1, real, 0)
     node = tl.load(cell_node + cell, real, 0)[:, None]
@@ -237,7 +237,6 @@ def total_nodes(
     v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
     v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay
     v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
-    mask = k < tl.where(dt > 0, nodes, 0)  # here, as the loads need not wait for the schedule
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
         stopped = mask & (free == 0)
@@ -265,11 +264,8 @@ def total_nodes(
 
 
 @triton.jit(do_not_specialize=VARIES)
-def total_rows(
-    node, weight, rows, fields, residual, schedule, first_step, step_offset, BLOCK: tl.constexpr
-):  # fmt: skip
+def total_rows(node, weight, rows, fields, residual, BLOCK: tl.constexpr):
     """``total``: velocities of the held points, and their sums since the start of the rollout."""
-    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < rows
     o = tl.arange(0, 32)[None, :]  # all 27 at once: one after the other would wait 27 times for the memory
@@ -280,7 +276,6 @@ def total_rows(
     r0 = tl.sum(w * tl.load(place, known, 0.0), 1)
     r1 = tl.sum(w * tl.load(place + 1, known, 0.0), 1)
     r2 = tl.sum(w * tl.load(place + 2, known, 0.0), 1)
-    mask = k < tl.where(dt > 0, rows, 0)
     out = residual + k * 4
     tl.store(out, r0, mask)
     tl.store(out + 1, r1, mask)
@@ -313,7 +308,6 @@ def total_hold(
         a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
         a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
     at = fields + tl.load(affected + n, mask, 0) * 8
-    mask = n < tl.where(dt > 0, nodes, 0)
     tl.store(at, tl.load(at, mask, 0.0) - dt * a0, mask)
     tl.store(at + 1, tl.load(at + 1, mask, 0.0) - dt * a1, mask)
     tl.store(at + 2, tl.load(at + 2, mask, 0.0) - dt * a2, mask)
