@@ -183,9 +183,12 @@ class MPMSolver(nn.Module):
             self._bind(self.points.map(fn))
         return self
 
+    def _conditions(self) -> list[Boundary]:
+        return [b for b in self.boundaries if isinstance(b, Boundary)]
+
     def _bind(self, points: MaterialPoints) -> None:
         """Bind the material and compute everything that stays constant."""
-        conditions = _conditions(self.boundaries) if self._framed is None else self._framed
+        conditions = self._conditions() if self._framed is None else self._framed
         self._bound = self._fused = None
         bound = FORMULATIONS[self.formulation](Body(points, conditions), self.settings)
         self._fused_obstacle = self._why_not_fused(bound)
@@ -210,8 +213,7 @@ class MPMSolver(nn.Module):
     @property
     def has_kernels(self) -> bool:
         """Whether the Triton substep is used where no gradient is needed."""
-        self.bound  # noqa: B018  (raises an error without a material)
-        return self._fused_obstacle is None
+        return self._bound is not None and self._fused_obstacle is None
 
     def fused(self, *tensors: Tensor | None) -> Fused | None:
         """The Triton substep of this material; None if the torch substep is used.
@@ -272,7 +274,7 @@ class MPMSolver(nn.Module):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
         self._framed = None
         if frame is not None:
-            self._framed = tuple(b.in_frame(frame) for b in _conditions(self.boundaries))
+            self._framed = tuple(b.in_frame(frame) for b in self._conditions())
         self._bound = None
         self.to(points.position.device)  # the solver moves to the device of its material
         self._bind(points)
@@ -486,7 +488,7 @@ class MPMSolver(nn.Module):
                 return state, dt * cells
         seen = []
         for first, last in pairwise([0, *marks]):
-            part = None if watch is None else partial(_told, watch, first)
+            part = None if watch is None else lambda done, before=first: watch(before + done)
             state = self.rollout(state, dt, last - first, acting, watch=part)
             seen.append(self.cfl_number(state, dt))
         return state, torch.stack(seen).amax()
@@ -516,11 +518,3 @@ class MPMSolver(nn.Module):
     def extra_repr(self) -> str:
         """Settings, for printing."""
         return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"
-
-
-def _told(watch: WatchFunction, before: int, done: int) -> None:
-    watch(before + done)
-
-
-def _conditions(modules: nn.ModuleList) -> list[Boundary]:
-    return [b for b in modules if isinstance(b, Boundary)]

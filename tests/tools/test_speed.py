@@ -27,7 +27,7 @@ BATCH = {
 BATCH |= {"ratio", "difference"}
 CUBE = SPREAD | {"asked", "turning", "walls", "particles", "substeps", "grid_nodes"}
 FRAME = SPREAD | {"dx_m", "main", "simulation_ms", "shading_ms", "rendering_ms", "particles", "width", "height"}
-FRAME |= {"points", "substeps", "renderer", "memory_bytes", "build_memory_bytes"}
+FRAME |= {"points", "substeps", "substep_ms", "renderer", "memory_bytes", "build_memory_bytes"}
 
 
 PAGE = """# Benchmarks
@@ -201,7 +201,9 @@ def _recorded(factor):
     ]
     batch = [{"formulation": f, "gusts": g, "ratio": 20 / factor} for f in ("total", "updated") for g in (False, True)]
     sand = [{"asked": 1_000_000, "median_ms": 0.6 * factor}]
-    return {"kind": "cuda", "substep": rows, "sand": sand, "batch": batch, "frame": [frame, small], "cube": cube}
+    large = {"median_ms": factor * 8.0, "substep_ms": factor * 0.03}
+    found = {"kind": "cuda", "substep": rows, "sand": sand, "batch": batch, "frame": [frame, small], "cube": cube}
+    return found | {"large": [large]}
 
 
 @pytest.mark.parametrize(
@@ -209,11 +211,11 @@ def _recorded(factor):
 )
 def test_goals_are_reached_or_not(factor, reached, stretched):
     found = speed_goals.goals(_recorded(factor))
-    assert len(found) == 16
+    assert len(found) == 18
     assert {goal[2] for goal in found} == {reached}
     assert {goal[4] for goal in found} - {None} == {stretched}
     lines = goals.goals([_recorded(factor) | {"copy": {}}])[2:]
-    assert len(lines) == 16
+    assert len(lines) == 18
     assert all(line.split(" | ")[2] == ("yes" if reached else "no") for line in lines)
     assert all(line.count(" | ") == 4 for line in lines)
 
@@ -221,7 +223,7 @@ def test_goals_are_reached_or_not(factor, reached, stretched):
 def test_goals_of_what_is_missing_or_failed():
     assert {goal[1:3] for goal in speed_goals.goals({"kind": "cuda"})} == {("not measured", None)}
     failed = _recorded(0.5)
-    for section in ("substep", "sand", "cube", "batch", "frame"):
+    for section in ("substep", "sand", "cube", "batch", "frame", "large"):
         failed[section] = [row | {"failed": "out of memory"} for row in failed[section]]
     assert {goal[1:3] for goal in speed_goals.goals(failed)} == {("out of memory", False)}
     assert speed_goals.goals({"kind": "cpu"}) == []
@@ -233,7 +235,9 @@ def test_goals_of_the_other_runs():
     assert goals.goals([slow])[2].endswith("within 40 ms | 41.0 ms (`updated`) | no | - | - |")
     wall = {"simulation": 0.8, "shading": 0.2, "rendering": 0.2}
     run = {"name": "guitar, 1920x1080", "frames": 250, "wall_s": wall, "peak_memory_bytes": {"device": 10**8}}
-    run |= {"lost_particles": 0, "stretch_min": 0.9, "stretch_max": 1.1}
+    run |= {"lost_particles": 0, "stretch_min": 0.9, "stretch_max": 1.1, "process_wall_s": 7.0}
+    lines = goals.goals([{"device": "NVIDIA H200", "runs": [run]}])
+    assert [row.split(" | ", 1)[1] for row in lines if "whole process" in row] == ["7.0 s | yes | 6 s | no |"]
     rows = [row for row in goals.goals([{"device": "NVIDIA H200", "runs": [run]}]) if "within 1.5 s" in row]
     assert [row.split(" | ", 1)[1] for row in rows] == ["1.2 s, 0.09 GiB | yes | 1 s | no |"]
     run |= {"name": "guitar, 960x540", "process_wall_s": 185.0}

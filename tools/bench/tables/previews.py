@@ -17,7 +17,7 @@ def rows(result: Row) -> list[str]:
     found = []
     for name, entry in result["previews"].items():
         run = entry["run"]
-        what = f"{name}, `--preset {entry['preset']}`" if entry.get("preset") else f"{name}, {entry.get('quality', '')}"
+        what = f"{name}, `--preset {entry['preset']}`" if entry.get("preset") else name
         found.append(
             [
                 what,
