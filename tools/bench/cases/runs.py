@@ -18,7 +18,9 @@ import torch
 from bench import record
 from bench.clock import timed
 from bench.problems import CUBE, sheet
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.simulation import Simulation
 
 FLAG = record.ROOT / "configs" / "sim" / "flag.yaml"
@@ -55,17 +57,14 @@ def run_sim(name: str, arguments: list[str], device: torch.device) -> dict[str, 
 
 
 def comparison(device: torch.device, frames: int) -> dict[str, Any]:
-    """The time of tools/eval.py, in its own process: a flag against pictures and a surface of its size.
-
-    The reference is a sheet that waves as a sine; what it looks like makes no difference to the time.
-    """
+    """The time of tools/eval.py, in its own process: a flag against its own pictures and a surface beside it."""
     with tempfile.TemporaryDirectory() as folder:
         run, reference = Path(folder) / "run", Path(folder) / "reference"
         command = [sys.executable, str(record.ROOT / "tools" / "sim.py"), "--config", str(FLAG), *COARSE]
         command += [f"--frames={frames}", "--device", device.type, "--output", str(run)]
         subprocess.run(command, check=True, cwd=record.ROOT)
         shutil.copytree(run / "frames", reference / "frames")
-        positions, faces = waving_sheet(frames)
+        positions, faces = surface_beside(run, frames)
         np.savez(reference / "cloth.npz", positions=positions, faces=faces, side=1.0)
         begin = time.perf_counter()
         command = [sys.executable, str(record.ROOT / "tools" / "eval.py"), str(run), str(reference), "--no-video"]
@@ -77,13 +76,16 @@ def comparison(device: torch.device, frames: int) -> dict[str, Any]:
     return known | {"points": found["reference_points"], "process_wall_s": wall}
 
 
-def waving_sheet(frames: int, rows: int = 41, columns: int = 61) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (T, V, 3) [m] and squares (F, 4) of a sheet of 1.0 m x 0.7 m with waves that run along it."""
-    x, z = np.meshgrid(np.linspace(0, 1, columns), np.linspace(-0.35, 0.35, rows))
-    wave = [0.05 * x * np.sin(6 * x - 0.3 * frame) for frame in range(frames)]
-    positions = np.stack([np.stack([x, y, z], -1).reshape(-1, 3) for y in wave]).astype(np.float32)
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
-    return positions, corner + np.array([0, 1, columns + 1, columns])
+def surface_beside(run: Path, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (T, V, 3) [m] and squares (F, 4) of a surface one centimetre beside the flag of a run."""
+    trajectory = run / "trajectory.npz"
+    to_scene = SimFrame.from_summary(json.loads((run / "summary.json").read_text())).point_to_scene
+    places = np.stack([to_scene(load_trajectory(trajectory, frame)[0]).numpy() for frame in range(frames)])
+    columns, rows = (np.unique(places[0, :, axis].round(4), return_inverse=True)[1] for axis in (0, 2))
+    vertex = np.empty((rows.max() + 1, columns.max() + 1), dtype=np.int64)
+    vertex[rows, columns] = np.arange(len(rows))
+    squares = np.stack([vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, 1:], vertex[1:, :-1]], -1).reshape(-1, 4)
+    return places + np.array([0.0, 0.01, 0.0], dtype=places.dtype), squares
 
 
 def round_trip_psnr(config: str, ply: str, device: torch.device) -> float:
