@@ -921,12 +921,25 @@ def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
         assert torch.equal(getattr(again, name), value), name
 
 
-def test_a_replayed_rollout_follows_what_changes(kernel_device):
-    """Numbers of the wind and patches that change in place, and a force that is another one."""
+@pytest.mark.parametrize("graphs", ["as on the device", "played"])
+def test_a_replayed_rollout_follows_what_changes(kernel_device, graphs, monkeypatch):
+    """Numbers of the wind and patches that change in place, and a force that is another one.
+
+    A played graph runs what was recorded, with what the recording knew of its first rollout.
+    """
+    if graphs == "played" and kernel_device.type == "cuda":
+        pytest.skip("on this device graphs are real")
     points = _points(kernel_device, count=12)
     load, other = _load(points), _load(points, seed=7)
+    if graphs == "played":
+        monkeypatch.setattr(_graphs, "record", lambda device, work, pool, stream: _Played(work))
+        monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
+        monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+        monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
 
     def run(solver, state):
+        if graphs == "played" and solver.transfer == "triton":
+            solver.fused().repeater = _graphs.Repeater(torch.device("cuda"), kept=8)
         states = [solver.rollout(state, DT, 2, load) for _ in range(3)]
         load.area *= 2
         load.aero.C_D += 1.0
@@ -935,8 +948,10 @@ def test_a_replayed_rollout_follows_what_changes(kernel_device):
         load.wind.flows *= 0.5
         states += [solver.rollout(state, DT, 2, load) for _ in range(3)]
         states += [solver.rollout(state, DT, 2, other) for _ in range(3)]
+        states += [solver.rollout(states[-1], 0.7 * DT, steps, load) for steps in (5, 3, 1, 4)]
         load.area /= 2
         load.aero.C_D -= 1.0
+        load.wind.seed = 0
         load.wind.flows *= 2
         return states
 
