@@ -11,6 +11,9 @@ from typing import Any
 import torch
 from torch import nn
 
+RECORDED = 200_000
+"""Most particles or Gaussians whose fields are recorded in CUDA graphs, which keep their memory."""
+
 _RECORDING = threading.Lock()
 """Held while a graph is recorded: PyTorch cannot give memory back to the driver during that time."""
 

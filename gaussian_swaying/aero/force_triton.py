@@ -149,7 +149,7 @@ def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
     zero = rest * 0
     s = (zero, zero, zero)
     u = (zero, zero, zero)
-    for k in range(0, tl.max(count), 4):  # four rows at once, so that they wait for the memory together
+    for k in range(0, tl.max(count), 4):  # four rows at once
         row = first + 8 + 4 * k
         b0 = load3(numbers, 1, row, k < count)
         b1 = load3(numbers, 1, row + 4, k + 1 < count)

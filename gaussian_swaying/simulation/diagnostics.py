@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._graphs import Replayed
+from gaussian_swaying._graphs import RECORDED, Replayed
 from gaussian_swaying.geometry.linalg import determinant, matmul3, symmetric_eigenvalues
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -19,9 +19,6 @@ from gaussian_swaying.mpm.state import MPMState, support_force
 from gaussian_swaying.simulation.health import particle_of_extremes
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
-RECORDED = 200_000
-"""Most particles whose measurements are recorded in a CUDA graph."""
-
 _SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
@@ -315,8 +312,8 @@ def measure(
 class Gauge:
     """:func:`measure` from a CUDA graph, where possible: some 150 small kernels take longer to start than to run.
 
-    That is on a GPU, for a solver whose grid does not move, and at most :data:`RECORDED` particles, as a graph keeps
-    its memory.
+    That is on a GPU, for a solver whose grid does not move, and at most ``_graphs.RECORDED`` particles, as a graph
+    keeps its memory.
     """
 
     def __init__(self) -> None:

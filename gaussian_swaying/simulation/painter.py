@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._graphs import Replayed, fingerprint
+from gaussian_swaying._graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import rotate_sh
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -25,9 +25,6 @@ from gaussian_swaying.simulation.recording.layout import check_camera_name
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
-
-RECORDED = 200_000
-"""Most Gaussians whose motion and colours are recorded in CUDA graphs, which keep their memory."""
 
 
 class Painter(nn.Module):

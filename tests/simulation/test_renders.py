@@ -10,6 +10,8 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import mean_depth
+from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.recording.layout import frame_folder, video_file
 from gaussian_swaying.simulation.recording.recorder import Recorder
 
@@ -175,3 +177,40 @@ def test_a_camera_that_does_not_move_is_made_once(make_simulation):
     painter.camera.eye[0] = 1.0
     assert float(painter.camera_at(1).position[0]) == pytest.approx(1.0)
     assert float(kept.position[0]) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_motion_and_colours_are_those_of_the_scene_in_every_frame(make_simulation, device):
+    """On a GPU they are replayed from the second frame on: other states, cameras, lights and colours count."""
+    simulation = make_simulation(dx=0.2, scene={"points": "grid"}).to(device)
+    painter, scene = simulation.painter, simulation.scene
+    painter.shader = DiffuseShader([0.3, -0.6, 1.0]).to(device)
+    with torch.inference_mode():
+        state, kept = simulation.start(), []
+        for k in range(8):
+            if k == 3:
+                painter.camera = OrbitCamera(azimuth=70.0, width=8, height=8)
+            if k == 4:
+                painter.shader.ambient = 0.5
+            if k == 6:
+                state = simulation.edit(state, Edit(color=[1.0, 0.0, 0.0]))
+            camera = painter.camera_at(k)
+            found, expected = painter.deformed(state), scene.deformed(state)
+            for name in ("means", "covariances", "normals"):
+                torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+            if scene.model.view_dependent:
+                torch.testing.assert_close(found.rotations, expected.rotations)
+            colours = painter.colors(found, camera)
+            turned = (expected.rotations,) if scene.model.view_dependent else ()
+            torch.testing.assert_close(
+                colours, painter._colors(camera.position, expected.means, expected.normals, *turned)
+            )
+            kept.append((colours, colours.clone(), found.means, found.means.clone()))
+            state, _ = simulation.advance(state)
+    for colours, copy, means, its_copy in kept:  # later frames leave them alone
+        assert torch.equal(colours, copy)
+        assert torch.equal(means, its_copy)
+    assert not torch.equal(kept[0][2], kept[-1][2])
+    assert not torch.equal(kept[3][0], kept[4][0])
+    assert not torch.equal(kept[5][0], kept[6][0])
+    if device.type == "cuda":
+        assert painter._moved.recorded

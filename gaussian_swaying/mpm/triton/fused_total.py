@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying._graphs import RECORDED
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.forces import TWIN_VALUES
@@ -23,9 +24,6 @@ _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 
 # least number of pieces that `total` cuts its cells into: about the number of warps that an H200 holds
 _PROGRAMS = 2048
-
-RECORDED = 200_000
-"""Most particles whose fields at the end of a rollout are recorded in a CUDA graph, which keeps their memory."""
 
 # spilling registers is worth it, because more warps run at once
 _REGISTERS = {64: {"maxnreg": 128}}

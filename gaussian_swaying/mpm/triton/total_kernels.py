@@ -217,7 +217,7 @@ def total_nodes(
     mask = k < nodes
     node = tl.load(active + k, mask, 0)
     inverse = tl.load(inverse_mass + k, mask, 0.0)
-    o = tl.arange(0, 32)[:, None]  # all 27 at once: one after the other would wait 27 times for the memory
+    o = tl.arange(0, 32)[:, None]  # all 27 at once
     known = mask[None, :] & (o < 27)
     row = partial + (o * (cells + 1) + tl.load(source + o * nodes + k[None, :], known, cells)) * WIDTH
     f0 = tl.sum(tl.load(row, known, 0.0), 0)
