@@ -329,6 +329,19 @@ def test_the_number_of_lanes_suits_the_cells(monkeypatch):
     monkeypatch.undo()
     few, many = (fused_total._lanes(torch.full((100,), size)) for size in (3, 300))
     assert few < many
+    sizes = torch.tensor([4] * 4000 + [5] * 100)  # no program goes through its cells twice, if all run at once
+    assert fused_total._lanes(sizes) == 8
+    assert fused_total._lanes(sizes.repeat(10)) == 4
+
+
+def test_a_node_adds_only_the_cells_around_it(monkeypatch):
+    """A sheet one cell thick has at most nine cells around a node, and each of a node's rows is that of its place."""
+    if fused is None:
+        pytest.skip("needs triton, which is available on Linux only")
+    cell = torch.full((27, 2), 5)
+    cell[[3, 20], 0] = torch.tensor([4, 2])
+    cell[26, 1] = 0
+    assert fused_total._sources(cell, 5).tolist() == [[3 * 6 + 4, 26 * 6], [20 * 6 + 2, 5]]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

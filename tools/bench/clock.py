@@ -19,9 +19,10 @@ class Clock:
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self.marks: list[Any] = []
-        self._wait()
+        self.wait()
 
-    def _wait(self) -> None:
+    def wait(self) -> None:
+        """Wait until the device has done everything."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
@@ -36,7 +37,7 @@ class Clock:
 
     def read(self) -> list[float]:
         """Milliseconds between consecutive marks."""
-        self._wait()
+        self.wait()
         pairs = zip(self.marks, self.marks[1:], strict=False)
         return [a.elapsed_time(b) if self.device.type == "cuda" else 1e3 * (b - a) for a, b in pairs]
 

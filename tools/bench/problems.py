@@ -17,13 +17,13 @@ CUBE = GridSpec(0.01, (0, 0, 0), (100, 100, 100))
 """Grid of ``updated`` around the sheet."""
 
 
-def sheet(particles: int, device: torch.device) -> MaterialPoints:
-    """A square sheet of 0.9 m, level except for a ripple, within a cube of 1 m."""
+def sheet(particles: int, device: torch.device, width: float = 0.9) -> MaterialPoints:
+    """A square sheet, 0.9 m wide within a cube of 1 m, level except for a ripple."""
     side = round(particles**0.5)
-    axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) / side * 0.9 + 0.05
+    axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) / side * width + 0.05
     x, y = (g.reshape(-1) for g in torch.meshgrid(axis, axis, indexing="ij"))
     position = torch.stack([x, y, 0.5 + 0.003 * torch.sin(9 * x)], dim=-1)
-    area = (0.9 / side) ** 2
+    area = (width / side) ** 2
     return MaterialPoints.create(position, volume=area * 0.01, density=50.0, youngs_modulus=5e3, poisson_ratio=0.3)
 
 

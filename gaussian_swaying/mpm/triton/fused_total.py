@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import torch
+import triton
 from torch import Tensor
 
 from gaussian_swaying._graphs import RECORDED
@@ -67,7 +68,9 @@ class FusedTotal(Fused):
         _, ny, nz = grid.resolution
         shifts = [(i * ny + j) * nz + k for i in range(3) for j in range(3) for k in range(3)]
         below = [active - shift for shift in shifts]
-        self.source = torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below])
+        self.source = _sources(
+            torch.stack([torch.where(b >= 0, place[b.clamp(min=0)], self.cells) for b in below]), self.cells
+        )
         self.fields = torch.zeros(len(inverse), 8, device=self.device)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = _lanes(sizes)
@@ -194,10 +197,11 @@ class FusedTotal(Fused):
         block = 64
         nodes = len(self.active)
         kernels.total_nodes[(-(-nodes // block),)](
-            self.active, self.source, self.inverse_mass, self.held, nodes, self.cells, partial,
+            self.active, self.source, len(self.source), self.inverse_mass, self.held, nodes, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
-            HELD=self.plain and "nodes" in self.bound.kinds, MOVE=self.plain, BLOCK=block, num_warps=4,
+            HELD=self.plain and "nodes" in self.bound.kinds, MOVE=self.plain, BLOCK=block,
+            SOURCES=triton.next_power_of_2(len(self.source)), num_warps=4,
         )  # fmt: skip
         if self.points is not None:
             self._hold_points(self.points, offset)
@@ -306,8 +310,31 @@ def _padded(shape: torch.Size) -> int:
     return -(-shape.numel() // 4) * 4
 
 
+def _sources(cell: Tensor, cells: int) -> Tensor:
+    """Rows of the sums that each node adds, shape (most of a node, nodes).
+
+    A node of a sheet has far fewer than 27 cells with particles around it.
+
+    Args:
+        cell: The cell in each of the 27 places around each node, shape (27, nodes); ``cells`` where there is none.
+        cells: Number of cells.
+    """
+    none = cell == cells
+    most = int((~none).sum(0).amax())
+    first = none.byte().argsort(dim=0, stable=True)[:most]  # in the order of the places
+    return (first * (cells + 1) + cell.gather(0, first)).int()
+
+
 def _lanes(sizes: Tensor) -> int:
-    """Lanes per cell that give the least total work, with empty lanes included (one synchronisation)."""
-    lanes = list(_LANE_COST)
-    work = torch.stack([(-(-sizes // n)).sum() * n for n in lanes]).tolist()
+    """Lanes per cell (one synchronisation).
+
+    Those that give the least total work, with empty lanes included. A small body takes as long as its slowest program:
+    there, so many that no program has to go through its cells twice.
+    """
+    lanes, most = list(_LANE_COST), sizes.amax()[None]
+    work = torch.stack([(-(-sizes // n)).sum() * n for n in lanes])
+    *work, largest = torch.cat([work, most]).tolist()
+    for n in lanes:
+        if largest <= n and len(sizes) <= _PROGRAMS * max(1, 32 // n):
+            return n
     return min(zip(lanes, work, strict=True), key=lambda pair: pair[1] * _LANE_COST[pair[0]])[0]

@@ -1,9 +1,9 @@
 """Kernels of the ``total`` substep; the reference is :mod:`~gaussian_swaying.mpm.formulations.total`.
 
 Stencils do not move, so particles are sorted by cell once. A program handles some cells with up to ``LANES`` particles
-at a time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of its
-27 cells. Points that are held all the time are stopped by two more kernels. No atomics: the result is the same in every
-run.
+at a time, reads nodal displacements and velocities, and writes 27 sums per cell; each node then gathers the sums of the
+cells around it. Points that are held all the time are stopped by two more kernels. No atomics: the result is the same
+in every run.
 
 Rows of node arrays: displacement and velocity, each in four columns of eight, a sector of memory. The sums have four
 columns, or eight if boundaries need positions.
@@ -203,12 +203,15 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
 
 @triton.jit(do_not_specialize=VARIES)
 def total_nodes(
-    active, source, inverse_mass, held, nodes, cells, partial, fields, shift,
+    active, source, sources, inverse_mass, held, nodes, partial, fields, shift,
     schedule, first_step, step_offset, gravity_x, gravity_y, gravity_z, taken,
     IMPLICIT: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr, HELD: tl.constexpr, MOVE: tl.constexpr,
-    BLOCK: tl.constexpr,
+    BLOCK: tl.constexpr, SOURCES: tl.constexpr,
 ):  # fmt: skip
-    """``total``: nodal velocities and displacements from the sums of the cells around each node."""
+    """``total``: nodal velocities and displacements from the sums of the cells around each node.
+
+    ``source`` are the rows of ``partial`` that each node adds, of which no node has more than ``sources``.
+    """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     dt = tl.load(schedule + (step + 1) * 4 + 1)
@@ -217,9 +220,9 @@ def total_nodes(
     mask = k < nodes
     node = tl.load(active + k, mask, 0)
     inverse = tl.load(inverse_mass + k, mask, 0.0)
-    o = tl.arange(0, 32)[:, None]  # all 27 at once
-    known = mask[None, :] & (o < 27)
-    row = partial + (o * (cells + 1) + tl.load(source + o * nodes + k[None, :], known, cells)) * WIDTH
+    o = tl.arange(0, SOURCES)[:, None]  # all at once
+    known = mask[None, :] & (o < sources)
+    row = partial + tl.load(source + o * nodes + k[None, :], known, 0) * WIDTH
     f0 = tl.sum(tl.load(row, known, 0.0), 0)
     f1 = tl.sum(tl.load(row + 1, known, 0.0), 0)
     f2 = tl.sum(tl.load(row + 2, known, 0.0), 0)

@@ -187,7 +187,7 @@ def _torch_path(plan: Plan, solver: MPMSolver, state: MPMState, load: WindForce 
 
 
 def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device) -> Row:
-    """Flags in different winds: all in one rollout, compared with one rollout after another."""
+    """Flags in different winds: all in one rollout, one rollout after another, and one flag with as many particles."""
     steps = plan.steps[0]
     winds = [wind(k, gusts, device) for k in range(plan.scenes)]
     one = sheet(plan.side**2, device)
@@ -211,13 +211,18 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
     def in_turn() -> None:
         results["apart"] = [single.rollout(at_rest, DT, steps, own).position for own in loads]
 
+    wide = sheet(one.count * plan.scenes, device, 0.9 * plan.scenes**0.5)
+    large, large_at_rest = start(wide)
+    over_it = wind_load(wide, winds[0])
     row: Row = {"scenes": plan.scenes, "particles": one.count, "substeps": steps}
     row["together"] = timed(batched, device, plan.repeats[0], plan.warm)
+    row["large"] = timed(lambda: large.rollout(large_at_rest, DT, steps, over_it), device, plan.repeats[0], plan.warm)
     row["apart"] = timed(in_turn, device, plan.repeats[1], 2 if device.type == "cuda" else 1)
     done = plan.scenes * one.count * steps
-    for name in ("together", "apart"):
+    for name in ("together", "large", "apart"):
         row[f"{name}_per_s"] = done / (1e-3 * row[name]["median_ms"])
     row["ratio"] = row["together_per_s"] / row["apart_per_s"]
+    row["share"] = row["together_per_s"] / row["large_per_s"]
     apart = torch.stack(results["apart"])
     row["difference"] = float((results["together"] - apart).abs().amax() / (apart - one.position).abs().amax())
     return row
@@ -253,7 +258,8 @@ def bench_frame(plan: Plan, dx: float | None, device: torch.device, spacing: flo
             arguments += [f"--camera.init_args.{name}", str(size)]
     parser = Simulation.parser()
     peak = Peak(device)
-    simulation = Simulation.from_settings(parser, parser.parse_args(arguments))
+    with torch.inference_mode(False):  # as a user makes it: what inference tensors hold cannot be foreseen
+        simulation = Simulation.from_settings(parser, parser.parse_args(arguments))
     painter = simulation.painter
     state = simulation.start()
     build_memory = peak.read()

@@ -32,7 +32,9 @@ def whole(result: Row) -> list[str]:
     """Time and memory of whole runs, and the health of the material."""
     parts = ("simulation", "shading", "rendering", "writing")
     head = ["run", "particles", "frames", "substeps", *(f"{part} [s]" for part in parts)]
-    head += ["process [s]", "host memory [GiB]", "device memory [GiB]"]
+    compiled = any("process_compiling_s" in run for run in result["runs"])
+    head += ["process [s]", *(["with kernels to compile [s]"] if compiled else [])]
+    head += ["host memory [GiB]", "device memory [GiB]"]
     rows = [
         [
             run["name"],
@@ -41,6 +43,7 @@ def whole(result: Row) -> list[str]:
             f"{run['substeps']:,}",
             *(f"{run['wall_s'][part]:.1f}" for part in parts),
             f"{run['process_wall_s']:.1f}",
+            *([f"{run['process_compiling_s']:.1f}"] if compiled else []),
             *(gib(run["peak_memory_bytes"][where]) for where in ("host", "device")),
         ]
         for run in result["runs"]
@@ -50,6 +53,11 @@ def whole(result: Row) -> list[str]:
         f"[{run['stretch_min']:.2f}, {run['stretch_max']:.2f}], largest CFL number {run['largest_cfl']:.2f}, "
         f"largest mean displacement {run['displacement_mean_max_m']:.3f} m."
         for run in result["runs"]
+    ]
+    told += [
+        f"- {run['name']}: all frames simulated and drawn, without files, in {run['without_files_s']:.2f} s."
+        for run in result["runs"]
+        if "without_files_s" in run
     ]
     if "round_trip_psnr_db" in result:
         told.append(f"- PSNR of frame 0 compared with the captured splat: {result['round_trip_psnr_db']:.1f} dB.")

@@ -108,13 +108,15 @@ def cubes(result: Row) -> list[str]:
 def batches(result: Row) -> list[str]:
     """Many flags in one rollout, and one after another."""
     rows = result.get("batch", [])
-    head = ["flags", "together [ms]", "one after another [ms]", "together [10⁶ particle substeps/s]"]
-    head += ["one after another [10⁶/s]", "ratio", "largest difference in positions"]
+    head = ["flags", "together [ms]", "one after another [ms]", "one flag as large [ms]"]
+    head += ["together [10⁶ particle substeps/s]", "one after another [10⁶/s]", "ratio", "one as large [10⁶/s]"]
+    head += ["share of it [%]", "largest difference in positions"]
 
     def cells(row: Row) -> list[str]:
-        times = [_digits(row[name]["median_ms"]) for name in ("together", "apart")]
+        times = [_digits(row[name]["median_ms"]) if name in row else "-" for name in ("together", "apart", "large")]
         rates = [_digits(row[name] / 1e6) for name in ("together_per_s", "apart_per_s")]
-        return [*times, *rates, f"{row['ratio']:.1f}", f"{row['difference']:.1e}"]
+        large = [_digits(row["large_per_s"] / 1e6), f"{100 * row['share']:.0f}"] if "share" in row else ["-", "-"]
+        return [*times, *rates, f"{row['ratio']:.1f}", *large, f"{row['difference']:.1e}"]
 
     def label(row: Row) -> str:
         size = f"{row['scenes']} of {row['particles']:,} particles, " if "scenes" in row else ""

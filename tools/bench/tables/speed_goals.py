@@ -16,7 +16,7 @@ SUBSTEP_GOALS = {
 }
 SCALING_GOAL = (1.1, 1.0)
 SAND_GOAL = (1_000_000, (0.6, 0.4))
-BATCH_GOAL = 20.0
+BATCH_GOAL, SHARE_GOAL = 20.0, (90.0, 100.0)  # %
 FRAME_GOAL = (5.0, 3.5)
 SMALL_FRAME_GOAL = (2.0, 1.0)
 LARGE_FRAME_GOAL, LARGE_SUBSTEP_GOAL = (8.0, 5.0), (0.03, 0.02)
@@ -70,6 +70,11 @@ def goals(result: Row) -> list[Goal]:
                 found.append((text, "not measured" if row is None else row["failed"], row and False, "-", None))
             else:
                 found.append((text, f"{row['ratio']:.1f} times", row["ratio"] >= BATCH_GOAL, "-", None))
+                if "share" in row:
+                    share, text = 100 * row["share"], text.rsplit(": ", 1)[0]
+                    text += f": {SHARE_GOAL[0]:g} % of the throughput of one flag as large"
+                    reached, stretched = (share >= limit for limit in SHARE_GOAL)
+                    found.append((text, f"{share:.0f} %", reached, f"{SHARE_GOAL[1]:g} %", stretched))
     row = find("frame", main=True)
     what = "frame of a flag of 100,000 Gaussians at 1920x1080"
     found.append(goal(what, row, "median_ms", FRAME_GOAL, "ms"))
