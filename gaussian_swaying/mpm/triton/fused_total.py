@@ -332,8 +332,8 @@ def _lanes(sizes: Tensor) -> int:
     there, so many that no program has to go through its cells twice.
     """
     lanes, most = list(_LANE_COST), sizes.amax()[None]
-    work = torch.stack([(-(-sizes // n)).sum() * n for n in lanes])
-    *work, largest = torch.cat([work, most]).tolist()
+    costs = torch.stack([(-(-sizes // n)).sum() * n for n in lanes])
+    *work, largest = torch.cat([costs, most]).tolist()
     for n in lanes:
         if largest <= n and len(sizes) <= _PROGRAMS * max(1, 32 // n):
             return n
