@@ -182,15 +182,20 @@ class Simulation(nn.Module):
         self._text, self._changed, self._given = "", set(given), given
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Of the arguments, only ``wind``, ``aero`` and ``recorder`` can be assigned once a simulation is made."""
+        """Of the arguments, only these can be assigned later: ``wind``, ``aero``, ``frame_dt`` and ``recorder``."""
         if "_given" in self.__dict__ and name in (*self._given, *PYTHON_ONLY, "device"):
-            if name not in ("wind", "aero"):
+            if name not in ("wind", "aero", "frame_dt"):
                 raise AttributeError(
                     f"`{name}` is given when a simulation is made: make another Simulation. Between frames you can "
-                    "assign `wind` and `aero`, change the material with `edit`, and the pictures in `painter`."
+                    "assign `wind`, `aero` and `frame_dt`, change the material with `edit`, and the pictures in "
+                    "`painter`."
                 )
             check_types({name: value})
-            value = (as_wind(value) if name == "wind" else value or AeroForce()).to(self.device)
+            if name == "frame_dt":
+                check_positive(name, value)
+                value = float(value)
+            else:
+                value = (as_wind(value) if name == "wind" else value or AeroForce()).to(self.device)
             self._given[name] = value
             self._changed.add(name)
         super().__setattr__(name, value)

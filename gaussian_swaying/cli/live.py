@@ -1,0 +1,113 @@
+"""``gaussian-swaying live``: a page on which the wind can be changed while a scene moves."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gaussian_swaying import _program as program
+from gaussian_swaying._yaml_limits import check_config_files
+from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.simulation.defaults import resolve_device
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.scenes import settings_of_splat
+from gaussian_swaying.viewer.session import Session
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+
+def build_options() -> argparse.ArgumentParser:
+    """The parser of the options that are not those of ``gaussian-swaying sim``."""
+    parser = argparse.ArgumentParser(
+        prog=program.name("live"),
+        usage=f"{program.name('live')} [SCENE] [options]",
+        description="Open a page on which the wind can be changed while a scene moves. SCENE is a splat or a "
+        "configuration (.yaml); without it, a flag. Further options are those of `gaussian-swaying sim`, for example "
+        "--solver.dx 0.04.",
+    )
+    add = parser.add_argument
+    add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets other computers in (default: this one)")
+    add("--port", type=int, default=8080, help="port of the page; the next free one if it is taken")
+    add("--pixels", type=int, default=1920, help="most pixels of the longer side of a picture")
+    add("--no-browser", action="store_true", help="only print the address")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Serve the page until Ctrl-C.
+
+    Args:
+        arguments: Command line; that of the process if None.
+
+    Returns:
+        0 after Ctrl-C, 2 on bad input.
+    """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    return run_command(
+        lambda: _live(*split(arguments)),
+        memory="a smaller `scene.region`, a coarser `solver.dx` or fewer `--pixels`",
+        expected=(ImportError,),
+        arguments=arguments,
+    )
+
+
+def split(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """The options of this command, and those of ``gaussian-swaying sim``; the scene comes first."""
+    first = [] if not arguments or arguments[0].startswith("-") else [arguments[0]]
+    options, further = build_options().parse_known_args(arguments[len(first) :])
+    options.scene = first[0] if first else None
+    return options, further
+
+
+def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str]) -> Namespace:
+    """The settings of what is to be shown.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
+        further: Options of ``gaussian-swaying sim``.
+
+    Raises:
+        ValueError: If a file or an option is bad.
+    """
+    given = list(further)
+    if scene is not None and Path(scene).suffix.lower() not in (".yaml", ".yml"):
+        if any(option.split("=")[0] == "--config" for option in given):
+            raise ValueError("`SCENE` and `--config` both say what to show: give a splat with `--scene.ply`.")
+        with guessing(parser):
+            device = parser.parse_args([*given, "--scene.ply", scene]).device
+        settings = settings_of_splat(parser, scene, resolve_device(device), given)
+    else:
+        config = scene or (None if any(option.split("=")[0] == "--config" for option in given) else "flag")
+        arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
+        check_config_files(arguments)
+        with guessing(parser):
+            settings = parser.parse_args(arguments)
+    return settings
+
+
+def _live(options: argparse.Namespace, further: Sequence[str]) -> None:
+    parser = Simulation.parser()
+    session = Session(parser, settings_of(parser, options.scene, further))
+    page = Page(session, options.host, options.port, options.pixels)
+    session.start()
+    print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)
+    if not options.no_browser:
+        webbrowser.open(page.url)
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        print("Ended.")
+    finally:
+        page.close()
+        session.close()

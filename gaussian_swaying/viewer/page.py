@@ -1,0 +1,175 @@
+"""The page of a live wind tunnel: pictures drawn here, sent to every browser behind the camera of viser."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from gaussian_swaying.viewer.film_strip import FilmStrip
+from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw
+from gaussian_swaying.viewer.session import Session, Snapshot
+
+if TYPE_CHECKING:
+    import viser
+
+MOST_PER_SECOND = 30  # pictures for a browser
+JPEG_QUALITY = 75
+BACK = 1.35  # the first view is from farther away than that of the configuration, as the controls cover a part of it
+
+
+def make_server(host: str, port: int) -> viser.ViserServer:
+    """A viser server that opens no tunnel to the internet, whoever asks.
+
+    Args:
+        host: Address to listen on.
+        port: Port; the next free one if it is taken.
+
+    Raises:
+        ImportError: If viser is not installed.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise ImportError("The live page needs viser: install gaussian-swaying[viewer].") from None
+
+    class Server(viser.ViserServer):
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    return Server(host=host, port=port, label="Wind tunnel", verbose=False)
+
+
+class Page:
+    """Serves a session.
+
+    The simulation never waits for a browser. Each browser has a thread that draws the newest snapshot from its camera;
+    a slow one gets fewer pictures, as viser replaces a picture that is not sent yet.
+
+    Args:
+        session: The session.
+        host: Address to listen on.
+        port: Port; the next free one if it is taken.
+        largest: Most pixels of the longer side of a picture.
+
+    Attributes:
+        shown: What is drawn, one of :data:`.pictures.SHOWN`.
+        recording: The video that is being recorded, or None.
+    """
+
+    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, largest: int = 1920) -> None:
+        from gaussian_swaying.viewer.controls import Controls
+
+        self.session, self.largest = session, largest
+        self.shown = "colour"
+        self.recording: FilmStrip | None = None
+        self.recorder: int | None = None  # the browser from whose camera is recorded
+        self._closed = threading.Event()
+        self._gone: dict[int, threading.Event] = {}
+        self._drawn: dict[int, deque[float]] = {}
+        self._version = 0  # of what is drawn besides snapshot and camera
+        self.server = make_server(host, port)
+        self.server.gui.configure_theme(
+            control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
+        )
+        self.look_from_start()
+        self.controls = Controls(self)
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._disconnected)
+        self._health = threading.Thread(target=self._tell, name="health", daemon=True)
+        self._health.start()
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._closed.set()
+        self.server.stop()
+
+    def redraw(self) -> None:
+        """Draw again, as something else than the simulation has changed."""
+        self._version += 1
+
+    def look_from_start(self) -> None:
+        """Set where a browser looks from at first: from the camera of the configuration."""
+        simulation = self.session.simulation
+        camera = simulation.painter.camera_at(0)
+        scene = simulation.scene
+        up = scene.frame.rotation[2].tolist()
+        self.server.scene.set_up_direction(tuple(up))
+        first = self.server.initial_camera
+        away = camera.position.to(scene.center) - scene.center
+        first.position = tuple((scene.center + BACK * away).tolist())
+        first.look_at = tuple(scene.center.tolist())
+        first.up = tuple(up)
+        first.fov = float(2 * torch.atan(0.5 * camera.height / camera.intrinsics[1, 1]))
+        first.near = 0.001 * scene.size
+
+    def pictures_per_second(self) -> float:
+        """Pictures that the fastest browser gets."""
+        now = time.perf_counter()
+        return max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
+
+    # ---- browsers
+
+    def _connected(self, client: viser.ClientHandle) -> None:
+        gone = self._gone[client.client_id] = threading.Event()
+        self._drawn[client.client_id] = deque(maxlen=120)
+        name = f"pictures {client.client_id}"
+        threading.Thread(target=self._serve, args=(client, gone), name=name, daemon=True).start()
+
+    def _disconnected(self, client: viser.ClientHandle) -> None:
+        self._gone.pop(client.client_id, threading.Event()).set()
+        self._drawn.pop(client.client_id, None)
+        if self.recorder == client.client_id:
+            self.controls.stop_recording(None)
+
+    def _serve(self, client: viser.ClientHandle, gone: threading.Event) -> None:
+        """Draw for a browser until it is gone."""
+        size = PictureSize(largest=self.largest)
+        seen: tuple[Any, ...] = ()
+        number = -1
+        while not (gone.is_set() or self._closed.is_set()):
+            began = time.perf_counter()
+            snapshot = self.session.wait(number, 0.02)
+            camera = client.camera
+            now = (snapshot.number, self._version, self.shown, camera.update_timestamp)
+            if now == seen:
+                continue
+            seen, number = now, snapshot.number
+            try:
+                self._send(client, snapshot, size)
+            except Exception as error:  # one picture; the page goes on
+                self.session.problem = f"A picture could not be drawn: {' '.join(str(error).split())}"
+                gone.wait(0.5)
+            left = 1 / MOST_PER_SECOND - (time.perf_counter() - began)
+            if left > 0:
+                gone.wait(left)
+
+    def _send(self, client: viser.ClientHandle, snapshot: Snapshot, size: PictureSize) -> None:
+        pose, began = client.camera, time.perf_counter()
+        width, height = size.fit(pose.image_width, pose.image_height)
+        near = max(float(pose.near), 1e-6)
+        camera = camera_of(pose.wxyz.tolist(), pose.position.tolist(), float(pose.fov), width, height, near)
+        with self.session.lock:
+            waited = time.perf_counter()
+            picture = draw(snapshot, camera, self.shown, self.controls.force_end)
+        size.took(time.perf_counter() - waited)
+        client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
+        times = self._drawn.get(client.client_id)
+        if times is not None:
+            times.append(began)
+        if self.recording is not None and self.recorder == client.client_id:
+            self.recording.add(snapshot.health.time, np.ascontiguousarray(picture))
+
+    def _tell(self) -> None:
+        """Keep the figures in the corner up to date."""
+        while not self._closed.wait(0.4):
+            self.controls.tell()

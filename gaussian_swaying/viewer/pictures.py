@@ -1,0 +1,115 @@
+"""Pictures of a snapshot from the camera of a browser, as large as the machine can keep up with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.viewer.session import Snapshot
+
+SHOWN = ("colour", "normals", "wind force")
+LEAST = 96  # pixels of the shorter side
+SIZES = (1.0, 0.75, 0.5, 0.375, 0.25)
+
+
+def camera_of(
+    wxyz: Sequence[float], position: Sequence[float], fov: float, width: int, height: int, near: float = 0.01
+) -> Camera:
+    """A camera from its pose.
+
+    Args:
+        wxyz: Rotation from camera to scene, a quaternion; x to the right, y down, z forward.
+        position: Eye [scene units].
+        fov: Vertical field of view [rad].
+        width: Width of the picture [pixels].
+        height: Height of the picture [pixels].
+        near: Nearest depth that is drawn [scene units].
+    """
+    rotation = quat_to_rotation(torch.tensor(list(wxyz), dtype=torch.float64))
+    eye = torch.tensor(list(position), dtype=torch.float64)
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3], view[:3, 3] = rotation.mT, -rotation.mT @ eye
+    focal = 0.5 * height / math.tan(0.5 * fov)
+    intrinsics = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]).double()
+    return Camera(view, intrinsics, width, height, near)
+
+
+@torch.inference_mode()
+def draw(snapshot: Snapshot, camera: Camera, shown: str = "colour", force_end: float = 1.0) -> np.ndarray:
+    """The picture of a snapshot, uint8, shape (H, W, 3).
+
+    Args:
+        snapshot: What there is to see.
+        camera: From where.
+        shown: One of :data:`SHOWN`.
+        force_end: End of the colour scale of the wind force [Pa].
+    """
+    simulation, state = snapshot.simulation, snapshot.state
+    painter = simulation.painter
+    means = simulation.scene.model.means
+    camera = camera.to(means.device, means.dtype)
+    gaussians = painter.deformed(state)
+    if shown == "normals":
+        picture = painter.draw_normals(gaussians, camera, "world")
+    elif shown == "wind force":
+        picture = painter.draw_pressure(simulation.wind_pressure(state), gaussians, camera, force_end)
+    else:
+        picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera).color
+    return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+@torch.inference_mode()
+def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequence[float]) -> list[float] | None:
+    """The place of the first Gaussian that a ray meets [scene units]; None if it meets nothing that can be seen.
+
+    Args:
+        snapshot: What there is to see.
+        origin: Start of the ray [scene units].
+        direction: Its direction, of any length.
+    """
+    scene = snapshot.simulation.scene
+    means = snapshot.simulation.painter.deformed(snapshot.state).means.double()
+    start = torch.tensor(list(origin), dtype=torch.float64, device=means.device)
+    along = torch.nn.functional.normalize(torch.tensor(list(direction), dtype=torch.float64), dim=0).to(means)
+    depth = (means - start) @ along
+    beside = torch.linalg.vector_norm(means - start - depth[:, None] * along, dim=-1)
+    seen = (scene.model.opacity() > 0.2) & (depth > 0)
+    if not scene.all_move:
+        moves = torch.zeros_like(seen)
+        moves[scene.moving] = True
+        seen &= moves
+    near = seen & (beside < 0.02 * scene.size)
+    if not bool(near.any()):
+        return None
+    return [float(x) for x in means[depth.where(near, math.inf).argmin()]]
+
+
+class PictureSize:
+    """Chooses the size of pictures so that drawing one takes about as long as it may.
+
+    Args:
+        seconds: Time that a picture may take [s].
+        largest: Most pixels of the longer side.
+    """
+
+    def __init__(self, seconds: float = 0.08, largest: int = 1920) -> None:
+        self.seconds, self.largest, self._level = seconds, largest, 0
+
+    def fit(self, width: int, height: int) -> tuple[int, int]:
+        """Size for a window of these pixels; the same shape, and even."""
+        width, height = max(width, 1), max(height, 1)
+        scale = SIZES[self._level] * min(1.0, self.largest / max(width, height))
+        scale = max(scale, min(1.0, LEAST / min(width, height)))
+        return max(2 * round(width * scale / 2), 2), max(2 * round(height * scale / 2), 2)
+
+    def took(self, seconds: float) -> None:
+        """Tell how long a picture took."""
+        if seconds > 1.3 * self.seconds and self._level < len(SIZES) - 1:
+            self._level += 1
+        elif seconds < 0.3 * self.seconds and self._level > 0:
+            self._level -= 1

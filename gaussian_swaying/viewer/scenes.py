@@ -1,0 +1,54 @@
+"""What the live page shows: the settings of a splat that has no configuration."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.simulation.preview.calibration import calibrated_suggestion
+from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.simulation.preview.suggest import suggest
+from gaussian_swaying.simulation.simulation import Simulation
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+
+SWAY = 0.25
+"""How far a splat without a configuration sways, as the preview's default: a share of its longest side."""
+
+
+def settings_of_splat(
+    parser: ArgumentParser, path: str | os.PathLike[str], device: torch.device, further: Sequence[str] = ()
+) -> Namespace:
+    """The settings that the preview suggests for a splat: its draft on a CPU, its starter on a GPU.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        path: The splat.
+        device: Where it will be simulated.
+        further: Options that replace what is suggested.
+
+    Raises:
+        ValueError: If the file is not a splat, or nothing in it can move.
+        FileNotFoundError: If there is no such file.
+    """
+    file = Path(path).resolve()
+    found = suggest(read_gaussians(file), quality="draft" if device.type == "cpu" else "normal")
+    draft = _parsed(parser, draft_yaml(found, str(file)), device)
+    found = calibrated_suggestion(found, Simulation.from_settings(parser, draft), SWAY)
+    text = draft_yaml(found, str(file)) if device.type == "cpu" else starter_yaml(found, str(file))
+    return _parsed(parser, text, device, further)
+
+
+def _parsed(parser: ArgumentParser, text: str, device: torch.device, further: Sequence[str] = ()) -> Namespace:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "starter.yaml"
+        path.write_text(text, encoding="utf-8")
+        return parser.parse_args(["--config", str(path), "--device", device.type, *further])

@@ -1,0 +1,318 @@
+"""A simulation that goes on in a thread of its own, and can be changed while it does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.simulation.config import config_text
+from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, diagnose
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.changes import carry_over, changed_settings, take
+from gaussian_swaying.viewer.pull import Pull
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+SLOW, FAST = 0.12, 0.03  # s: steps that take longer are halved, and shorter ones doubled again
+SHORTEST = 16  # a step is at least this part of `frame_dt`
+WINDOW = 2.0  # s, over which rates are averaged
+BEHIND = 0.25  # s that a session may be late before it stops trying to catch up
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """What there is to see at a moment.
+
+    Attributes:
+        simulation: The simulation.
+        state: Its state.
+        health: Measurements at the end of the last step.
+        number: Counts the snapshots of a session.
+    """
+
+    simulation: Simulation
+    state: MPMState
+    health: FrameDiagnostics
+    number: int
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How fast a session runs.
+
+    Attributes:
+        steps: Steps per second.
+        real_time: Simulated seconds per second.
+        step: Length of a step [s].
+        substeps: Substeps of the last step.
+    """
+
+    steps: float
+    real_time: float
+    step: float
+    substeps: int
+
+
+class Session:
+    """Runs a simulation in a thread; every method may be called from any thread, and none waits for a step.
+
+    A step is one frame of the configuration, or a part of it where the machine needs longer. What would diverge, and
+    values that cannot be, are told in :attr:`problem`; the session then waits for :meth:`reset`, or keeps what it had.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        settings: What it parsed.
+        simulation: The simulation of these settings, if it is made already.
+
+    Attributes:
+        settings: The settings as they are now; :meth:`yaml` writes them down.
+        problem: One sentence on what went wrong last, or None.
+        speed: Simulated seconds per second that are wanted; 1 is real time.
+        lock: Held while the simulation is changed; whoever draws holds it, too.
+    """
+
+    def __init__(self, parser: ArgumentParser, settings: Namespace, simulation: Simulation | None = None) -> None:
+        self.parser, self.settings = parser, settings
+        self.problem: str | None = None
+        self.speed, self.paused = 1.0, False
+        self.lock = threading.RLock()
+        self._wake = threading.Condition()
+        self._asked: list[Callable[[], None]] = []
+        self._changes: dict[str, Any] = {}
+        self._single, self._closed, self._broken = False, False, False
+        self._steps: deque[tuple[float, float]] = deque()  # when, and simulated time, of the last steps
+        self._anchor: tuple[float, float] | None = None
+        self._pull: Pull | None = None
+        self._number = 0
+        self.simulation = simulation or Simulation.from_settings(parser, settings)
+        self._begin(self.simulation.start())
+        self._thread = threading.Thread(target=self._loop, name="simulation", daemon=True)
+
+    # ---- from any thread
+
+    def start(self) -> Session:
+        """Start the thread; returns the session."""
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """End the thread; returns when it has ended."""
+        with self._wake:
+            self._closed = True
+            self._wake.notify_all()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def change(self, values: Mapping[str, Any]) -> None:
+        """Change fields of the configuration, for example ``{"wind.flow": [4, 0, 0], "material.E": 2e4}``.
+
+        What can be changed in motion is; for the rest the simulation is made anew, see :func:`.changes.take`.
+        """
+        with self._wake:
+            self._changes.update(values)
+            self._wake.notify_all()
+
+    def load(self, settings: Namespace) -> None:
+        """Go on with another scene, from rest."""
+        self._ask(lambda: self._take_settings(settings))
+
+    def reset(self) -> None:
+        """Go back to rest."""
+        self._ask(lambda: self._begin(self.simulation.start()))
+
+    def pause(self, paused: bool = True) -> None:
+        """Pause, or go on."""
+        with self._wake:
+            self.paused = paused
+            self._wake.notify_all()
+
+    def step(self) -> None:
+        """Make one step, if paused."""
+        with self._wake:
+            self._single = True
+            self._wake.notify_all()
+
+    def grab(self, place: Sequence[float]) -> None:
+        """Take hold of the material around a place; :meth:`drag` pulls it, until :meth:`let_go`.
+
+        Args:
+            place: Place in the scene now [scene units].
+        """
+        self._ask(lambda: self._grab(place))
+
+    def drag(self, place: Sequence[float]) -> None:
+        """Pull what was grabbed towards a place [scene units]."""
+        self._ask(lambda: None if self._pull is None else self._pull.aim(place))
+
+    def let_go(self) -> None:
+        """Let go of what was grabbed."""
+        self._ask(self._let_go)
+
+    @property
+    def pulls(self) -> bool:
+        """Whether something is held."""
+        return self._pull is not None
+
+    @property
+    def broken(self) -> bool:
+        """Whether the simulation diverged, and waits for a reset."""
+        return self._broken
+
+    def wait(self, number: int, seconds: float) -> Snapshot:
+        """The newest snapshot; waits up to some seconds for another one than number ``number``."""
+        with self._wake:
+            self._wake.wait_for(lambda: self.snapshot.number != number or self._closed, seconds)
+        return self.snapshot
+
+    def yaml(self) -> str:
+        """The configuration as it is now; ``gaussian-swaying sim --config`` starts from it."""
+        return config_text(self.parser, self.settings)
+
+    def rates(self) -> Rates:
+        """How fast it runs."""
+        steps, now = list(self._steps), time.perf_counter()
+        steps = [step for step in steps if now - step[0] < WINDOW]
+        health, simulation = self.snapshot.health, self.simulation
+        if len(steps) < 2:
+            return Rates(0.0, 0.0, simulation.frame_dt, health.substeps)
+        took = max(now - steps[0][0], 1e-6)
+        passed = steps[-1][1] - steps[0][1]
+        return Rates((len(steps) - 1) / took, passed / took, simulation.frame_dt, health.substeps)
+
+    # ---- in the thread
+
+    def _ask(self, what: Callable[[], None]) -> None:
+        with self._wake:
+            self._asked.append(what)
+            self._wake.notify_all()
+
+    def _loop(self) -> None:
+        while True:
+            with self._wake:
+                while not (self._closed or self._asked or self._changes or self._single or self._runs()):
+                    self._wake.wait()
+                if self._closed:
+                    return
+                asked, self._asked = self._asked, []
+                changes, self._changes = self._changes, {}
+                single, self._single = self._single and not self._broken, False
+            for what in asked:
+                self._safely(what)
+            if changes:
+                self._safely(partial(self._change, changes))
+            if single or self._runs():
+                self._advance(single)
+
+    def _runs(self) -> bool:
+        return not self.paused and not self._broken
+
+    def _safely(self, what: Callable[[], None]) -> None:
+        """Do what was asked; if it is not possible, keep what there was and say why."""
+        try:
+            with self.lock:
+                what()
+        except Exception as error:
+            self.problem = _sentence(error)
+
+    def _advance(self, single: bool) -> None:
+        """One step, then wait until its time has come."""
+        simulation, began = self.simulation, time.perf_counter()
+        try:
+            with torch.inference_mode():
+                state, health = simulation.advance(self.snapshot.state)
+        except SimulationDiverged as error:
+            self._broken, self.problem = True, str(error)
+            return
+        except Exception as error:  # out of memory, a kernel that fails: the page goes on
+            self._broken, self.problem = True, _sentence(error)
+            return
+        self._publish(state, health)
+        took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)
+        if took > SLOW and simulation.frame_dt > 1.01 * wanted / SHORTEST:
+            simulation.frame_dt = simulation.frame_dt / 2
+        elif took < FAST and simulation.frame_dt < 0.99 * wanted:
+            simulation.frame_dt = min(2 * simulation.frame_dt, wanted)
+        self._steps.append((time.perf_counter(), health.time))
+        while self._steps and self._steps[-1][0] - self._steps[0][0] > WINDOW:
+            self._steps.popleft()
+        if not single:
+            self._pace(health.time)
+
+    def _pace(self, simulated: float) -> None:
+        """Wait while the simulation is ahead of the wanted speed."""
+        now = time.perf_counter()
+        if self._anchor is None:
+            self._anchor = (now, simulated)
+        due = self._anchor[0] + (simulated - self._anchor[1]) / self.speed
+        if due < now - BEHIND:
+            self._anchor = (now, simulated)
+        elif due > now:
+            with self._wake:
+                self._wake.wait_for(lambda: bool(self._closed or self._asked or self._changes), due - now)
+
+    def pace(self, speed: float) -> None:
+        """Set the wanted speed, in simulated seconds per second."""
+        with self._wake:
+            self.speed, self._anchor = max(float(speed), 1e-3), None
+
+    def _publish(self, state: MPMState, health: FrameDiagnostics) -> None:
+        self._number += 1
+        self.snapshot = Snapshot(self.simulation, state, health, self._number)
+        with self._wake:
+            self._wake.notify_all()
+
+    def _begin(self, state: MPMState) -> None:
+        """Go on from a state at rest."""
+        self._let_go()
+        self._broken, self.problem, self._anchor = False, None, None
+        self._steps.clear()
+        self._publish(state, diagnose(self.simulation.solver, state, 0, 0.0))
+
+    def _change(self, values: Mapping[str, Any]) -> None:
+        """Change the settings, and the simulation with them."""
+        settings = changed_settings(self.parser, self.settings, values)
+        if not self._broken:
+            self.problem = None
+        state = take(self.simulation, self.snapshot.state, self.parser, settings, list(values))
+        if state is None:
+            self._take_settings(settings)
+        else:
+            self.settings = settings
+            self._publish(state, self.snapshot.health)
+
+    def _take_settings(self, settings: Namespace) -> None:
+        """Make the simulation anew; it goes on from where it is if its grid stays the same."""
+        simulation = Simulation.from_settings(self.parser, settings)
+        start = simulation.start()
+        state = None if self._broken else carry_over(self.simulation, self.snapshot.state, simulation, start)
+        self.simulation, self.settings = simulation, settings
+        if state is None:
+            self._begin(start)
+        else:
+            self._let_go()
+            self._publish(state, self.snapshot.health)
+
+    def _grab(self, place: Sequence[float]) -> None:
+        self._let_go()
+        self._pull = Pull.at(self.simulation.scene, self.snapshot.state, place)
+        self.simulation.custom_forces.append(self._pull)
+
+    def _let_go(self) -> None:
+        if self._pull is not None:
+            kept = [force for force in self.simulation.custom_forces if force is not self._pull]
+            self.simulation.custom_forces = torch.nn.ModuleList(kept)
+            self._pull = None
+
+
+def _sentence(error: BaseException) -> str:
+    """An error in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
