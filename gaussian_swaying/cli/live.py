@@ -85,6 +85,7 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
             raise ValueError("`SCENE` and `--config` both say what to show: give a splat with `--scene.ply`.")
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
+        print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
         settings = settings_of_splat(parser, scene, resolve_device(device), given)
     else:
         config = scene or (None if any(option.split("=")[0] == "--config" for option in given) else "flag")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import yaml
 
+from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.simulation import Simulation
@@ -92,7 +93,7 @@ def take(
 
 
 def carry_over(old: Simulation, state: MPMState, new: Simulation, start: MPMState) -> MPMState | None:
-    """The state of a simulation as one of another with the same nodes, such as the same one with other pins.
+    """The motion of a simulation as a state of another with the same nodes, such as the same one with other pins.
 
     Args:
         old: The simulation.
@@ -101,11 +102,14 @@ def carry_over(old: Simulation, state: MPMState, new: Simulation, start: MPMStat
         start: Its state at rest.
 
     Returns:
-        The state; None if the nodes or the points are not the same.
+        The state; None if the formulation is not ``total``, or if a node has mass that had none, as it did not move.
     """
-    same = old.solver.neighbours_fixed and new.solver.neighbours_fixed and state.grid == start.grid
-    if not same or state.position.shape != start.position.shape:
+    before, after = old.solver.bound, new.solver.bound
+    if not (isinstance(before, Total) and isinstance(after, Total)) or state.grid != start.grid:
         return None
-    if not torch.equal(old.scene.points.position, new.scene.points.position):
+    if bool(((after.node_inverse_mass > 0) & (before.node_inverse_mass == 0)).any()):
         return None
-    return state.replace(impulse=start.impulse, internal=start.internal)
+    assert state.node_displacement is not None
+    assert state.node_velocity is not None
+    moved = start.replace(time=state.time, substep=state.substep, work=state.work)
+    return after.read_particles(moved, state.node_displacement, state.node_velocity)

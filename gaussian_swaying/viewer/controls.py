@@ -218,9 +218,9 @@ class Controls:
     def _anchor(self) -> np.ndarray:
         """Where the arrow of the wind ends: just above the object."""
         scene = self.session.simulation.scene
-        height = scene.frame.rotation[2].abs() @ (scene.bounds[1] - scene.bounds[0]).to(scene.frame.rotation)
-        above = (0.5 * height + 0.12 * scene.size) * scene.frame.rotation[2]
-        return (scene.center + above).cpu().numpy()
+        low, high = (corner.double() for corner in scene.bounds)
+        up = scene.frame.rotation[2].to(low)
+        return (0.5 * (low + high) + (0.5 * up.abs() @ (high - low) + 0.12 * scene.size) * up).cpu().numpy()
 
     def _draw_arrow(self, flow: list[float]) -> None:
         """An arrow that ends above the object, as long as the wind is fast; its tail can be dragged."""
@@ -330,11 +330,11 @@ class Controls:
             self.session.problem = str(error)
             return
         if client is not None:
-            client.send_file_download("wind.mp4", content)
+            client.send_file_download("wind.mp4", content, save_immediately=True)
 
     def _save(self, event: viser.GuiEvent) -> None:
         if event.client is not None:
-            event.client.send_file_download("live.yaml", self.session.yaml().encode())
+            event.client.send_file_download("live.yaml", self.session.yaml().encode(), save_immediately=True)
 
     def _load(self) -> None:
         file = self.load.value

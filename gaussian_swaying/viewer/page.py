@@ -105,9 +105,10 @@ class Page:
         up = scene.frame.rotation[2].tolist()
         self.server.scene.set_up_direction(tuple(up))
         first = self.server.initial_camera
-        away = camera.position.to(scene.center) - scene.center
-        first.position = tuple((scene.center + BACK * away).tolist())
-        first.look_at = tuple(scene.center.tolist())
+        eye, forward = camera.position.double(), camera.world_to_camera[2, :3].double()
+        distance = float((scene.center.to(eye) - eye).norm())
+        first.position = tuple((eye - (BACK - 1) * distance * forward).tolist())
+        first.look_at = tuple((eye + distance * forward).tolist())
         first.up = tuple(up)
         first.fov = float(2 * torch.atan(0.5 * camera.height / camera.intrinsics[1, 1]))
         first.near = 0.001 * scene.size
@@ -133,14 +134,14 @@ class Page:
 
     def _serve(self, client: viser.ClientHandle, gone: threading.Event) -> None:
         """Draw for a browser until it is gone."""
-        size = PictureSize(largest=self.largest)
+        size = PictureSize(largest=self.largest, level=2 if self.session.simulation.device.type == "cpu" else 0)
         seen: tuple[Any, ...] = ()
         number = -1
         while not (gone.is_set() or self._closed.is_set()):
             began = time.perf_counter()
             snapshot = self.session.wait(number, 0.02)
             camera = client.camera
-            now = (snapshot.number, self._version, self.shown, camera.update_timestamp)
+            now = (snapshot.number, self._version, self.shown, self.session.paused, camera.update_timestamp)
             if now == seen:
                 continue
             seen, number = now, snapshot.number
@@ -155,13 +156,15 @@ class Page:
 
     def _send(self, client: viser.ClientHandle, snapshot: Snapshot, size: PictureSize) -> None:
         pose, began = client.camera, time.perf_counter()
-        width, height = size.fit(pose.image_width, pose.image_height)
+        still = self.session.paused or self.session.broken
+        width, height = size.fit(pose.image_width, pose.image_height, still)
         near = max(float(pose.near), 1e-6)
         camera = camera_of(pose.wxyz.tolist(), pose.position.tolist(), float(pose.fov), width, height, near)
         with self.session.lock:
             waited = time.perf_counter()
             picture = draw(snapshot, camera, self.shown, self.controls.force_end)
-        size.took(time.perf_counter() - waited)
+        if not still:
+            size.took(time.perf_counter() - waited)
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
         times = self._drawn.get(client.client_id)
         if times is not None:

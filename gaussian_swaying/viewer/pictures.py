@@ -95,21 +95,23 @@ class PictureSize:
     Args:
         seconds: Time that a picture may take [s].
         largest: Most pixels of the longer side.
+        level: Where it starts in :data:`SIZES`.
     """
 
-    def __init__(self, seconds: float = 0.08, largest: int = 1920) -> None:
-        self.seconds, self.largest, self._level = seconds, largest, 0
+    def __init__(self, seconds: float = 0.08, largest: int = 1920, level: int = 0) -> None:
+        self.seconds, self.largest, self._level = seconds, largest, level
 
-    def fit(self, width: int, height: int) -> tuple[int, int]:
-        """Size for a window of these pixels; the same shape, and even."""
+    def fit(self, width: int, height: int, still: bool = False) -> tuple[int, int]:
+        """Size for a window of these pixels; the same shape, and even. If nothing moves, as large as it may be."""
         width, height = max(width, 1), max(height, 1)
-        scale = SIZES[self._level] * min(1.0, self.largest / max(width, height))
+        scale = (1.0 if still else SIZES[self._level]) * min(1.0, self.largest / max(width, height))
         scale = max(scale, min(1.0, LEAST / min(width, height)))
         return max(2 * round(width * scale / 2), 2), max(2 * round(height * scale / 2), 2)
 
     def took(self, seconds: float) -> None:
         """Tell how long a picture took."""
-        if seconds > 1.3 * self.seconds and self._level < len(SIZES) - 1:
+        while seconds > 1.3 * self.seconds and self._level < len(SIZES) - 1:
+            seconds *= (SIZES[self._level + 1] / SIZES[self._level]) ** 2  # about as many pixels as it takes time
             self._level += 1
-        elif seconds < 0.3 * self.seconds and self._level > 0:
+        if seconds < 0.3 * self.seconds and self._level > 0:
             self._level -= 1

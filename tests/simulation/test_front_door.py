@@ -389,10 +389,26 @@ def test_a_coefficient_changed_in_place_is_felt():
     assert float((state.position - simulation.scene.points.position).abs().max()) > 1e-3
 
 
-@pytest.mark.parametrize("name", ["camera", "material", "frame_dt", "solver", "scene", "forces", "hold", "device"])
+@pytest.mark.parametrize("name", ["camera", "material", "solver", "scene", "forces", "hold", "device"])
 def test_what_cannot_be_assigned_says_so(name):
     with pytest.raises(AttributeError, match=rf"`{name}` is given when a simulation is made"):
         setattr(_flag(), name, None)
+
+
+def test_the_length_of_a_frame_can_be_assigned():
+    """Two frames of half the length end where one does, to the order of the substep."""
+    simulation = _flag()
+    (_, frame) = simulation.frames(2)
+    end = frame.state.position
+    frames = simulation.frames(3)
+    next(frames)
+    simulation.frame_dt = 0.5 * simulation.frame_dt
+    *_, last = frames
+    assert last.time == pytest.approx(frame.time)
+    rest = simulation.scene.points.position
+    assert (last.state.position - end).norm() < 0.05 * (end - rest).norm()
+    with pytest.raises(ValueError, match="`frame_dt`"):
+        simulation.frame_dt = 0.0
 
 
 def test_wind_is_assigned_as_it_is_given():

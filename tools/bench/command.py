@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import pages, record, show
-from bench.cases import accuracy, flags, gallery, gradients, pareto, pins, points, previews, runs, speed, training
+from bench.cases import accuracy, flags, gallery, gradients, live, pareto, pins, points, previews, runs, speed, training
 from bench.slots import SlotError
 
 
@@ -55,6 +55,7 @@ COMMANDS = {
     "speed": Command("Measure rollouts of many sizes, sand, batches and frames, with memory and error.",
                      speed.run, speed.add_arguments),
     "sim": Command("Measure whole runs: the default flag and a captured object.", runs.sim, runs.add_arguments),
+    "live": Command("Measure the pictures a second of the live page.", live.live, live.add_arguments, page="live.md"),
     "accuracy": Command("Measure errors against exact solutions and experiments.",
                         accuracy.run, accuracy.add_arguments, page="validation.md"),
     "pareto": Command("Measure speed against error over the settings of the solver.",

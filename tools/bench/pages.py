@@ -14,6 +14,7 @@ from bench.tables import (
     flags,
     goals,
     gradients,
+    live,
     long_flag,
     pareto,
     pareto_plot,
@@ -28,7 +29,22 @@ from bench.tables import (
 )
 from gaussian_swaying._files import write_text
 
-TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, peers, pins, points, previews, runs, speed, training)
+TABLES = (
+    accuracy,
+    flags,
+    goals,
+    gradients,
+    live,
+    long_flag,
+    pareto,
+    peers,
+    pins,
+    points,
+    previews,
+    runs,
+    speed,
+    training,
+)
 """The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {

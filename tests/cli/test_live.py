@@ -1,0 +1,94 @@
+"""``gaussian-swaying live``: what it shows, and its life from the command line."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+
+import pytest
+import torch
+
+from gaussian_swaying.cli import live
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.simulation import Simulation
+
+
+@pytest.fixture(scope="module")
+def parser():
+    return Simulation.parser()
+
+
+def test_the_scene_comes_first_and_the_rest_is_for_the_simulation():
+    options, further = live.split(["my.ply", "--port", "9000", "--device", "cpu", "--no-browser"])
+    assert (options.scene, options.port, options.no_browser) == ("my.ply", 9000, True)
+    assert further == ["--device", "cpu"]
+    options, further = live.split(["--solver.dx", "0.1"])
+    assert options.scene is None
+    assert options.host == "127.0.0.1"
+    assert further == ["--solver.dx", "0.1"]
+
+
+def test_without_a_scene_it_is_the_flag(parser):
+    settings = live.settings_of(parser, None, ["--solver.dx=0.2", "--device=cpu"])
+    assert settings.scene.generator.class_path.endswith("FlagScene")
+    assert settings.solver.dx == 0.2
+
+
+def test_a_configuration_and_a_shipped_one(parser, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("scene: {generator: {class_path: FlagScene}}\nsolver: {dx: 0.3}\n")
+    assert live.settings_of(parser, str(file), []).solver.dx == 0.3
+    assert live.settings_of(parser, None, ["--config", str(file), "--solver.dx=0.4"]).solver.dx == 0.4
+    with pytest.raises(ValueError, match="`SCENE` and `--config`"):
+        live.settings_of(parser, "my.ply", ["--config", str(file)])
+
+
+def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
+    path = tmp_path / "flag.ply"
+    write_ply(path, FlagScene(spacing=0.05).generate())
+    settings = live.settings_of(parser, str(path), ["--device=cpu", "--wind.flow=[1,2,3]"])
+    assert settings.scene.ply == str(path)
+    assert settings.wind.flow == [1, 2, 3]
+    simulation = Simulation.from_settings(parser, settings)
+    frames = list(simulation.frames(2))
+    assert torch.isfinite(frames[-1].state.position).all()
+
+
+def test_bad_input_is_one_sentence(capsys, tmp_path):
+    pytest.importorskip("viser")
+    assert live.main([str(tmp_path / "none.ply"), "--device=cpu", "--no-browser"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert "none.ply" in error
+    assert len(error.strip().splitlines()) == 1
+    assert live.main(["--solver.dxx=3", "--no-browser"]) == 2
+    assert "dxx" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_it_cleanly(tmp_path):
+    pytest.importorskip("viser")
+    code = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "live", "--no-browser", "--port=8500", "--device=cpu", "--solver.dx=0.1"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+    )
+    try:
+        told = ""
+        assert process.stdout is not None
+        while "The wind blows at" not in told:
+            line = process.stdout.readline()
+            assert line, told
+            told += line
+        address = told.split("The wind blows at ")[1].split()[0]
+        assert urllib.request.urlopen(address, timeout=20).status == 200
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=30)
+        assert process.returncode == 0, rest
+        assert "Traceback" not in rest
+        assert "Ended." in rest
+    finally:
+        process.kill()

@@ -1,0 +1,154 @@
+"""The live page, in a real browser where there is one."""
+
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+import yaml
+
+from gaussian_swaying.viewer.session import Session
+
+pytest.importorskip("viser", reason="needs the extra [viewer]")
+from gaussian_swaying.viewer.page import Page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+
+@pytest.fixture
+def page(parser, settings):
+    """A page with a small flag, and its session, which runs."""
+    session = Session(parser, settings)
+    made = Page(session, port=8400, largest=320)
+    session.start()
+    yield made
+    made.close()
+    session.close()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium, so the page is not tried in a browser")
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def window(browser, page):
+    """A browser window with the page, and the errors that it logs."""
+    context = browser.new_context(viewport={"width": 1100, "height": 900}, accept_downloads=True)
+    opened = context.new_page()
+    opened.problems = []
+    opened.on("pageerror", lambda error: opened.problems.append(str(error)))
+    opened.goto(page.url)
+    opened.get_by_text("pictures a second").wait_for(timeout=30_000)
+    yield opened
+    context.close()
+
+
+def _seen(window):
+    """The part of the window beside the controls."""
+    return window.screenshot(clip={"x": 350, "y": 150, "width": 380, "height": 600})
+
+
+def test_it_listens_on_this_computer_only_and_serves_no_files(page):
+    assert page.url.startswith("http://127.0.0.1:")
+    assert urllib.request.urlopen(page.url, timeout=10).status == 200
+    for path in ("/../../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%2fpage.py"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(page.url + path, timeout=10)
+    assert page.server.request_share_url() is None  # no tunnel, whoever asks
+
+
+def test_closing_ends_all_threads(parser, settings):
+    before = set(threading.enumerate())
+    session = Session(parser, settings)
+    page = Page(session, port=8450)
+    session.start()
+    page.close()
+    session.close()
+    end = time.monotonic() + 10
+    names = ("health", "simulation")
+    while any(t.name in names for t in set(threading.enumerate()) - before):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_the_page_moves_pauses_and_steps(page, window, until):
+    session = page.session
+    first = _seen(window)
+    until(lambda: session.snapshot.health.time > 0.2)
+    until(lambda: _seen(window) != first)
+    window.get_by_role("button", name="Pause").click()
+    until(lambda: session.paused)
+    time.sleep(1.0)
+    still = _seen(window)
+    time.sleep(0.7)
+    assert _seen(window) == still
+    window.get_by_role("button", name="Step").click()
+    until(lambda: _seen(window) != still)
+    assert window.problems == []
+
+
+def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
+    session = page.session
+    before = session.simulation.wind.flows.clone()
+    field = window.get_by_text("Speed [m/s]").locator("xpath=ancestor::*[.//input][1]").locator("input").last
+    field.fill("12")
+    field.press("Enter")
+    until(lambda: session.simulation.wind.flows.norm() > 11.9)
+    flows = session.simulation.wind.flows
+    assert flows / flows.norm() == pytest.approx((before / before.norm()).numpy(), abs=0.02)  # the same direction
+    session.change({"wind.flow": [1e7, 0.0, 0.0]})
+    window.get_by_text("to start again").wait_for(timeout=20_000)
+    session.change({"wind.flow": [2.0, 0.0, 0.0]})
+    window.get_by_role("button", name="Reset").click()
+    until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
+
+
+def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
+    iio = pytest.importorskip("imageio.v3")
+    window.get_by_role("button", name="Record a video").click()
+    until(lambda: page.recording is not None and page.recording.seconds > 0.3)
+    with window.expect_download(timeout=30_000) as download:
+        window.get_by_role("button", name="Stop recording").click()
+    video = tmp_path / "wind.mp4"
+    download.value.save_as(video)
+    frames = iio.imread(video)
+    assert len(frames) > 7
+    assert abs(frames[0].astype(int) - frames[-1].astype(int)).max() > 20  # it moves
+    with window.expect_download(timeout=30_000) as download:
+        window.get_by_role("button", name="Save the configuration").click()
+    file = tmp_path / "live.yaml"
+    download.value.save_as(file)
+    assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
+
+
+def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
+    second = browser.new_context(viewport={"width": 500, "height": 700})
+    other = second.new_page()
+    other.goto(page.url)
+    until(lambda: len(page.server.get_clients()) == 2, 40)
+    until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 40)
+    second.close()
+    until(lambda: len(page.server.get_clients()) == 1)
+    number = page.session.snapshot.number
+    until(lambda: page.session.snapshot.number > number + 3)
+    assert page.session.problem is None

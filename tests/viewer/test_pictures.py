@@ -1,0 +1,87 @@
+"""Pictures from the camera of a browser, picking, and their size."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.geometry.rotations import rotation_to_quat
+from gaussian_swaying.viewer.controls import from_angles, to_angles
+from gaussian_swaying.viewer.film_strip import FilmStrip
+from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, under_cursor
+
+
+def _pose(session):
+    """The camera of the configuration as a browser tells it."""
+    camera = session.simulation.painter.camera_at(0)
+    rotation = camera.world_to_camera[:3, :3].double().mT
+    fov = 2 * math.atan(0.5 * camera.height / float(camera.intrinsics[1, 1]))
+    return rotation_to_quat(rotation).tolist(), camera.position.tolist(), fov, camera
+
+
+def test_the_picture_is_that_of_the_simulation(session):
+    wxyz, eye, fov, camera = _pose(session)
+    picture = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height))
+    with torch.inference_mode():
+        wanted = session.simulation.painter.render(session.snapshot.state, 0).color
+    assert picture.dtype == np.uint8
+    difference = np.abs(picture.astype(float) - 255 * wanted.clamp(0, 1).numpy())
+    assert difference.max() < 2.0  # one half by rounding, and the camera in float32
+
+
+@pytest.mark.parametrize("shown", SHOWN)
+def test_everything_that_can_be_shown_is_different(session, shown):
+    wxyz, eye, fov, _ = _pose(session)
+    camera = camera_of(wxyz, eye, fov, 64, 36)
+    picture = draw(session.snapshot, camera, shown)
+    assert picture.shape == (36, 64, 3)
+    others = [draw(session.snapshot, camera, other) for other in SHOWN if other != shown]
+    assert all(np.abs(picture.astype(int) - other.astype(int)).max() > 30 for other in others)
+
+
+def test_the_cursor_finds_what_is_under_it(session):
+    place = under_cursor(session.snapshot, [0.6, -3.0, 0.4], [0.0, 1.0, 0.0])
+    assert place == pytest.approx([0.6, 0.0, 0.4], abs=0.04)
+    assert under_cursor(session.snapshot, [0.6, -3.0, 3.0], [0.0, 1.0, 0.0]) is None
+    assert under_cursor(session.snapshot, [0.6, -3.0, 0.4], [0.0, -1.0, 0.0]) is None  # behind the eye
+
+
+def test_pictures_get_smaller_where_they_take_long():
+    size = PictureSize(seconds=0.1, largest=1000)
+    assert size.fit(2000, 1000) == (1000, 500)
+    size.took(0.2)  # twice as long as it may: the next smaller ones have about half as many pixels
+    assert size.fit(2000, 1000) == (750, 376)
+    size.took(0.5)
+    size.took(5.0)
+    assert size.fit(2000, 1000) == (250, 124)
+    assert size.fit(300, 200) == (144, 96)  # not too small to be read
+    assert size.fit(2000, 1000, still=True) == (1000, 500)
+    for _ in range(10):
+        size.took(0.01)
+    assert size.fit(400, 300) == (400, 300)
+
+
+@pytest.mark.parametrize("flow", [[3.0, 4.0, 0.0], [0.0, -2.0, 1.0], [0.0, 0.0, 5.0], [0.0, 0.0, 0.0]])
+def test_angles_of_the_wind(flow):
+    assert from_angles(*to_angles(flow)) == pytest.approx(flow, abs=1e-9)
+
+
+def test_a_film_is_as_long_as_the_simulated_time():
+    """At 0.01 s a picture, and with a gap, and after going back to rest."""
+    iio = pytest.importorskip("imageio.v3")
+    film = FilmStrip()
+    times = [1.0 + 0.01 * k for k in range(50)] + [2.0] + [0.0, 0.2]
+    for k, time in enumerate(times):
+        film.add(time, np.full((32, 48, 3), 4 * k, dtype=np.uint8))
+    film.add(0.3, np.zeros((16, 48, 3), dtype=np.uint8))  # another size is left out
+    assert film.seconds == pytest.approx(1.2, abs=0.09)
+    content = film.finish()
+    frames = iio.imread(content, extension=".mp4")
+    assert len(frames) == round(film.seconds * 25)
+    assert frames[0].mean() < frames[10].mean() < frames[-1].mean()
+
+
+def test_a_film_without_pictures_is_refused():
+    with pytest.raises(ValueError, match="Nothing was recorded"):
+        FilmStrip().finish()

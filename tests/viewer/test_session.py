@@ -1,0 +1,190 @@
+"""A simulation that goes on in a thread, and is changed there."""
+
+import threading
+import time
+
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.session import Session
+
+
+def _position(session):
+    return session.snapshot.state.position
+
+
+def test_it_goes_on_pauses_and_steps(session, until):
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.1)
+    session.pause()
+    time.sleep(0.3)
+    now = session.snapshot
+    time.sleep(0.3)
+    assert session.snapshot is now
+    session.step()
+    until(lambda: session.snapshot is not now)
+    time.sleep(0.2)
+    assert session.snapshot.number == now.number + 1
+    session.pause(False)
+    until(lambda: session.snapshot.number > now.number + 2)
+    assert session.problem is None
+
+
+def test_reset_goes_back_to_rest(session, until):
+    rest = _position(session).clone()
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.1)
+    assert not torch.equal(_position(session), rest)
+    session.pause()
+    session.reset()
+    until(lambda: session.snapshot.health.time == 0)
+    assert torch.equal(_position(session), rest)
+
+
+def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, until):
+    """Not paced or shortened, a session computes the frames of the simulation, bit for bit."""
+    session.pause()
+    session.start()
+    session.simulation.frame_dt = settings.frame_dt
+    for _ in range(3):
+        number = session.snapshot.number
+        session.step()
+        until(lambda number=number: session.snapshot.number > number)
+        session.simulation.frame_dt = settings.frame_dt
+    frames = list(Simulation.from_settings(parser, settings).frames(4))
+    assert torch.equal(_position(session), frames[-1].state.position)
+
+
+@pytest.mark.parametrize(
+    ("values", "found"),
+    [
+        ({"wind.flow": [0.0, 3.0, 0.0]}, lambda s: s.wind.flows.tolist() == [[0, 3, 0]]),
+        ({"wind.modulations": []}, lambda s: len(s.wind.modulations) == 0),
+        ({"aero.C_D": 0.7}, lambda s: float(s.aero.C_D) == pytest.approx(0.7)),
+        ({"material.E": 2e4}, lambda s: float(s.scene.points.youngs_modulus.amax()) == pytest.approx(2e4)),
+        ({"solver.gravity": [0.0, 0.0, -1.0]}, lambda s: s.solver.gravity == (0, 0, -1)),
+        ({"solver.damping": 2.5}, lambda s: s.solver.damping == 2.5),
+        ({"shader": None}, lambda s: s.painter.shader is None),
+        ({"background": [0.0, 0.5, 0.0]}, lambda s: s.painter.background.tolist() == [0, 0.5, 0]),
+    ],
+)
+def test_what_changes_in_motion(session, until, values, found):
+    """The simulation stays the same object, and the state goes on."""
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.05)
+    simulation, time_before = session.simulation, session.snapshot.health.time
+    session.change(values)
+    until(lambda: found(session.simulation))
+    until(lambda: session.snapshot.health.time > time_before)
+    assert session.simulation is simulation
+    assert session.problem is None
+
+
+def test_gravity_that_was_changed_acts(session, until):
+    """Without wind, and with gravity upwards, the flag rises."""
+    session.change({"wind.flow": [0.0, 0.0, 0.0], "wind.modulations": [], "solver.gravity": [0.0, 0.0, 9.8]})
+    session.start()
+    rest = _position(session)[:, 2].mean()
+    until(lambda: session.snapshot.health.time > 0.3)
+    assert _position(session)[:, 2].mean() > rest + 0.05
+
+
+def test_another_grid_starts_anew_and_the_same_grid_goes_on(session, until):
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.1)
+    session.change({"solver.dx": 0.15})
+    until(lambda: session.simulation.solver.dx == 0.15)
+    assert session.snapshot.health.time < 0.1
+    until(lambda: session.snapshot.health.time > 0.1)
+    before, simulation = session.snapshot.health.time, session.simulation
+    session.change({"solver.boundaries": []})  # let go
+    until(lambda: session.simulation is not simulation)
+    assert session.snapshot.health.time >= before
+    low = _position(session)[:, 2].mean()
+    until(lambda: _position(session)[:, 2].mean() < low - 0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"material.E": -1.0}, "`material.E`|`edits.E`"),
+        ({"solver.dx": 0.0}, "`dx`"),
+        ({"wind.speeds": 3}, "speeds"),
+        ({"wind.flow": "fast"}, "flow"),
+    ],
+)
+def test_what_cannot_be_is_told_and_changes_nothing(session, until, values, message):
+    session.start()
+    before = session.yaml()
+    session.change(values)
+    until(lambda: session.problem is not None)
+    assert any(part.strip("`") in session.problem for part in message.split("|"))
+    assert "\n" not in session.problem
+    assert session.yaml() == before
+    number = session.snapshot.number
+    until(lambda: session.snapshot.number > number)  # it goes on
+
+
+def test_what_diverges_is_told_and_reset_heals_it(session, until):
+    session.start()
+    session.change({"wind.flow": [1e7, 0.0, 0.0]})
+    until(lambda: session.broken)
+    assert "wind" in session.problem
+    number = session.snapshot.number
+    time.sleep(0.2)
+    assert session.snapshot.number == number
+    session.change({"wind.flow": [1.0, 0.0, 0.0]})
+    session.reset()
+    until(lambda: session.snapshot.health.time > 0.1)
+    assert not session.broken
+    assert session.problem is None
+
+
+def test_the_saved_configuration_is_that_of_the_session(parser, session, until, tmp_path):
+    session.change({"wind.flow": [1.0, 2.0, 0.5], "material.E": 1.2e4, "solver.damping": 0.5})
+    session.start()
+    until(lambda: session.settings.solver.damping == 0.5)
+    file = tmp_path / "live.yaml"
+    file.write_text(session.yaml())
+    again = Simulation.from_yaml(file, device="cpu")
+    assert again.wind.flows.tolist() == [[1, 2, 0.5]]
+    assert float(again.scene.points.youngs_modulus.amax()) == pytest.approx(1.2e4)
+    assert again.solver.damping == 0.5
+    assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
+
+
+def test_a_pull_moves_what_it_holds_and_lets_go(session, until):
+    session.change({"wind.flow": [0.0, 0.0, 0.0], "wind.modulations": [], "solver.gravity": [0.0, 0.0, 0.0]})
+    session.start()
+    session.grab([1.2, 0.0, 0.4])
+    until(lambda: session.pulls)
+    session.drag([1.2, 0.3, 0.4])
+    corner = session.snapshot.state.position[:, 0].argmax()
+    until(lambda: _position(session)[corner, 1] > 0.2)
+    session.let_go()
+    until(lambda: not session.pulls)
+    assert len(session.simulation.custom_forces) == 0
+
+
+def test_slow_motion_is_slower(session, until):
+    session.pace(0.2)
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.25)
+    assert 0.1 < session.rates().real_time < 0.35
+    assert session.rates().steps > 0
+
+
+def test_close_ends_the_thread(session):
+    session.start()
+    session.close()
+    assert all(thread.name != "simulation" for thread in threading.enumerate())
+
+
+def test_steps_get_shorter_where_they_take_long(parser, settings, until, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.viewer.session.SLOW", 0.0)
+    session = Session(parser, settings).start()
+    until(lambda: session.simulation.frame_dt < 0.01)
+    session.close()
+    assert session.simulation.frame_dt >= settings.frame_dt / 16
