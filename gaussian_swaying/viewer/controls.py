@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import yaml
 
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.pictures import SHOWN, under_cursor
 from gaussian_swaying.viewer.scenes import settings_of_splat
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from gaussian_swaying.viewer.page import Page
 
 MOST_SPEED = 30.0  # m/s
-LARGEST_UPLOAD = 1 << 30  # bytes
 ARROW = 0.06  # length of the arrow of a wind of 1 m/s, in longest sides
 GRIDS = {"coarse": 1.5, "normal": 1.0, "fine": 0.7}
 
@@ -119,11 +119,13 @@ class Controls:
         self.shading = gui.add_checkbox("Shading", self.session.simulation.painter.shader is not None)
         self.arrow = gui.add_checkbox("Arrow of the wind", True)
         self.box = gui.add_checkbox("Box of the grid", False)
+        self.pins = gui.add_checkbox("What is held", False, hint="Points that pins and handles hold, at rest")
         self.shown.on_update(lambda _: self._show())
         self.light.on_update(lambda _: self._shade())
         self.shading.on_update(lambda _: self._shade())
         self.arrow.on_update(lambda _: self.draw_handles())
         self.box.on_update(lambda _: self.draw_handles())
+        self.pins.on_update(lambda _: self.draw_handles())
 
     def _files(self) -> None:
         gui = self.server.gui
@@ -214,6 +216,19 @@ class Controls:
         corners = torch.tensor(low + size * np.array(CORNERS), dtype=torch.float64)
         lines = scene.frame.point_to_scene(corners).cpu().numpy()[np.array(EDGES)]
         server.add_line_segments("/grid", lines, (120, 120, 120), thickness=1.5, visible=self.box.value)
+
+        server.add_point_cloud(
+            "/held", self._held(), (220, 120, 40), point_size=0.008 * scene.size, visible=self.pins.value
+        )
+
+    def _held(self) -> np.ndarray:
+        """Places at rest of the material points that pins and handles hold [scene units], shape (N, 3)."""
+        scene, body = self.session.simulation.scene, self.session.simulation.solver.bound.body
+        held = torch.zeros(scene.points.count, dtype=torch.bool, device=scene.points.position.device)
+        for boundary in body.boundaries:
+            if isinstance(boundary, PinnedRegion):
+                held |= boundary.particle_mask(scene.points.position)
+        return scene.frame.point_to_scene(scene.points.position[held].double()).cpu().numpy()
 
     def _anchor(self) -> np.ndarray:
         """Where the arrow of the wind ends: just above the object."""
@@ -338,10 +353,6 @@ class Controls:
 
     def _load(self) -> None:
         file = self.load.value
-        if len(file.content) > LARGEST_UPLOAD:
-            most = f"{LARGEST_UPLOAD >> 20:,} MiB"
-            self.session.problem = f"The file is larger than {most}: give it on the command line instead."
-            return
         threading.Thread(target=self._look_at, args=(file.content,), name="load", daemon=True).start()
 
     def _look_at(self, content: bytes) -> None:

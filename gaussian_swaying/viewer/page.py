@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import threading
 import time
+import warnings
 from collections import deque
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
 
 MOST_PER_SECOND = 30  # pictures for a browser
 JPEG_QUALITY = 75
+LARGEST_UPLOAD = 1 << 30  # bytes
 BACK = 1.35  # the first view is from farther away than that of the configuration, as the controls cover a part of it
 
 
@@ -41,7 +46,41 @@ def make_server(host: str, port: int) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    return Server(host=host, port=port, label="Wind tunnel", verbose=False)
+    # a picture may be drawn while its browser goes away
+    warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+    with redirect_stdout(io.StringIO()):  # its banner; the address is told by the caller
+        return Server(host=host, port=port, label="Wind tunnel", verbose=False)
+
+
+def limit_uploads(server: viser.ViserServer, most: int, refused: Callable[[], None]) -> None:
+    """Drop uploads that are too large before they fill the memory.
+
+    Args:
+        server: The server.
+        most: Largest file [bytes].
+        refused: Called for each file that is dropped.
+    """
+    from viser._messages import FileTransferPart, FileTransferStartUpload
+
+    gui, socket = server.gui, server._websock_server
+    start, part = gui._handle_file_transfer_start, gui._handle_file_transfer_part
+
+    def check_start(client: Any, message: Any) -> None:
+        if message.size_bytes > most:
+            refused()
+        else:
+            start(client, message)
+
+    def check_part(client: Any, message: Any) -> Any:
+        state = gui._current_file_upload_states.get(message.transfer_uuid)
+        if state is not None and state["transferred_bytes"] + len(message.content) > most:  # more than was announced
+            gui._current_file_upload_states.pop(message.transfer_uuid, None)
+            refused()
+        return part(client, message)
+
+    for kind, ours in ((FileTransferStartUpload, check_start), (FileTransferPart, check_part)):
+        socket.unregister_handler(kind)
+        socket.register_handler(kind, ours)
 
 
 class Page:
@@ -73,6 +112,7 @@ class Page:
         self._drawn: dict[int, deque[float]] = {}
         self._version = 0  # of what is drawn besides snapshot and camera
         self.server = make_server(host, port)
+        limit_uploads(self.server, LARGEST_UPLOAD, self._refuse_upload)
         self.server.gui.configure_theme(
             control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
         )
@@ -117,6 +157,10 @@ class Page:
         """Pictures that the fastest browser gets."""
         now = time.perf_counter()
         return max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
+
+    def _refuse_upload(self) -> None:
+        most = f"{LARGEST_UPLOAD >> 20:,} MiB"
+        self.session.problem = f"The file is larger than {most}: give it on the command line instead."
 
     # ---- browsers
 

@@ -9,6 +9,8 @@ import urllib.request
 import pytest
 import yaml
 
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
@@ -75,6 +77,35 @@ def test_it_listens_on_this_computer_only_and_serves_no_files(page):
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(page.url + path, timeout=10)
     assert page.server.request_share_url() is None  # no tunnel, whoever asks
+
+
+def test_large_uploads_are_dropped_before_they_arrive(page):
+    from viser._messages import FileTransferPart, FileTransferStartUpload
+
+    gui, handlers = page.server.gui, page.server._websock_server._incoming_handlers
+    button = page.controls.load._impl.uuid
+
+    def announce(size, name):
+        message = FileTransferStartUpload(button, name, "../../x.ply", "", 2, size)
+        handlers[FileTransferStartUpload][0](0, message)
+
+    announce((1 << 30) + 1, "large")
+    assert "1,024 MiB" in page.session.problem
+    assert "large" not in gui._current_file_upload_states
+    page.session.problem = None
+    announce(100, "small")
+    state = gui._current_file_upload_states["small"]
+    assert page.session.problem is None
+    state["transferred_bytes"] = 1 << 30  # more than was announced
+    handlers[FileTransferPart][0](0, FileTransferPart(button, "small", 1, b"more"))
+    assert "small" not in gui._current_file_upload_states
+    assert "1,024 MiB" in page.session.problem
+
+
+def test_what_is_held_is_shown(page):
+    held = page.controls._held()
+    assert len(held) > 5
+    assert abs(held[:, 0]).max() < 0.03  # the pole
 
 
 def test_closing_ends_all_threads(parser, settings):
@@ -152,3 +183,27 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     number = page.session.snapshot.number
     until(lambda: page.session.snapshot.number > number + 3)
     assert page.session.problem is None
+
+
+def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
+    path = tmp_path / "../flag.ply"
+    write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
+    before = page.session.simulation
+    window.locator("input[type=file]").first.set_input_files(path)
+    until(lambda: page.session.simulation is not before, 60)
+    until(lambda: page.session.snapshot.health.time > 0.05, 30)
+    assert len(page.session.simulation.scene.model.means) == 144
+    assert window.problems == []
+    (tmp_path / "text.ply").write_text("not a splat")
+    window.locator("input[type=file]").first.set_input_files(tmp_path / "text.ply")
+    until(lambda: page.session.problem is not None and "Looking" not in page.session.problem, 30)
+    assert page.session.simulation.scene.source is not None  # the scene stays
+
+
+def test_a_click_takes_hold_of_the_flag(page, window, until):
+    time.sleep(1.0)
+    window.mouse.click(520, 480)
+    until(lambda: page.session.pulls)
+    assert page.controls._handle is not None
+    window.get_by_role("button", name="Let go of it").click()
+    until(lambda: not page.session.pulls)
