@@ -8,7 +8,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -219,4 +219,5 @@ class Page:
     def _tell(self) -> None:
         """Keep the figures in the corner up to date."""
         while not self._closed.wait(0.4):
-            self.controls.tell()
+            with suppress(Exception):  # the figures of a moment, while a scene is replaced
+                self.controls.tell()

@@ -207,3 +207,37 @@ def test_a_click_takes_hold_of_the_flag(page, window, until):
     assert page.controls._handle is not None
     window.get_by_role("button", name="Let go of it").click()
     until(lambda: not page.session.pulls)
+
+
+def _connect(page, size):
+    """A client that says where it looks from, with as few frames read ahead as possible."""
+    connect = pytest.importorskip("websockets.sync.client").connect
+    msgspec = pytest.importorskip("msgspec")
+    viser = pytest.importorskip("viser")
+    address = page.url.replace("http", "ws")
+    socket = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, max_queue=1)
+    pose = {"wxyz": [0.7071, -0.7071, 0, 0], "position": [0.6, -2, 0.4], "look_at": [0.6, 0, 0.4], "fov": 0.8}
+    pose |= {"up_direction": [0, 0, 1], "near": 0.01, "far": 100.0, "image_height": size, "image_width": 2 * size}
+    socket.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage"} | pose))
+    return socket
+
+
+def test_a_client_that_reads_slowly_slows_nobody(page, until):
+    """One does not read at all, another reads everything; nothing piles up for the first."""
+    page.largest = 1000
+    slow, quick = _connect(page, 500), _connect(page, 100)
+    until(lambda: len(page.server.get_clients()) == 2)
+    number = page.session.snapshot.number
+    received, end = 0, time.monotonic() + 5
+    while time.monotonic() < end:
+        received += len(quick.recv(timeout=5)) > 500
+    assert received > 5
+    assert page.session.snapshot.number > number + 5
+    buffers = [state.message_buffer for state in page.server._websock_server._client_state_from_id.values()]
+    assert len(buffers) == 2
+    assert all(len(buffer.message_from_id) < 30 for buffer in buffers)
+    quick.close()
+    slow.socket.close()  # without a word
+    until(lambda: len(page.server.get_clients()) == 0, 60)
+    number = page.session.snapshot.number
+    until(lambda: page.session.snapshot.number > number + 2)

@@ -1,63 +1,103 @@
-"""What ``bench.py live`` measures: how many pictures a second the live page can draw, and how fast its time passes."""
+"""What ``bench.py live`` measures: pictures that a client of the live page receives, and how soon a control shows."""
 
 from __future__ import annotations
 
 import argparse
+import io
 import statistics
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bench import record
+from bench.page_client import PageClient
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.page import MOST_PER_SECOND
-from gaussian_swaying.viewer.pictures import camera_of, draw
+from gaussian_swaying.viewer.page import Page
 from gaussian_swaying.viewer.session import Session
 
 Row = dict[str, Any]
-SIZE = (640, 360)
-WARM = 6.0  # s until steps have found their length
+SIZES = {"cpu": (640, 360), "cuda": (1920, 1080)}
+WARM = 8.0  # s until steps and pictures have found their size
+CHANGES = 7  # of the background, for the latency
+PATIENCE = 10.0  # s
 
 
-def rates(name: str, arguments: list[str], device: str, seconds: float) -> Row:
-    """A session, and a thread that draws its newest snapshot as a browser's does, without a browser."""
-    from gaussian_swaying.geometry.rotations import rotation_to_quat
-
+def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
+    """A page, and one client on the same machine."""
     parser = Simulation.parser()
     session = Session(parser, parser.parse_args([*arguments, "--device", device]))
-    given = session.simulation.painter.camera_at(0)
-    wxyz = rotation_to_quat(given.world_to_camera[:3, :3].double().mT).tolist()
-    camera = camera_of(wxyz, given.position.tolist(), 0.7, *SIZE)
+    page = Page(session, port=8700, largest=max(SIZES[device]))
+    first = page.server.initial_camera
+    wxyz = camera_rotation(first.position, first.look_at, session.simulation.scene.frame.rotation[2].tolist())
     session.start()
-    number, drawn, each, factors = -1, 0, [], []
-    begin = time.perf_counter()
-    while (now := time.perf_counter()) < begin + WARM + seconds:
-        snapshot = session.wait(number, 0.02)
-        if snapshot.number == number:
-            continue
-        number = snapshot.number
-        with session.lock:
-            draw(snapshot, camera)
-        if now > begin + WARM:
-            drawn += 1
-            each.append(time.perf_counter() - now)
-            factors.append(session.rates().real_time)
-        time.sleep(max(0.0, 1 / MOST_PER_SECOND - (time.perf_counter() - now)))
+    width, height = SIZES[device]
+    eye, target = ([float(x) for x in place] for place in (first.position, first.look_at))
+    client = PageClient(page.server.get_port(), width, height, wxyz, eye, target)
+    for _ in client.pictures(WARM):
+        pass
+    received = [(at, len(jpeg), size_of(jpeg)) for at, jpeg in client.pictures(seconds)]
+    rates = session.rates()
+    waited = [latency(session, client, k) for k in range(CHANGES)]
+    client.close()
+    page.close()
     session.close()
     scene = session.simulation.scene
     return {
         "name": name,
         "gaussians": len(scene.model.means),
         "points": scene.points.count,
-        "width": SIZE[0],
-        "height": SIZE[1],
+        "window": [width, height],
         "seconds": seconds,
-        "pictures_per_s": drawn / seconds,
-        "picture_ms": 1e3 * statistics.median(each) if each else None,
-        "real_time": statistics.median(factors) if factors else None,
-        "step_s": session.simulation.frame_dt,
+        "pictures_per_s": len(received) / seconds,
+        "picture_bytes": statistics.median(size for _, size, _ in received) if received else None,
+        "picture": statistics.mode(shape for *_, shape in received) if received else None,
+        "latency_ms": statistics.median(waited),
+        "real_time": rates.real_time,
+        "step_s": rates.step,
         "problem": session.problem,
     }
+
+
+def latency(session: Session, client: PageClient, k: int) -> float:
+    """Milliseconds from a change of the background to the first picture that shows it."""
+    wanted = [1.0, 0.0, 0.0] if k % 2 == 0 else [0.0, 0.0, 1.0]
+    begin = time.perf_counter()
+    session.change({"background": wanted})
+    for at, jpeg in client.pictures(PATIENCE):
+        corner = pixels_of(jpeg)[:4, :4].astype(float).mean((0, 1))
+        if np.abs(corner - 255 * np.array(wanted)).max() < 40:
+            return 1e3 * (at - begin)
+    return float("nan")
+
+
+def camera_rotation(eye: Any, target: Any, up: list[float]) -> list[float]:
+    """Quaternion of a camera that looks from an eye at a target."""
+    import torch
+
+    from gaussian_swaying.geometry.rotations import rotation_to_quat
+
+    forward = np.array(target, dtype=float) - np.array(eye, dtype=float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    return [float(x) for x in rotation_to_quat(torch.tensor(rotation))]
+
+
+def pixels_of(jpeg: bytes) -> np.ndarray:
+    """The pixels of a picture, uint8 (H, W, 3)."""
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"))
+
+
+def size_of(jpeg: bytes) -> str:
+    """Width and height of a picture."""
+    from PIL import Image
+
+    return "x".join(map(str, Image.open(io.BytesIO(jpeg)).size))
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -67,12 +107,15 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def live(options: argparse.Namespace) -> None:
-    """Measure the default flag, and a captured object."""
+    """Measure the default flag, on a GPU one of 100,000 Gaussians too, and a captured object."""
     device, result = record.start(options.device)
     configs = record.ROOT / "configs" / "sim"
     scenes = [("flag", ["--config", str(configs / "flag.yaml")])]
+    if device.type == "cuda":
+        large = ["--solver.dx=0.0125", "--scene.generator.init_args.spacing=0.0031"]
+        scenes.append(("large flag", [*scenes[0][1], *large]))
     if options.ply:
         hanging = ["--config", str(configs / "hanging_object.yaml"), "--scene.ply", options.ply]
         scenes.append((Path(options.ply).stem, hanging))
-    result["rows"] = [rates(name, arguments, device.type, options.seconds) for name, arguments in scenes]
+    result["rows"] = [watch(name, arguments, device.type, options.seconds) for name, arguments in scenes]
     record.write(Path(options.results), f"live_{device.type}", result)
