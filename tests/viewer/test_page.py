@@ -154,6 +154,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
+@pytest.mark.slow
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
@@ -172,6 +173,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
 
 
+@pytest.mark.slow
 def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
@@ -185,6 +187,7 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     assert page.session.problem is None
 
 
+@pytest.mark.slow
 def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     path = tmp_path / "../flag.ply"
     write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
