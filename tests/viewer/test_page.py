@@ -244,3 +244,19 @@ def test_a_client_that_reads_slowly_slows_nobody(page, until):
     until(lambda: len(page.server.get_clients()) == 0, 60)
     number = page.session.snapshot.number
     until(lambda: page.session.snapshot.number > number + 2)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_memory_does_not_grow_in_ten_minutes(page):
+    """Measured after a minute, when everything has been used once."""
+    resource = pytest.importorskip("resource")
+    socket, begin, sizes = _connect(page, 200), time.monotonic(), []
+    while time.monotonic() - begin < 600:
+        socket.recv(timeout=10)
+        if time.monotonic() - begin > 60 * (len(sizes) + 1):
+            with open("/proc/self/statm") as file:
+                sizes.append(int(file.read().split()[1]) * resource.getpagesize() / 2**20)
+    socket.close()
+    assert page.session.problem is None
+    assert max(sizes[5:]) < max(sizes[:3]) + 20, sizes  # MiB

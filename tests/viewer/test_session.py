@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.pictures import draw
 from gaussian_swaying.viewer.session import Session
 
 
@@ -188,3 +189,48 @@ def test_steps_get_shorter_where_they_take_long(parser, settings, until, monkeyp
     until(lambda: session.simulation.frame_dt < 0.01)
     session.close()
     assert session.simulation.frame_dt >= settings.frame_dt / 16
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings, until):
+    """Graphs are recorded and replayed in the thread of the session while others draw."""
+    settings.device = "cuda"
+    session = Session(parser, settings).start()
+    camera = session.simulation.painter.camera_at(0)
+    pictures, stop = [], threading.Event()
+
+    def watch():
+        number = -1
+        while not stop.is_set():
+            snapshot = session.wait(number, 0.05)
+            number = snapshot.number
+            with session.lock:
+                pictures.append(draw(snapshot, camera))
+
+    watchers = [threading.Thread(target=watch) for _ in range(2)]
+    for watcher in watchers:
+        watcher.start()
+    try:
+        until(lambda: session.snapshot.health.time > 0.5, 100)
+        for values in (
+            {"wind.flow": [0.0, 5.0, 0.0]},
+            {"material.E": 2e4},
+            {"solver.damping": 1.0},
+            {"solver.dx": 0.15},
+        ):
+            before = session.snapshot.number
+            session.change(values)
+            until(lambda before=before: session.snapshot.number > before + 15, 100)
+        session.grab([1.0, 0.0, 0.4])
+        before = session.snapshot.number
+        until(lambda: session.snapshot.number > before + 15, 100)
+        session.let_go()
+    finally:
+        stop.set()
+        for watcher in watchers:
+            watcher.join()
+        session.close()
+    assert session.problem is None
+    assert len(pictures) > 50
+    assert abs(pictures[0].astype(int) - pictures[-1].astype(int)).max() > 30
+    assert torch.isfinite(session.snapshot.state.position).all()
