@@ -51,7 +51,7 @@ def take(
     """Change a simulation between two steps.
 
     Wind, aerodynamic coefficients, stiffness, density, gravity, damping, shading, background and length of a frame
-    change in motion.
+    change in motion; the material only if it is the same everywhere.
 
     Args:
         simulation: The simulation.
@@ -71,6 +71,8 @@ def take(
     motion = [name.split(".")[1] for name in names if name.startswith("solver.")]
     known = {"wind", "aero", "shader", "background", "frame_dt", "material", "solver"}
     if not (heads <= known and set(material) <= set(MATERIAL) and set(motion) <= set(MOTION)):
+        return None
+    if material and (settings.material.regions or settings.edits):  # each part has its own
         return None
     parts = parser.instantiate(settings)
     device, painter = simulation.device, simulation.painter

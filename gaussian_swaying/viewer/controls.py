@@ -40,8 +40,12 @@ class Controls:
         self.force_end = page.session.simulation.force_scale()
         self._quiet = False  # while controls are set by the program
         self._upload: tempfile.TemporaryDirectory[str] | None = None
+        self._loading = threading.Lock()
         self._pin: Any = None
         self._handle: Any = None
+        self._grabbed = False  # whether what the handle pulls is held by now
+        self._drawn_for: Any = None  # the simulation whose handles are drawn
+        self._shader: dict[str, Any] | None = None  # the last one, while shading is off
         self._dx = float(self.session.settings.solver.dx)
         gui = self.server.gui
         self.health = gui.add_markdown("")
@@ -122,7 +126,7 @@ class Controls:
         self.pins = gui.add_checkbox("What is held", False, hint="Points that pins and handles hold, at rest")
         self.shown.on_update(lambda _: self._show())
         self.light.on_update(lambda _: self._shade())
-        self.shading.on_update(lambda _: self._shade())
+        self.shading.on_update(lambda _: self._unless_quiet(self._shade))
         self.arrow.on_update(lambda _: self.draw_handles())
         self.box.on_update(lambda _: self.draw_handles())
         self.pins.on_update(lambda _: self.draw_handles())
@@ -153,7 +157,14 @@ class Controls:
         if session.problem:
             remedy = " Press **Reset** to start again." if session.broken else ""
             lines.append(f"⚠️ {session.problem}{remedy}")
+        if self.page.notice:
+            lines.append(f"_{self.page.notice}_")
         self.health.content = "\n\n".join(lines)
+        if session.simulation is not self._drawn_for:
+            self.draw_handles()
+        if self._handle is not None and self._grabbed and not session.pulls:
+            self.let_go()  # the session let go
+        self._grabbed = self._handle is not None and session.pulls
 
     # ---- what they do
 
@@ -162,7 +173,8 @@ class Controls:
             what()
 
     def _set(self, name: str, value: Any) -> None:
-        self.session.change({name: value})
+        if not self._quiet:
+            self.session.change({name: value})
 
     def _toggle(self) -> None:
         self.session.pause(not self.session.paused)
@@ -190,19 +202,22 @@ class Controls:
         return 0.0 if light is None else round(to_angles(light.tolist())[1])
 
     def _shade(self) -> None:
+        given = yaml.safe_load(self.session.yaml()).get("shader")
+        self._shader = given or self._shader or {"class_path": "DiffuseShader", "init_args": {"two_sided": True}}
         if not self.shading.value:
             self.session.change({"shader": None})
             return
-        text = yaml.safe_load(self.session.yaml())
-        given = (text.get("shader") or {}).get("init_args") or {"two_sided": True, "ambient": 0.5}
-        light = from_angles(1.0, self.light.value, 40.0)
-        chosen = {"class_path": "DiffuseShader", "init_args": given | {"light": [round(x, 4) for x in light]}}
-        self.session.change({"shader": chosen})
+        arguments = dict(self._shader.get("init_args") or {})
+        old = arguments.get("light", [0.0, -1.0, 0.8])
+        light = from_angles(1.0, self.light.value, to_angles(old)[2])
+        arguments["light"] = [round(x, 4) for x in light]
+        self.session.change({"shader": self._shader | {"init_args": arguments}})
 
     # ---- handles in the scene
 
     def draw_handles(self) -> None:
-        """Draw the arrow of the wind, the box of the grid and the pins, again after another scene is there."""
+        """Draw the arrow of the wind, the box of the grid and the pins, again after another simulation is there."""
+        self._drawn_for = self.session.simulation
         scene, server = self.session.simulation.scene, self.server.scene
         self._tip = server.add_transform_controls(
             "/wind/tip", scale=0.12 * scene.size, disable_rotations=True, disable_sliders=True, depth_test=False,
@@ -269,7 +284,8 @@ class Controls:
     # ---- pull and hold
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
-        place = under_cursor(self.session.snapshot, event.ray_origin, event.ray_direction)
+        with self.session.lock:
+            place = under_cursor(self.session.snapshot, event.ray_origin, event.ray_direction)
         if place is None:
             return
         self.let_go()
@@ -314,6 +330,9 @@ class Controls:
 
     def _hold_box(self) -> None:
         """Add a pin that holds what is in the box at rest."""
+        if self.session.settings.normalisation is not None:
+            self.page.tell("Pins of this configuration are in normalised coordinates: write them into its file.")
+            return
         centre, half = np.array(self._pin.position), 0.5 * self._pin_side()
         box = {"min": [float(f"{x:.6g}") for x in centre - half], "max": [float(f"{x:.6g}") for x in centre + half]}
         pin = {
@@ -342,35 +361,63 @@ class Controls:
         try:
             content = film.finish()
         except (ValueError, OSError) as error:
-            self.session.problem = str(error)
+            self.page.tell(str(error))
             return
         if client is not None:
             client.send_file_download("wind.mp4", content, save_immediately=True)
 
     def _save(self, event: viser.GuiEvent) -> None:
+        text = self.session.yaml()
+        if self._upload is not None:  # it goes away with the program
+            text = "# Give the splat that you loaded: --scene.ply PATH\n" + text.replace(self._upload.name + "/", "")
         if event.client is not None:
-            event.client.send_file_download("live.yaml", self.session.yaml().encode(), save_immediately=True)
+            event.client.send_file_download("live.yaml", text.encode(), save_immediately=True)
 
     def _load(self) -> None:
-        file = self.load.value
-        threading.Thread(target=self._look_at, args=(file.content,), name="load", daemon=True).start()
+        content = self.load.value.content
+        threading.Thread(target=self._look_at, args=(content,), name="load", daemon=True).start()
 
     def _look_at(self, content: bytes) -> None:
         """Go on with an uploaded splat; its name is never used."""
-        self.session.problem = "Looking at the splat, which takes up to a minute."
-        folder = tempfile.TemporaryDirectory()
-        path = Path(folder.name) / "scene.ply"
-        path.write_bytes(content)
-        try:
-            settings = settings_of_splat(self.session.parser, path, self.session.simulation.device)
-        except Exception as error:
-            self.session.problem = " ".join(str(error).split())
-            folder.cleanup()
-            return
-        self._upload = folder  # the old one goes away
-        self.session.problem = None
-        self.session.load(settings)
-        self.session.wait(self.session.snapshot.number, 60.0)
+        with self._loading:
+            self.page.tell("Looking at the splat, which takes up to a minute.", 60.0)
+            folder = tempfile.TemporaryDirectory()
+            path = Path(folder.name) / "scene.ply"
+            path.write_bytes(content)
+            try:
+                settings = settings_of_splat(self.session.parser, path, self.session.simulation.device)
+            except Exception as error:
+                self.page.tell(" ".join(str(error).split()))
+                folder.cleanup()
+                return
+            self.session.load(settings, lambda: self._loaded(folder))
+
+    def _loaded(self, folder: tempfile.TemporaryDirectory[str]) -> None:
+        """Another scene is there: what belongs to the old one goes, and the controls show its values."""
+        self._upload = folder
+        if self._pin is not None:
+            self._pin.remove()
+            self._pin = None
+            self.hold.disabled = True
+        settings = self.session.settings
+        self._dx = float(settings.solver.dx)
+        self.force_end = self.session.simulation.force_scale()
+        speed, azimuth, elevation = (round(x, 1) for x in to_angles(self._flow()))
+        shown = {
+            self.wind_speed: min(speed, MOST_SPEED),
+            self.azimuth: azimuth,
+            self.elevation: elevation,
+            self.stiffness: round(min(max(math.log10(float(settings.material.E)), 2.0), 8.0), 2),
+            self.damping: min(float(settings.solver.damping), 10.0),
+            self.gravity: min(max(-float(settings.solver.gravity[2]), 0.0), 20.0),
+            self.grid: "normal",
+            self.shading: self.session.simulation.painter.shader is not None,
+        }
+        self._quiet = True
+        for control, value in shown.items():
+            control.value = value  # type: ignore[attr-defined]
+        self._quiet = False
+        self.page.tell("", 0.0)
         self.page.look_from_start()
         self.draw_handles()
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from gaussian_swaying.simulation.recording.video import VideoEncoder
 
@@ -24,6 +26,7 @@ class FilmStrip:
         self._size: tuple[int, ...] | None = None
         self._last: np.ndarray | None = None
         self._frames = 0
+        self._lock, self._done = threading.Lock(), False
 
     @property
     def seconds(self) -> float:
@@ -31,11 +34,16 @@ class FilmStrip:
         return self._frames / FPS
 
     def add(self, time: float, picture: np.ndarray) -> None:
-        """Add a picture, uint8 (H, W, 3), at a simulated time [s]; other sizes than the first are left out."""
+        """Add a picture, uint8 (H, W, 3), at a simulated time [s]; it gets the size of the first."""
+        with self._lock:
+            if not self._done and self.seconds < LONGEST:
+                self._add(time, picture)
+
+    def _add(self, time: float, picture: np.ndarray) -> None:
         if self._size is None:
             self._start, self._size = time, picture.shape
-        if picture.shape != self._size or self.seconds >= LONGEST:
-            return
+        if picture.shape != self._size:
+            picture = np.asarray(Image.fromarray(picture).resize((self._size[1], self._size[0])))
         assert self._start is not None
         wanted = int((time - self._start) * FPS) + 1
         if wanted < self._frames:  # the simulation went back to rest: go on from there
@@ -53,6 +61,8 @@ class FilmStrip:
             ValueError: If there is no picture.
             OSError: If ffmpeg fails.
         """
+        with self._lock:
+            self._done = True
         try:
             if self._frames == 0:
                 raise ValueError("Nothing was recorded, as nothing moved: go on before you record.")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import http
 import io
+import socket
 import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout, suppress
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import torch
@@ -46,10 +49,63 @@ def make_server(host: str, port: int) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
+    check_address(host, port)
     # a picture may be drawn while its browser goes away
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-    with redirect_stdout(io.StringIO()):  # its banner; the address is told by the caller
+    with redirect_stdout(io.StringIO()), own_pages_only(host):  # its banner; the caller tells the address
         return Server(host=host, port=port, label="Wind tunnel", verbose=False)
+
+
+def check_address(host: str, port: int) -> None:
+    """Raise ValueError if nothing can listen at an address."""
+    if not 0 < port < 65536:
+        raise ValueError(f"Expected `--port` from 1 to 65535, but got {port}.")
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.bind((host, 0))
+    except OSError as error:
+        raise ValueError(
+            f"Nothing can listen at `--host` {host} ({error.strerror or error}): give an address of this computer, "
+            "such as 127.0.0.1."
+        ) from None
+
+
+LOCAL = ("127.0.0.1", "localhost", "[::1]")
+
+
+def allowed(host: str, headers: Mapping[str, str]) -> bool:
+    """Whether a request comes from a page of the server itself, and not from another website in the same browser.
+
+    Args:
+        host: Where the server listens.
+        headers: Of the request.
+    """
+    asked, origin = headers.get("Host") or "", headers.get("Origin")
+    if host in ("127.0.0.1", "localhost", "::1") and asked.rsplit(":", 1)[0] not in LOCAL:
+        return False  # a name that another site has pointed at this computer
+    return origin is None or urlsplit(origin).netloc == asked
+
+
+@contextmanager
+def own_pages_only(host: str) -> Iterator[None]:
+    """Servers that are started meanwhile refuse requests that are not :func:`allowed`."""
+    import websockets.asyncio.server as websockets
+
+    serve = websockets.serve
+
+    def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            if not allowed(host, request.headers):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "This is for pages of this program only.\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*arguments, process_request=process, **options)
+
+    websockets.serve = checked  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.serve = serve  # type: ignore[misc]
 
 
 def limit_uploads(server: viser.ViserServer, most: int, refused: Callable[[], None]) -> None:
@@ -66,7 +122,8 @@ def limit_uploads(server: viser.ViserServer, most: int, refused: Callable[[], No
     start, part = gui._handle_file_transfer_start, gui._handle_file_transfer_part
 
     def check_start(client: Any, message: Any) -> None:
-        if message.size_bytes > most:
+        under_way = sum(state["total_bytes"] for state in gui._current_file_upload_states.values())
+        if under_way + message.size_bytes > most:
             refused()
         else:
             start(client, message)
@@ -110,6 +167,7 @@ class Page:
         self._closed = threading.Event()
         self._gone: dict[int, threading.Event] = {}
         self._drawn: dict[int, deque[float]] = {}
+        self._notice = ("", 0.0)
         self._version = 0  # of what is drawn besides snapshot and camera
         self.server = make_server(host, port)
         limit_uploads(self.server, LARGEST_UPLOAD, self._refuse_upload)
@@ -120,18 +178,29 @@ class Page:
         self.controls = Controls(self)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
-        self._health = threading.Thread(target=self._tell, name="health", daemon=True)
+        self._health = threading.Thread(target=self._keep_telling, name="health", daemon=True)
         self._health.start()
 
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+        return f"http://{host}:{self.server.get_port()}"
 
     def close(self) -> None:
         """Stop serving."""
         self._closed.set()
         self.server.stop()
+
+    def tell(self, notice: str, seconds: float = 15.0) -> None:
+        """Show a sentence on the page for some time."""
+        self._notice = (notice, time.monotonic() + seconds)
+
+    @property
+    def notice(self) -> str | None:
+        """The sentence that is shown now."""
+        return self._notice[0] if time.monotonic() < self._notice[1] else None
 
     def redraw(self) -> None:
         """Draw again, as something else than the simulation has changed."""
@@ -152,6 +221,10 @@ class Page:
         first.up = tuple(up)
         first.fov = float(2 * torch.atan(0.5 * camera.height / camera.intrinsics[1, 1]))
         first.near = 0.001 * scene.size
+        for client in self.server.get_clients().values():
+            with client.atomic():
+                client.camera.up_direction = tuple(up)
+                client.camera.position, client.camera.look_at = first.position, first.look_at
 
     def pictures_per_second(self) -> float:
         """Pictures that the fastest browser gets."""
@@ -160,7 +233,7 @@ class Page:
 
     def _refuse_upload(self) -> None:
         most = f"{LARGEST_UPLOAD >> 20:,} MiB"
-        self.session.problem = f"The file is larger than {most}: give it on the command line instead."
+        self.tell(f"The file is larger than {most}: give it on the command line instead.")
 
     # ---- browsers
 
@@ -192,7 +265,7 @@ class Page:
             try:
                 self._send(client, snapshot, size)
             except Exception as error:  # one picture; the page goes on
-                self.session.problem = f"A picture could not be drawn: {' '.join(str(error).split())}"
+                self.tell(f"A picture could not be drawn: {' '.join(str(error).split())}")
                 gone.wait(0.5)
             left = 1 / MOST_PER_SECOND - (time.perf_counter() - began)
             if left > 0:
@@ -213,10 +286,11 @@ class Page:
         times = self._drawn.get(client.client_id)
         if times is not None:
             times.append(began)
-        if self.recording is not None and self.recorder == client.client_id:
-            self.recording.add(snapshot.health.time, np.ascontiguousarray(picture))
+        film = self.recording
+        if film is not None and self.recorder == client.client_id:
+            film.add(snapshot.health.time, np.ascontiguousarray(picture))
 
-    def _tell(self) -> None:
+    def _keep_telling(self) -> None:
         """Keep the figures in the corner up to date."""
         while not self._closed.wait(0.4):
             with suppress(Exception):  # the figures of a moment, while a scene is replaced

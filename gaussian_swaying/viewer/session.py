@@ -93,6 +93,7 @@ class Session:
         self._anchor: tuple[float, float] | None = None
         self._pull: Pull | None = None
         self._number = 0
+        self._edited = False  # whether the material was changed since the simulation was made
         self.simulation = simulation or Simulation.from_settings(parser, settings)
         self._begin(self.simulation.start())
         self._thread = threading.Thread(target=self._loop, name="simulation", daemon=True)
@@ -121,13 +122,23 @@ class Session:
             self._changes.update(values)
             self._wake.notify_all()
 
-    def load(self, settings: Namespace) -> None:
-        """Go on with another scene, from rest."""
-        self._ask(lambda: self._take_settings(settings))
+    def load(self, settings: Namespace, done: Callable[[], None] = lambda: None) -> None:
+        """Go on with another scene, from rest.
+
+        Args:
+            settings: Its settings.
+            done: Called in the thread of the session once the scene is there; not if it cannot be made.
+        """
+
+        def take_scene() -> None:
+            self._take_settings(settings, fresh=True)
+            done()
+
+        self._ask(take_scene)
 
     def reset(self) -> None:
         """Go back to rest."""
-        self._ask(lambda: self._begin(self.simulation.start()))
+        self._ask(self._reset)
 
     def pause(self, paused: bool = True) -> None:
         """Pause, or go on."""
@@ -235,6 +246,13 @@ class Session:
         except Exception as error:  # out of memory, a kernel that fails: the page goes on
             self._broken, self.problem = True, _sentence(error)
             return
+        if simulation.editor.edits:
+            try:
+                with self.lock:
+                    state = simulation.edit_due(state)
+            except Exception as error:
+                self._broken, self.problem = True, _sentence(error)
+                return
         self._publish(state, health)
         took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)
         if took > SLOW and simulation.frame_dt > 1.01 * wanted / SHORTEST:
@@ -250,9 +268,10 @@ class Session:
     def _pace(self, simulated: float) -> None:
         """Wait while the simulation is ahead of the wanted speed."""
         now = time.perf_counter()
-        if self._anchor is None:
-            self._anchor = (now, simulated)
-        due = self._anchor[0] + (simulated - self._anchor[1]) / self.speed
+        anchor = self._anchor
+        if anchor is None:
+            self._anchor = anchor = (now, simulated)
+        due = anchor[0] + (simulated - anchor[1]) / self.speed
         if due < now - BEHIND:
             self._anchor = (now, simulated)
         elif due > now:
@@ -277,6 +296,12 @@ class Session:
         self._steps.clear()
         self._publish(state, diagnose(self.simulation.solver, state, 0, 0.0))
 
+    def _reset(self) -> None:
+        if self._edited:  # `start` would go back to the material of the first settings
+            self._take_settings(self.settings, fresh=True)
+        else:
+            self._begin(self.simulation.start())
+
     def _change(self, values: Mapping[str, Any]) -> None:
         """Change the settings, and the simulation with them."""
         settings = changed_settings(self.parser, self.settings, values)
@@ -287,13 +312,15 @@ class Session:
             self._take_settings(settings)
         else:
             self.settings = settings
+            self._edited |= any(name.startswith("material.") for name in values)
             self._publish(state, self.snapshot.health)
 
-    def _take_settings(self, settings: Namespace) -> None:
-        """Make the simulation anew; it goes on from where it is if its grid stays the same."""
+    def _take_settings(self, settings: Namespace, fresh: bool = False) -> None:
+        """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""
         simulation = Simulation.from_settings(self.parser, settings)
         start = simulation.start()
-        state = None if self._broken else carry_over(self.simulation, self.snapshot.state, simulation, start)
+        self._edited = False
+        state = None if self._broken or fresh else carry_over(self.simulation, self.snapshot.state, simulation, start)
         self.simulation, self.settings = simulation, settings
         if state is None:
             self._begin(start)

@@ -14,7 +14,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
-from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.page import Page, allowed, check_address
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = [
@@ -79,6 +79,24 @@ def test_it_listens_on_this_computer_only_and_serves_no_files(page):
     assert page.server.request_share_url() is None  # no tunnel, whoever asks
 
 
+def test_other_websites_in_the_same_browser_are_refused(page):
+    """Neither by their own name, nor by one that they have pointed at this computer."""
+    for headers in ({"Origin": "https://evil.example"}, {"Host": "evil.example"}):
+        request = urllib.request.Request(page.url, headers=headers)
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=10)
+    own = urllib.request.Request(page.url, headers={"Origin": page.url})
+    assert urllib.request.urlopen(own, timeout=10).status == 200
+    assert allowed("0.0.0.0", {"Host": "my.machine:8080", "Origin": "http://my.machine:8080"})
+    assert not allowed("0.0.0.0", {"Host": "my.machine:8080", "Origin": "http://evil.example"})
+
+
+@pytest.mark.parametrize(("host", "port", "field"), [("127.0.0.1", 70000, "--port"), ("10.99.99.99", 8080, "--host")])
+def test_an_address_that_cannot_be_is_refused(host, port, field):
+    with pytest.raises(ValueError, match=field):
+        check_address(host, port)
+
+
 def test_large_uploads_are_dropped_before_they_arrive(page):
     from viser._messages import FileTransferPart, FileTransferStartUpload
 
@@ -90,16 +108,18 @@ def test_large_uploads_are_dropped_before_they_arrive(page):
         handlers[FileTransferStartUpload][0](0, message)
 
     announce((1 << 30) + 1, "large")
-    assert "1,024 MiB" in page.session.problem
+    assert "1,024 MiB" in page.notice
     assert "large" not in gui._current_file_upload_states
-    page.session.problem = None
+    page.tell("", 0.0)
     announce(100, "small")
     state = gui._current_file_upload_states["small"]
-    assert page.session.problem is None
+    assert page.notice is None
+    announce((1 << 30) - 50, "together too large")
+    assert page.notice is not None
     state["transferred_bytes"] = 1 << 30  # more than was announced
     handlers[FileTransferPart][0](0, FileTransferPart(button, "small", 1, b"more"))
     assert "small" not in gui._current_file_upload_states
-    assert "1,024 MiB" in page.session.problem
+    assert "1,024 MiB" in page.notice
 
 
 def test_what_is_held_is_shown(page):
@@ -199,7 +219,7 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     assert window.problems == []
     (tmp_path / "text.ply").write_text("not a splat")
     window.locator("input[type=file]").first.set_input_files(tmp_path / "text.ply")
-    until(lambda: page.session.problem is not None and "Looking" not in page.session.problem, 30)
+    until(lambda: page.notice is not None and "Looking" not in page.notice, 30)
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 

@@ -74,8 +74,8 @@ def test_a_film_is_as_long_as_the_simulated_time():
     times = [1.0 + 0.01 * k for k in range(50)] + [2.0] + [0.0, 0.2]
     for k, time in enumerate(times):
         film.add(time, np.full((32, 48, 3), 4 * k, dtype=np.uint8))
-    film.add(0.3, np.zeros((16, 48, 3), dtype=np.uint8))  # another size is left out
-    assert film.seconds == pytest.approx(1.2, abs=0.09)
+    film.add(0.24, np.full((16, 24, 3), 255, dtype=np.uint8))  # another size gets that of the first
+    assert film.seconds == pytest.approx(1.24, abs=0.09)
     content = film.finish()
     frames = iio.imread(content, extension=".mp4")
     assert len(frames) == round(film.seconds * 25)

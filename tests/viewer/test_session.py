@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 
+from gaussian_swaying.simulation.config import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.pictures import draw
 from gaussian_swaying.viewer.session import Session
@@ -141,6 +142,45 @@ def test_what_diverges_is_told_and_reset_heals_it(session, until):
     until(lambda: session.snapshot.health.time > 0.1)
     assert not session.broken
     assert session.problem is None
+
+
+def test_reset_keeps_what_was_changed(session, until):
+    session.start()
+    session.change({"material.E": 2e4, "solver.damping": 3.0})
+    until(lambda: session.settings.solver.damping == 3.0)
+    session.reset()
+    until(lambda: session.snapshot.number > 3 and session.snapshot.health.time < 0.05)
+    until(lambda: session.snapshot.health.time > 0.05)
+    assert float(session.simulation.scene.points.youngs_modulus.amax()) == pytest.approx(2e4)
+    assert session.simulation.solver.damping == 3.0
+
+
+def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
+    """Edits act at their time, and another stiffness leaves them what they are."""
+    file = tmp_path / "edited.yaml"
+    edit = {"time": 0.06, "E": 5e4}
+    file.write_text(yaml.safe_dump(yaml.safe_load(config_text(parser, settings)) | {"edits": [edit]}))
+    session = Session(parser, parser.parse_args(["--config", str(file), "--device=cpu"])).start()
+
+    def stiffest():
+        return float(session.simulation.scene.points.youngs_modulus.amax())
+
+    assert stiffest() < 1e4
+    until(lambda: stiffest() == pytest.approx(5e4))
+    session.change({"material.E": 2e4})
+    until(lambda: session.settings.material.E == 2e4)
+    until(lambda: session.snapshot.health.time > 0.15 and stiffest() == pytest.approx(5e4))
+    session.close()
+    assert session.problem is None
+
+
+def test_another_scene_starts_at_rest(parser, settings, session, until):
+    session.start()
+    until(lambda: session.snapshot.health.time > 0.2)
+    told = []
+    session.load(settings, lambda: told.append(session.snapshot.health.time))
+    until(lambda: told)
+    assert told == [0.0]
 
 
 def test_the_saved_configuration_is_that_of_the_session(parser, session, until, tmp_path):
