@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
 from gaussian_swaying.runs.seal import sha256
@@ -121,6 +121,7 @@ class Run:
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint holds it, which is written every frame
         self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
+        self._nodes: tuple[GridSpec, Tensor] | None = None
         self.force_end = self.recorder.force_scale or simulation.force_scale()
 
     def go(
@@ -218,6 +219,7 @@ class Run:
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
                     "tracked": self.simulation.scene.tracked,
+                    "nodes": None if state.node_displacement is None else len(self.nodes(state.grid)),
                 }
             )
 
@@ -236,6 +238,14 @@ class Run:
                 recorder.write_splat(frame, self.painter.cloud(gaussians), self.simulation.scene.frame)
             if recorder.trajectory:
                 recorder.write_trajectory(frame, *self.simulation.scene.surface(state))
+            if recorder.nodes and state.node_displacement is not None:
+                recorder.write_nodes(frame, state.node_displacement[self.nodes(state.grid)])
+
+    def nodes(self, grid: GridSpec) -> Tensor:
+        """The nodes that the Gaussians follow, in a grid."""
+        if self._nodes is None or self._nodes[0] != grid:
+            self._nodes = (grid, self.simulation.scene.follow.nodes(grid))
+        return self._nodes[1]
 
     def picture(self, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str) -> None:
         """Draw the requested pictures of a frame from one camera and pass them to the recorder."""
@@ -273,6 +283,7 @@ class Run:
             "device": describe_device(simulation.device),
             "versions": versions(),
             "seed": getattr(simulation.wind, "seed", None),
+            "splat_sha256": self.splat,
             "particles": solver.points.count,
             "gaussians": len(scene.model.means),
             "simulated_gaussians": len(scene.simulated),
