@@ -19,7 +19,7 @@ FILES = [
 ]
 # names that a run writes; a folder that was not made by a run must not contain them
 OURS = [*FILES, "frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
-OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
+OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4", "film.html"]
 
 
 def frame_folder(render: str = "color", camera: str = "") -> str:
