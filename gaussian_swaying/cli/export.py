@@ -22,7 +22,8 @@ def build_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
     parser.add_argument(
         "source",
-        help="A .ply, compressed .ply or .splat, or a folder of .ply for an animated USD; with --web the folder of a run.",
+        help="A .ply, compressed .ply or .splat, or a folder of .ply for an animated USD; with --web the folder of"
+        " a run.",
     )
     parser.add_argument(
         "target",

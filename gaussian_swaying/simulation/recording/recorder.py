@@ -67,7 +67,8 @@ class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
-    ``nodes.npz`` (array ``displacement_00000``), ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
+    ``nodes.npz`` (array ``displacement_00000``), ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per
+    frame), ``config.yaml``, ``video.mp4``.
 
     Other renders have separate folders, ``depth``, ``normal`` and ``force``, and videos with these names. Further
     cameras have the same layout in ``cameras/<name>``. Except for colour, pixels without Gaussians are black.
@@ -97,8 +98,8 @@ class Recorder:
         export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
             ``splat``, or ``usd`` (all frames in one animation.usdc, in metres; needs usd-core). See
             ``gaussian_swaying.gaussians.export``.
-        nodes: In ``total``, write the displacement (float16, metres, z up) of the nodes that the Gaussians follow for each
-            frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated`` have nothing to write.
+        nodes: In ``total``, write the displacement (float16, metres, z up) of the nodes that the Gaussians follow for
+            each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated`` have nothing to write.
     """
 
     def __init__(

@@ -92,8 +92,8 @@ def _summary(run: Path) -> dict[str, Any]:
         raise ValueError(f"{run / 'summary.json'} cannot be read ({error}): run the simulation again.") from error
     if formulation != "total":
         raise ValueError(
-            f"The run in {run} is of `solver.formulation: {formulation}`, where no nodes move with the material: a film "
-            "needs a run of `total`."
+            f"The run in {run} is of `solver.formulation: {formulation}`, where nodes do not move with the material: "
+            "a film needs a run of `total`."
         )
     if not (run / "nodes.npz").is_file():
         raise ValueError(f"The run in {run} has no nodes.npz: run it again with `recorder.nodes: true`.")
