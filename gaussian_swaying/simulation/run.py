@@ -85,6 +85,13 @@ def _check_checkpoint(
             f"The trajectory in {output} is of {tracked} places, but the scene has {scene.tracked}: "
             "resume with the same splat, or start again without --resume."
         )
+    followed = None if start.node_displacement is None else len(scene.follow.nodes(start.grid))
+    nodes = checkpoint.get("nodes")
+    if isinstance(nodes, bool) or nodes != followed:
+        raise ValueError(
+            f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with the "
+            "same splat, or start again without --resume."
+        )
     most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
     try:
         check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited)

@@ -431,8 +431,8 @@ class Recorder:
             elif self.ply_every and frames:
                 made.append(self.folder / self.export_format)
             moved = self.nodes and ((self.folder / "nodes").exists() or (self.folder / "nodes.npz").exists())
-            for name, wanted in (("trajectory", self.trajectory), ("nodes", moved)):
-                if wanted and frames:
+            for name, kept in (("trajectory", self.trajectory), ("nodes", moved)):
+                if kept and frames:
                     pack_trajectory(self.folder / name, self.folder / f"{name}.npz", frames)
                     made.append(self.folder / f"{name}.npz")
             if self.images and frames:

@@ -7,6 +7,7 @@ import html
 import json
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,7 +81,8 @@ def pack(film: Film) -> dict[str, bytes]:
 def unpack(blocks: dict[str, bytes]) -> Film:
     """The inverse of :func:`pack`."""
     head = json.loads(blocks["head"])
-    count, at, found = head["count"], 0, {}
+    count, at = head["count"], 0
+    found: dict[str, Any] = {}
     kinds = {"position": "<f4", "place": "<f4", "scale": "<f2", "turn": "<i2", "facing": "<i2", "color": "u1"}
     for name in SPLATS:
         kind = np.dtype(kinds[name])

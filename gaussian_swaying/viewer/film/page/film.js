@@ -209,9 +209,11 @@ export async function play(read) {
     const [width, height] = [window.innerWidth, window.innerHeight];
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     renderer.setSize(width, height);
-    const across = Math.tan((head.camera.fov * Math.PI) / 360) * head.camera.aspect; // what must stay visible
+    const upright = Math.tan((head.camera.fov * Math.PI) / 360);
+    const distance = camera.position.distanceTo(controls.target);
+    const across = Math.min(upright * head.camera.aspect, 0.75 / distance); // what a narrow window still shows
     camera.aspect = width / height;
-    const half = Math.max(across / camera.aspect, Math.tan((head.camera.fov * Math.PI) / 360));
+    const half = Math.max(across / camera.aspect, upright);
     camera.fov = (2 * Math.atan(half) * 180) / Math.PI;
     camera.updateProjectionMatrix();
     wake(3);
