@@ -39,7 +39,11 @@ SETTINGS = {
 def _merged(settings, changes):
     both = dict(settings)
     for name, value in changes.items():
-        both[name] = _merged(both[name], value) if isinstance(value, dict) and name in both else value
+        both[name] = (
+            _merged(both[name], value)
+            if isinstance(value, dict) and name in both and "class_path" not in value
+            else value
+        )
     return both
 
 
