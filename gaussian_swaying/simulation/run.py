@@ -89,8 +89,8 @@ def _check_checkpoint(
     nodes = checkpoint.get("nodes")
     if isinstance(nodes, bool) or nodes != followed:
         raise ValueError(
-            f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with the "
-            "same splat, or start again without --resume."
+            f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
+            "the same splat, or start again without --resume."
         )
     most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
     try:
@@ -246,7 +246,9 @@ class Run:
             if recorder.trajectory:
                 recorder.write_trajectory(frame, *self.simulation.scene.surface(state))
             if recorder.nodes and state.node_displacement is not None:
-                recorder.write_nodes(frame, state.node_displacement[self.nodes(state.grid)])
+                scene = self.simulation.scene
+                limit = scene.size * scene.frame.metres_per_unit / 2  # rounding to float16 is then 0.02 % of the size
+                recorder.write_nodes(frame, state.node_displacement[self.nodes(state.grid)], limit)
 
     def nodes(self, grid: GridSpec) -> Tensor:
         """The nodes that the Gaussians follow, in a grid."""

@@ -28,6 +28,7 @@ from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
 from gaussian_swaying.simulation.recording.layout import FILES, OURS, frame_folder, raw_folder, video_file
+from gaussian_swaying.simulation.recording.nodes import NODES, split_far
 from gaussian_swaying.simulation.recording.resume import (
     check_frames,
     check_nodes,
@@ -67,8 +68,8 @@ class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
-    ``nodes.npz`` (array ``displacement_00000``), ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per
-    frame), ``config.yaml``, ``video.mp4``.
+    ``nodes.npz`` (arrays ``displacement_00000`` and ``far_00000``), ``checkpoint.pt``, ``summary.json``,
+    ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
     Other renders have separate folders, ``depth``, ``normal`` and ``force``, and videos with these names. Further
     cameras have the same layout in ``cameras/<name>``. Except for colour, pixels without Gaussians are black.
@@ -98,8 +99,9 @@ class Recorder:
         export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
             ``splat``, or ``usd`` (all frames in one animation.usdc, in metres; needs usd-core). See
             ``gaussian_swaying.gaussians.export``.
-        nodes: In ``total``, write the displacement (float16, metres, z up) of the nodes that the Gaussians follow for
-            each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated`` have nothing to write.
+        nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
+            that the Gaussians follow for each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated``
+            have nothing to write.
     """
 
     def __init__(
@@ -317,21 +319,28 @@ class Recorder:
 
     def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
         """Write position [m] (P, 3) and F (P, 3, 3) of one frame; :meth:`close` packs all into one file."""
-        self._write_arrays("trajectory", index, {"position": position.float(), "F": F.half()})
+        copy = HostCopy({"position": position.float(), "F": F.half()})
+        self._write_arrays("trajectory", index, lambda: {name: part.numpy() for name, part in copy.get().items()})
 
-    def write_nodes(self, index: int, displacement: Tensor) -> None:
-        """Write the displacement of the nodes [m] (M, 3) of one frame; :meth:`close` packs all into one file."""
-        self._write_arrays("nodes", index, {"displacement": displacement.half()})
+    def write_nodes(self, index: int, displacement: Tensor, limit: float) -> None:
+        """Write the displacement of the nodes [m] (N, 3) of one frame; :meth:`close` packs all into one file.
 
-    def _write_arrays(self, place: str, index: int, arrays: dict[str, Tensor]) -> None:
+        Args:
+            index: Frame number.
+            displacement: The displacements.
+            limit: Longest displacement that float16 may round [m].
+        """
+        copy = HostCopy(displacement.float())
+        self._write_arrays("nodes", index, lambda: dict(zip(NODES, split_far(copy.get().numpy(), limit), strict=True)))
+
+    def _write_arrays(self, place: str, index: int, arrays: Callable[[], dict[str, np.ndarray]]) -> None:
         path = self.folder / place / f"{index:05d}.npz"
-        copy = HostCopy({f"{name}_{index:05d}": tensor for name, tensor in arrays.items()})
 
         def write() -> None:
-            arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in copy.get().items()}
+            named: dict[str, Any] = {f"{name}_{index:05d}": array for name, array in arrays().items()}
             path.parent.mkdir(exist_ok=True)  # that of the nodes is made by the first frame: `updated` has none
             with atomic(path) as temporary:
-                np.savez(temporary, **arrays)
+                np.savez(temporary, **named)
 
         self._submit(path, write)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from gaussian_swaying._files import check_not_taken, kind_of
 from gaussian_swaying.gaussians.export import read_usd_frame
-from gaussian_swaying.simulation.recording.trajectory import NODES, check_trajectory
+from gaussian_swaying.simulation.recording.nodes import NODES
+from gaussian_swaying.simulation.recording.trajectory import check_trajectory
 
 
 def check_pictures(folder: Path, place: str, frames: int, video: str | None = None) -> list[str]:

@@ -1,6 +1,6 @@
-"""Arrays of a run, packed into one file at its end.
+"""Arrays of the frames of a run, packed into one file at its end.
 
-``trajectory.npz`` has arrays ``position_00000`` and ``F_00000`` per frame, ``nodes.npz`` has ``displacement_00000``.
+``trajectory.npz`` has arrays ``position_00000`` and ``F_00000`` per frame, ``nodes.npz`` those of :mod:`.nodes`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from gaussian_swaying._inputs import check_archive
 
 _MEMBER = re.compile(r"([A-Za-z]+)_(\d{5})\.npy")
 
-TRAJECTORY: dict[str, tuple[tuple[int, ...], type]] = {"position": ((3,), np.float32), "F": ((3, 3), np.float16)}
-"""The arrays of a frame in ``trajectory.npz``: shape of a row and type."""
-
-NODES: dict[str, tuple[tuple[int, ...], type]] = {"displacement": ((3,), np.float16)}
-"""The arrays of a frame in ``nodes.npz``."""
+TRAJECTORY: dict[str, tuple[tuple[int, ...], type, bool]] = {
+    "position": ((3,), np.float32, True),
+    "F": ((3, 3), np.float16, True),
+}
+"""The arrays of a frame in ``trajectory.npz``: shape of a row, type, and whether every frame has as many rows."""
 
 
 def pack_trajectory(shards: Path, target: Path, frames: int) -> None:
@@ -62,7 +62,7 @@ def check_trajectory(
     target: Path,
     frames: int,
     particles: int | None = None,
-    arrays: Mapping[str, tuple[tuple[int, ...], type]] = TRAJECTORY,
+    arrays: Mapping[str, tuple[tuple[int, ...], type, bool]] = TRAJECTORY,
 ) -> set[int]:
     """Check the files that :func:`pack_trajectory` would join, with the checksum of every array.
 
@@ -89,7 +89,8 @@ def check_trajectory(
                     if name is None or name[1] not in arrays:
                         raise ValueError(f"it contains {member.filename}, which no run writes")
                     with archive.open(member) as stream:
-                        _check_array(stream, *arrays[name[1]], particles)
+                        sizes, kind, fixed = arrays[name[1]]
+                        _check_array(stream, sizes, kind, particles if fixed else None)
                         while stream.read(1 << 20):  # up to the end, where its checksum is compared
                             pass
                     if int(name[2]) < frames:
@@ -126,24 +127,3 @@ def load_trajectory(path: str | os.PathLike[str], frame: int) -> tuple[Tensor, T
         if f"position_{name}" not in arrays:
             raise ValueError(f"{path} has no frame {frame}: it has {len(arrays.files) // 2} frames.")
         return torch.from_numpy(arrays[f"position_{name}"]), torch.from_numpy(arrays[f"F_{name}"]).float()
-
-
-def load_nodes(path: str | os.PathLike[str]) -> Tensor:
-    """Displacement of the recorded nodes [m, z up] in all frames, float16, shape (frames, nodes, 3).
-
-    The nodes are those of :meth:`~gaussian_swaying.simulation.followers.Followers.nodes`.
-
-    Args:
-        path: ``nodes.npz`` of a run of ``total``.
-
-    Raises:
-        ValueError: If a frame is missing, or the frames differ in their nodes.
-    """
-    with np.load(check_archive(path, "the run")) as arrays:
-        names = sorted(arrays.files)
-        if not names or names != [f"displacement_{index:05d}" for index in range(len(names))]:
-            raise ValueError(f"{path} lacks frames: run the simulation again, without --resume.")
-        frames = [arrays[name] for name in names]
-    if any(frame.shape != frames[0].shape or frame.dtype != np.float16 for frame in frames):
-        raise ValueError(f"{path} has frames of different nodes: run the simulation again, without --resume.")
-    return torch.from_numpy(np.stack(frames))

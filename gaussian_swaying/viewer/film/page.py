@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gaussian_swaying._files import atomic
+from gaussian_swaying.simulation.recording.nodes import join_far, split_at
 from gaussian_swaying.viewer.film.recorded import Film, read_film
 
 PAGE = Path(__file__).parent / "page"
@@ -67,15 +68,25 @@ def pack(film: Film) -> dict[str, bytes]:
     Bytes of the same weight stand together, and frames are differences to the frame before as whole numbers; both
     lose nothing, and the blocks compress to less.
     """
-    bits = film.displacement.view(np.uint16)
+    near, far = zip(*(_split(frame) for frame in film.displacement), strict=True)
+    bits = np.stack(near).view(np.uint16)
     frames = bits.copy()
     frames[1:] -= bits[:-1]  # modulo 65536
+    counts = np.array([len(rows) for rows in far], np.uint32)
     return {
         "head": json.dumps(film.head).encode(),
         "splats": b"".join(_planes(getattr(film, name)) for name in SPLATS),
         "nodes": _planes(film.nodes),
         "frames": _planes(frames),
+        "far": _planes(counts) + _planes(np.concatenate(far)),
     }
+
+
+def _split(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One frame in float16, and in float32 the nodes that float16 would round."""
+    with np.errstate(over="ignore"):
+        rounded = displacement.astype(np.float16).astype(np.float32)
+    return split_at(displacement, (rounded != displacement).any(axis=1))
 
 
 def unpack(blocks: dict[str, bytes]) -> Film:
@@ -93,7 +104,11 @@ def unpack(blocks: dict[str, bytes]) -> Film:
     frames = _unplaned(blocks["frames"], np.dtype("<u2")).reshape(head["frames"], head["nodes"], 3)
     bits = np.cumsum(frames, axis=0, dtype=np.uint16)
     nodes = _unplaned(blocks["nodes"], np.dtype("<u4"))
-    return Film(head, **found, nodes=nodes, displacement=bits.view(np.float16))
+    size = 4 * head["frames"]
+    counts = _unplaned(blocks["far"][:size], np.dtype("<u4"))
+    far = np.split(_unplaned(blocks["far"][size:], np.dtype("<i4")).reshape(-1, 4), np.cumsum(counts)[:-1])
+    moved = [join_far(near, rows) for near, rows in zip(bits.view(np.float16), far, strict=True)]
+    return Film(head, **found, nodes=nodes, displacement=np.stack(moved))
 
 
 def _planes(values: np.ndarray) -> bytes:

@@ -18,7 +18,7 @@ from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.config import parse_file
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.recording.trajectory import load_nodes
+from gaussian_swaying.simulation.recording.nodes import load_nodes
 from gaussian_swaying.simulation.scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -39,7 +39,7 @@ class Film:
         facing: Unit normals in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape (N, 4).
         color: Red, green, blue and opacity in steps of 1/255, uint8, shape (N, 4).
         nodes: Flat indices of the nodes in the grid, rising, uint32, shape (M,).
-        displacement: Displacement of the nodes [m], float16, shape (K, M, 3).
+        displacement: Displacement of the nodes [m], float32, shape (K, M, 3); float16 is enough for most.
         notes: Sentences on what the film does not show as the run does.
     """
 

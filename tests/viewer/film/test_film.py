@@ -15,8 +15,8 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.mpm.transfer import bspline_weights
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.recording.nodes import join_far, load_nodes, split_far
 from gaussian_swaying.simulation.recording.recorder import Recorder
-from gaussian_swaying.simulation.recording.trajectory import load_nodes
 from gaussian_swaying.viewer.film.page import pack, page, unpack
 from gaussian_swaying.viewer.film.recorded import read_film
 
@@ -120,6 +120,7 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     data = sum(len(block) for block in pack(film).values())
     head, rest = film.head, len(parts["code"]) + 16_384
     raw = 50 * head["count"] + head["nodes"] * (4 + 6 * head["frames"]) + len(json.dumps(head))
+    raw += 4 * head["frames"] + len(blocks["far"]) - 4 * head["frames"]
     assert data == raw
     assert len(text) < rest + 4 / 3 * (1.001 * raw + 256)
     again = page(film)
@@ -140,6 +141,22 @@ def test_other_light_is_told(make_flag, tmp_path, capsys):
 # ---- what a run records
 
 
+def test_nodes_that_swing_far_keep_their_digits(tmp_path):
+    """Nodes with hardly any mass move by thousands of metres, beyond what float16 rounds well or holds at all."""
+    generator = torch.Generator().manual_seed(0)
+    moved = (torch.rand(50, 3, generator=generator) - 0.5).numpy()
+    moved[[3, 20]] = [[1e5, 2.00001, -3e7], [0.1, 0.61, 0.2]]
+    near, far = split_far(moved, 0.6)
+    assert far[:, 0].tolist() == [3, 20]
+    assert np.array_equal(join_far(near, far)[[3, 20]], moved[[3, 20]])
+    assert np.abs(join_far(near, far) - moved).max() <= 0.6 * 2**-11
+    assert near.dtype == np.float16
+    assert split_far(moved[:0], 0.6)[1].shape == (0, 4)
+    np.savez(tmp_path / "nodes.npz", displacement_00000=near, far_00000=np.full((1, 4), 77, np.int32))
+    with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(index 77 is out of bounds"):
+        load_nodes(tmp_path / "nodes.npz")
+
+
 def test_nodes_are_recorded_in_total_unless_switched_off(make_flag, tmp_path):
     make_flag(recorder={"nodes": False}).run(tmp_path / "off", 2, progress=False)
     make_flag(solver={"formulation": "updated"}).run(tmp_path / "updated", 2, progress=False)
@@ -153,7 +170,7 @@ def test_a_resumed_run_records_the_same(make_flag, run, tmp_path):
     make_flag().run(folder, 3, progress=False)
     make_flag().run(folder, FRAMES, resume=True, progress=False)
     whole, parts = load_nodes(run / "nodes.npz"), load_nodes(folder / "nodes.npz")
-    assert whole.dtype == torch.float16
+    assert whole.dtype == torch.float32
     assert whole.shape[0] == FRAMES
     assert torch.equal(whole, parts)
     assert float(whole[-1].abs().max()) > 0

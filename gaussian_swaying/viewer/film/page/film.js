@@ -25,6 +25,19 @@ function readFrames(bytes, frames, row) {
   return all;
 }
 
+// The few nodes of each frame that swing far: index and displacement.
+function readFar(bytes, frames) {
+  const counts = reader(bytes.subarray(0, 4 * frames))(Uint32Array, frames);
+  const rows = reader(bytes.subarray(4 * frames))(Int32Array, (bytes.length - 4 * frames) / 4);
+  const values = new Float32Array(rows.buffer);
+  let at = 0;
+  return Array.from(counts, (count) => {
+    const begin = at;
+    at += 4 * count;
+    return { rows: rows.subarray(begin, at), values: values.subarray(begin, at) };
+  });
+}
+
 function readSplats(bytes, count) {
   const next = reader(bytes);
   return {
@@ -80,7 +93,7 @@ function makeGaussians(head, splats, nodes) {
   const { count } = head;
   const shapes = Array.from({ length: count }, (_, i) => covariance(splats, i));
   const float = THREE.FloatType;
-  const moved = texture(Uint16Array, nodes.length + 2, THREE.HalfFloatType, () => {});
+  const moved = texture(Float32Array, nodes.length + 2, float, () => {});
   const own = {
     rest: texture(Float32Array, count, float, (out, at, i) => {
       out.set(splats.position.subarray(3 * i, 3 * i + 3), at);
@@ -132,6 +145,8 @@ export async function play(read) {
   const splats = readSplats(await read("splats"), head.count);
   const nodes = reader(await read("nodes"))(Uint32Array, head.nodes);
   const frames = readFrames(await read("frames"), head.frames, 3 * head.nodes);
+  const far = readFar(await read("far"), head.frames);
+  const halves = Float32Array.from({ length: 65536 }, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
   const element = (name) => document.getElementById(name);
 
   const canvas = element("canvas");
@@ -179,10 +194,12 @@ export async function play(read) {
     const from = frames.subarray(frame * row, (frame + 1) * row);
     const data = moved.image.data;
     for (let i = 0, at = 0; i < row; i += 3, at += 4) {
-      data[at] = from[i];
-      data[at + 1] = from[i + 1];
-      data[at + 2] = from[i + 2];
+      data[at] = halves[from[i]];
+      data[at + 1] = halves[from[i + 1]];
+      data[at + 2] = halves[from[i + 2]];
     }
+    const { rows, values } = far[frame];
+    for (let i = 0; i < rows.length; i += 4) data.set(values.subarray(i + 1, i + 4), 4 * rows[i]);
     moved.needsUpdate = true;
     gaussians.updateVersion();
     state.frame = frame;
