@@ -25,6 +25,7 @@ from bench.tables import (
     speed,
     speed_plot,
     training,
+    web,
 )
 from gaussian_swaying._files import write_text
 
