@@ -29,7 +29,22 @@ from bench.tables import (
 )
 from gaussian_swaying._files import write_text
 
-TABLES = (accuracy, flags, goals, gradients, long_flag, pareto, peers, pins, points, previews, runs, speed, training)
+TABLES = (
+    accuracy,
+    flags,
+    goals,
+    gradients,
+    long_flag,
+    pareto,
+    peers,
+    pins,
+    points,
+    previews,
+    runs,
+    speed,
+    training,
+    web,
+)
 """The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
