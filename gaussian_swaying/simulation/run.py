@@ -86,8 +86,8 @@ def _check_checkpoint(
             "resume with the same splat, or start again without --resume."
         )
     followed = None if start.node_displacement is None else len(scene.follow.nodes(start.grid))
-    nodes = checkpoint.get("nodes")
-    if isinstance(nodes, bool) or nodes != followed:
+    nodes = checkpoint.get("nodes", "unknown")
+    if type(nodes) is not type(followed) or nodes != followed:
         raise ValueError(
             f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
             "the same splat, or start again without --resume."
