@@ -227,7 +227,7 @@ export async function play(read) {
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     renderer.setSize(width, height);
     const upright = Math.tan((head.camera.fov * Math.PI) / 360);
-    const distance = camera.position.distanceTo(controls.target);
+    const distance = new THREE.Vector3(...head.camera.eye).distanceTo(new THREE.Vector3(...head.camera.target));
     const across = Math.min(upright * head.camera.aspect, 0.75 / distance); // what a narrow window still shows
     camera.aspect = width / height;
     const half = Math.max(across / camera.aspect, upright);
