@@ -138,6 +138,21 @@ function makeGaussians(head, splats, nodes) {
   return { gaussians: new SplatGenerator({ numSplats: count, covGenerator }), moved };
 }
 
+// How far the moving Gaussians reach to the left and right of the first view, as a tangent.
+function reach(head, splats) {
+  const eye = new THREE.Vector3(...head.camera.eye);
+  const axis = new THREE.Vector3(...head.camera.target).sub(eye).normalize();
+  const right = new THREE.Vector3().crossVectors(axis, new THREE.Vector3(0, 0, 1)).normalize();
+  const ray = new THREE.Vector3();
+  let most = 0;
+  for (let i = 0; i < 3 * head.count; i += 3) {
+    ray.fromArray(splats.position, i).sub(eye);
+    const depth = ray.dot(axis);
+    if (splats.place[i] >= 0 && depth > 0) most = Math.max(most, Math.abs(ray.dot(right)) / depth);
+  }
+  return most;
+}
+
 // ---- the page
 
 export async function play(read) {
@@ -184,6 +199,8 @@ export async function play(read) {
   const loop = element("loop");
   slider.max = String(head.frames - 1);
 
+  const wanted = reach(head, splats) + 0.3 / camera.position.distanceTo(controls.target); // and room to swing
+
   function wake(pictures) {
     state.left = Math.max(state.left, pictures);
   }
@@ -227,8 +244,7 @@ export async function play(read) {
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     renderer.setSize(width, height);
     const upright = Math.tan((head.camera.fov * Math.PI) / 360);
-    const distance = new THREE.Vector3(...head.camera.eye).distanceTo(new THREE.Vector3(...head.camera.target));
-    const across = Math.min(upright * head.camera.aspect, 0.75 / distance); // what a narrow window still shows
+    const across = Math.min(upright * head.camera.aspect, wanted); // what a narrow window still shows
     camera.aspect = width / height;
     const half = Math.max(across / camera.aspect, upright);
     camera.fov = (2 * Math.atan(half) * 180) / Math.PI;
