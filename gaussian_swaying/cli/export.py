@@ -1,4 +1,7 @@
-"""Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or a run's ``ply`` folder to USD."""
+"""Convert a splat for viewers: ``gaussian-swaying export scene.ply scene.splat``, or a run's ``ply`` folder to USD.
+
+With ``--web``, a recorded run becomes a film that a browser plays: ``gaussian-swaying export --web outputs/flag``.
+"""
 
 import argparse
 import json
@@ -11,13 +14,28 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.export import SUFFIXES, convert, format_of
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.viewer.film.page import write_film
 
 
 def build_options() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
-    parser.add_argument("source", help="A .ply, compressed .ply or .splat, or a folder of .ply for an animated USD.")
-    parser.add_argument("target", help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}.")
+    parser.add_argument(
+        "source",
+        help="A .ply, compressed .ply or .splat, or a folder of .ply for an animated USD; with --web the folder of"
+        " a run.",
+    )
+    parser.add_argument(
+        "target",
+        nargs="?",
+        help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, or with --web in .html (default: "
+        "film.html in the folder of the run).",
+    )
+    parser.add_argument(
+        "--web",
+        action="store_true",
+        help="Write the run in the folder `source` as a film that a browser plays by itself.",
+    )
     parser.add_argument("--fps", type=float, help="Frames per second of a folder; default: those of its run, or 25.")
     parser.add_argument(
         "--up",
@@ -82,6 +100,11 @@ def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
     if options.fps is not None:
         check_positive("--fps", options.fps)
+    if options.web:
+        export_web(options)
+        return
+    if options.target is None:
+        raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(SUFFIXES.values())}.")
     if format_of(options.target) != "usd":
         if options.up is not None or options.metres_per_unit is not None:
             raise ValueError(
@@ -95,3 +118,23 @@ def export(options: argparse.Namespace) -> None:
         up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
         print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
     print(f"wrote {options.target}")
+
+
+def export_web(options: argparse.Namespace) -> None:
+    """Write the film of a run, and report its size.
+
+    Raises:
+        ValueError: If an option of the other formats is given, or the run cannot become a film.
+    """
+    given = {"--fps": options.fps, "--up": options.up, "--metres-per-unit": options.metres_per_unit}
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"{name} is not for --web, which takes it from the run: leave it out.")
+    run = Path(options.source)
+    target = run / "film.html" if options.target is None else Path(options.target)
+    film = write_film(run, target)
+    if film.notes:
+        print("\n".join(f"note: {note}" for note in film.notes))
+    head = film.head
+    print(f"{head['count']:,} Gaussians, {head['frames']:,} frames of {head['nodes']:,} nodes")
+    print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")

@@ -19,7 +19,7 @@ from gaussian_swaying.simulation.defaults import resolve_device
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.page import Page
 from gaussian_swaying.viewer.scenes import settings_of_splat
-from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.session import Session, share_cores
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -99,6 +99,8 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
 def _live(options: argparse.Namespace, further: Sequence[str]) -> None:
     parser = Simulation.parser()
     session = Session(parser, settings_of(parser, options.scene, further))
+    if session.simulation.device.type == "cpu":
+        share_cores()
     page = Page(session, options.host, options.port, options.pixels)
     session.start()
     print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)

@@ -34,6 +34,18 @@ class Followers(nn.Module, ABC):
             move = move + ((F - eye) * self.arm.to(F)[..., None, :]).sum(-1)
         return move, F
 
+    @property
+    @abstractmethod
+    def places(self) -> Tensor:
+        """Rest positions that are read [m], shape (M, 3)."""
+
+    def nodes(self, grid: GridSpec) -> Tensor:
+        """The nodes of a grid that the stencils of the places reach: flat indices in rising order, shape (N,).
+
+        Their order is the same in every grid that holds them.
+        """
+        return follower_stencil(self.places, grid).node.unique()
+
     @abstractmethod
     def velocity(self, state: MPMState) -> Tensor:
         """Velocity of the places that are read [m/s], shape (M, 3)."""
@@ -59,6 +71,11 @@ class PointFollowers(Followers):
         self.source: Tensor
         self.rest: Tensor
 
+    @property
+    def places(self) -> Tensor:
+        """Rest positions of the points that are followed [m], shape (M, 3)."""
+        return self.rest[self.source]
+
     def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
         return (state.position - self.rest)[self.source], state.F_total[self.source]
 
@@ -80,6 +97,11 @@ class GridFollowers(Followers):
         self.register_buffer("place", place, persistent=False)
         self.place: Tensor
         self._known: tuple[GridSpec, torch.device, Stencil] | None = None
+
+    @property
+    def places(self) -> Tensor:
+        """Rest positions that are read [m], shape (M, 3)."""
+        return self.place
 
     def stencil(self, grid: GridSpec) -> Stencil:
         """The 27 nodes of each follower."""

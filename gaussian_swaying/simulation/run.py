@@ -14,7 +14,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
 from gaussian_swaying.runs.seal import sha256
@@ -85,6 +85,13 @@ def _check_checkpoint(
             f"The trajectory in {output} is of {tracked} places, but the scene has {scene.tracked}: "
             "resume with the same splat, or start again without --resume."
         )
+    followed = None if start.node_displacement is None else len(scene.follow.nodes(start.grid))
+    nodes = checkpoint.get("nodes", "unknown")
+    if type(nodes) is not type(followed) or nodes != followed:
+        raise ValueError(
+            f"The Gaussians in {output} follow {nodes} nodes, but those of the scene follow {followed}: resume with "
+            "the same splat, or start again without --resume."
+        )
     most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
     try:
         check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited)
@@ -121,6 +128,7 @@ class Run:
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint holds it, which is written every frame
         self.walls, self.peak = WallClock(simulation.device), PeakMemory(simulation.device)
+        self._nodes: tuple[GridSpec, Tensor] | None = None
         self.force_end = self.recorder.force_scale or simulation.force_scale()
 
     def go(
@@ -218,6 +226,7 @@ class Run:
                     "wall_s": self.walls.read(),
                     "splat": self.splat,
                     "tracked": self.simulation.scene.tracked,
+                    "nodes": None if state.node_displacement is None else len(self.nodes(state.grid)),
                 }
             )
 
@@ -236,6 +245,16 @@ class Run:
                 recorder.write_splat(frame, self.painter.cloud(gaussians), self.simulation.scene.frame)
             if recorder.trajectory:
                 recorder.write_trajectory(frame, *self.simulation.scene.surface(state))
+            if recorder.nodes and state.node_displacement is not None:
+                scene = self.simulation.scene
+                limit = scene.size * scene.frame.metres_per_unit / 2  # rounding to float16 is then 0.02 % of the size
+                recorder.write_nodes(frame, state.node_displacement[self.nodes(state.grid)], limit)
+
+    def nodes(self, grid: GridSpec) -> Tensor:
+        """The nodes that the Gaussians follow, in a grid."""
+        if self._nodes is None or self._nodes[0] != grid:
+            self._nodes = (grid, self.simulation.scene.follow.nodes(grid))
+        return self._nodes[1]
 
     def picture(self, state: MPMState, gaussians: DeformedGaussians, frame: int, name: str) -> None:
         """Draw the requested pictures of a frame from one camera and pass them to the recorder."""
@@ -273,6 +292,7 @@ class Run:
             "device": describe_device(simulation.device),
             "versions": versions(),
             "seed": getattr(simulation.wind, "seed", None),
+            "splat_sha256": self.splat,
             "particles": solver.points.count,
             "gaussians": len(scene.model.means),
             "simulated_gaussians": len(scene.simulated),

@@ -340,7 +340,7 @@ class SimulatedScene(nn.Module):
         own = rest.means, rest.covariances, rest.normals
         if not self.all_move:
             own = rest.means[index], rest.covariances[index], rest.normals[index]
-        solid = None if self.max_stretch is None else self._solid()
+        solid = None if self.max_stretch is None else self.solid()
         moved = None
         if isinstance(self.follow, GridFollowers):
             moved = self.follow.drawn(state, self.frame, *own, rotations, self.max_stretch, solid)
@@ -370,7 +370,7 @@ class SimulatedScene(nn.Module):
         rest = self.track.place if self.track.arm is None else self.track.place + self.track.arm
         return rest + move, F
 
-    def _solid(self) -> Tensor:
+    def solid(self) -> Tensor:
         """Which moving Gaussians keep their shape because their law has no return map; bool, shape (M,)."""
         if self._kept is None or self._kept[0] is not self.points:  # an edit replaces the points
             laws, index = self.points.laws, self.points.law_index

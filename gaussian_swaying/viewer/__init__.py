@@ -1,1 +1,1 @@
-"""A live wind tunnel: a simulation that goes on while its wind and material are changed, on a local page."""
+"""Pages that show Gaussians in a browser: a live wind tunnel, and films of runs."""

@@ -167,6 +167,7 @@ class Page:
         self._closed = threading.Event()
         self._gone: dict[int, threading.Event] = {}
         self._drawn: dict[int, deque[float]] = {}
+        self._threads: list[threading.Thread] = []
         self._notice = ("", 0.0)
         self._version = 0  # of what is drawn besides snapshot and camera
         self.server = make_server(host, port)
@@ -191,6 +192,8 @@ class Page:
     def close(self) -> None:
         """Stop serving."""
         self._closed.set()
+        for thread in [*self._threads, self._health]:
+            thread.join(10.0)
         self.server.stop()
 
     def tell(self, notice: str, seconds: float = 15.0) -> None:
@@ -241,7 +244,9 @@ class Page:
         gone = self._gone[client.client_id] = threading.Event()
         self._drawn[client.client_id] = deque(maxlen=120)
         name = f"pictures {client.client_id}"
-        threading.Thread(target=self._serve, args=(client, gone), name=name, daemon=True).start()
+        thread = threading.Thread(target=self._serve, args=(client, gone), name=name, daemon=True)
+        self._threads = [known for known in self._threads if known.is_alive()] + [thread]
+        thread.start()
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         self._gone.pop(client.client_id, threading.Event()).set()
@@ -251,7 +256,8 @@ class Page:
 
     def _serve(self, client: viser.ClientHandle, gone: threading.Event) -> None:
         """Draw for a browser until it is gone."""
-        size = PictureSize(largest=self.largest, level=2 if self.session.simulation.device.type == "cpu" else 0)
+        on_cpu = self.session.simulation.device.type == "cpu"
+        size = PictureSize(0.14 if on_cpu else 0.05, self.largest, 2 if on_cpu else 0)
         seen: tuple[Any, ...] = ()
         number = -1
         while not (gone.is_set() or self._closed.is_set()):

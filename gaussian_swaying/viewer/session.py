@@ -22,8 +22,8 @@ from gaussian_swaying.viewer.pull import Pull
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-SLOW, FAST = 0.12, 0.03  # s: steps that take longer are halved, and shorter ones doubled again
-SHORTEST = 16  # a step is at least this part of `frame_dt`
+SLOW, FAST = 0.09, 0.025  # s: steps that take longer are halved, and shorter ones doubled again
+SHORTEST = 32  # a step is at least this part of `frame_dt`
 WINDOW = 2.0  # s, over which rates are averaged
 BEHIND = 0.25  # s that a session may be late before it stops trying to catch up
 
@@ -60,6 +60,11 @@ class Rates:
     real_time: float
     step: float
     substeps: int
+
+
+def share_cores() -> None:
+    """Give threads that start from now on half of the cores: one simulates and one draws, on a CPU."""
+    torch.set_num_threads(max(1, torch.get_num_threads() // 2))
 
 
 class Session:

@@ -228,7 +228,7 @@ def test_steps_get_shorter_where_they_take_long(parser, settings, until, monkeyp
     session = Session(parser, settings).start()
     until(lambda: session.simulation.frame_dt < 0.01)
     session.close()
-    assert session.simulation.frame_dt >= settings.frame_dt / 16
+    assert session.simulation.frame_dt >= settings.frame_dt / 32
 
 
 @pytest.mark.gpu

@@ -9,7 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from bench import pages, record, show
-from bench.cases import accuracy, flags, gallery, gradients, live, pareto, pins, points, previews, runs, speed, training
+from bench.cases import (
+    accuracy,
+    flags,
+    gallery,
+    gradients,
+    live,
+    pareto,
+    pins,
+    points,
+    previews,
+    runs,
+    speed,
+    training,
+    web,
+)
 from bench.slots import SlotError
 
 
@@ -73,6 +87,8 @@ COMMANDS = {
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
     "previews": Command("Compare the times that previews announce with those of runs.",
                         _going_on("previews", previews.measure), previews.add_arguments),
+    "web": Command("Measure films for the web: size, error, and speed in headless Chromium.",
+                   _going_on("web", web.measure), web.add_arguments, page="web.md"),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),

@@ -26,6 +26,7 @@ from bench.tables import (
     speed,
     speed_plot,
     training,
+    web,
 )
 from gaussian_swaying._files import write_text
 
@@ -44,6 +45,7 @@ TABLES = (
     runs,
     speed,
     training,
+    web,
 )
 """The modules that register the slots."""
 

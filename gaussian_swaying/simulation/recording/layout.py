@@ -12,13 +12,14 @@ FILES = [
     "config.yaml",
     "checkpoint.pt",
     "trajectory.npz",
+    "nodes.npz",
     "summary.json",
     "diagnostics.csv",
     "animation.usdc",
 ]
 # names that a run writes; a folder that was not made by a run must not contain them
-OURS = [*FILES, "frames", "ply", "trajectory", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
-OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4"]
+OURS = [*FILES, "frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4", "film.html"]
 
 
 def frame_folder(render: str = "color", camera: str = "") -> str:

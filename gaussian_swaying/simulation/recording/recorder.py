@@ -28,7 +28,14 @@ from gaussian_swaying.runs.folder import MARKER, check_names, claim_folder, hold
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
 from gaussian_swaying.simulation.recording.layout import FILES, OURS, frame_folder, raw_folder, video_file
-from gaussian_swaying.simulation.recording.resume import check_frames, check_pictures, check_positions, check_shards
+from gaussian_swaying.simulation.recording.nodes import NODES, split_far
+from gaussian_swaying.simulation.recording.resume import (
+    check_frames,
+    check_nodes,
+    check_pictures,
+    check_positions,
+    check_shards,
+)
 from gaussian_swaying.simulation.recording.trajectory import pack_trajectory
 from gaussian_swaying.simulation.recording.usd_film import pack_usd, write_usd_frame
 from gaussian_swaying.simulation.recording.video import VideoEncoder, encode_video
@@ -61,7 +68,8 @@ class Recorder:
     """Writes frames, trajectory, checkpoint, summary and video of a run to one folder.
 
     Layout: ``frames/00000.png``, ``ply/00000.ply``, ``trajectory.npz`` (arrays ``position_00000`` and ``F_00000``),
-    ``checkpoint.pt``, ``summary.json``, ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
+    ``nodes.npz`` (arrays ``displacement_00000`` and ``far_00000``), ``checkpoint.pt``, ``summary.json``,
+    ``diagnostics.csv`` (a row per frame), ``config.yaml``, ``video.mp4``.
 
     Other renders have separate folders, ``depth``, ``normal`` and ``force``, and videos with these names. Further
     cameras have the same layout in ``cameras/<name>``. Except for colour, pixels without Gaussians are black.
@@ -91,6 +99,9 @@ class Recorder:
         export_format: Format of the Gaussians: ``ply`` (3DGS, with normals), ``compressed_ply`` (for SuperSplat),
             ``splat``, or ``usd`` (all frames in one animation.usdc, in metres; needs usd-core). See
             ``gaussian_swaying.gaussians.export``.
+        nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
+            that the Gaussians follow for each frame; ``gaussian-swaying export --web`` needs it. Runs of ``updated``
+            have nothing to write.
     """
 
     def __init__(
@@ -106,6 +117,7 @@ class Recorder:
         normal_axes: str = "camera",
         force_scale: float | None = None,
         export_format: str = "ply",
+        nodes: bool = True,
     ) -> None:
         for name, value in (("ply_every", ply_every), ("checkpoint_every", checkpoint_every)):
             check_positive(f"recorder.{name}", value, allow_zero=True)
@@ -129,7 +141,7 @@ class Recorder:
             )
         if video and not images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
-        self.images, self.video, self.trajectory = images, video, trajectory
+        self.images, self.video, self.trajectory, self.nodes = images, video, trajectory, nodes
         self.ply_every, self.checkpoint_every, self.fps = int(ply_every), int(checkpoint_every), fps
         self._folder: Path | None = None
         self._writer = FrameWriter()
@@ -218,7 +230,7 @@ class Recorder:
         if check is not None:
             check(checkpoint)
         told = self._check_kept(path, checkpoint)
-        for folder in (path, *(path / name for name in self._folders())):
+        for folder in (path, path / "nodes", *(path / name for name in self._folders())):
             remove_temporaries(folder)  # of a run that was killed while writing
         if not (path / MARKER).exists():
             mark(path)
@@ -231,7 +243,8 @@ class Recorder:
         """Sentences about missing files of the frames so far; ValueError if something is damaged."""
         frames = checkpoint["frame"] + 1
         videos = [video_file(place) for place in self._films] if self.video else []
-        check_names(path, [*FILES, *videos], self._folders())
+        arrays = ["nodes"] if self.nodes else []
+        check_names(path, [*FILES, *videos], [*self._folders(), *arrays])
         told = []
         for place in self._picture_folders():
             film = video_file(place) if self.video and place in self._films else None
@@ -239,6 +252,8 @@ class Recorder:
         if self.trajectory:
             tracked = checkpoint.get("tracked")
             told += check_positions(path, frames, tracked if isinstance(tracked, int) else None)
+        if self.nodes and isinstance(checkpoint.get("nodes"), int):
+            told += check_nodes(path, frames, checkpoint["nodes"])
         if self.ply_every and self.export_format == "usd":
             told += check_shards(path, range(0, frames, self.ply_every))
         elif self.ply_every:
@@ -304,13 +319,28 @@ class Recorder:
 
     def write_trajectory(self, index: int, position: Tensor, F: Tensor) -> None:
         """Write position [m] (P, 3) and F (P, 3, 3) of one frame; :meth:`close` packs all into one file."""
-        path = self.folder / "trajectory" / f"{index:05d}.npz"
-        copy = HostCopy({f"position_{index:05d}": position.float(), f"F_{index:05d}": F.half()})
+        copy = HostCopy({"position": position.float(), "F": F.half()})
+        self._write_arrays("trajectory", index, lambda: {name: part.numpy() for name, part in copy.get().items()})
+
+    def write_nodes(self, index: int, displacement: Tensor, limit: float) -> None:
+        """Write the displacement of the nodes [m] (N, 3) of one frame; :meth:`close` packs all into one file.
+
+        Args:
+            index: Frame number.
+            displacement: The displacements.
+            limit: Longest displacement that float16 may round [m].
+        """
+        copy = HostCopy(displacement.float())
+        self._write_arrays("nodes", index, lambda: dict(zip(NODES, split_far(copy.get().numpy(), limit), strict=True)))
+
+    def _write_arrays(self, place: str, index: int, arrays: Callable[[], dict[str, np.ndarray]]) -> None:
+        path = self.folder / place / f"{index:05d}.npz"
 
         def write() -> None:
-            arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in copy.get().items()}
+            named: dict[str, Any] = {f"{name}_{index:05d}": array for name, array in arrays().items()}
+            path.parent.mkdir(exist_ok=True)  # that of the nodes is made by the first frame: `updated` has none
             with atomic(path) as temporary:
-                np.savez(temporary, **arrays)
+                np.savez(temporary, **named)
 
         self._submit(path, write)
 
@@ -409,9 +439,11 @@ class Recorder:
                 pack_usd(self.folder / "usd", made[-1], wanted, self.fps or self._real_time_fps)
             elif self.ply_every and frames:
                 made.append(self.folder / self.export_format)
-            if self.trajectory and frames:
-                pack_trajectory(self.folder / "trajectory", self.folder / "trajectory.npz", frames)
-                made.append(self.folder / "trajectory.npz")
+            moved = self.nodes and ((self.folder / "nodes").exists() or (self.folder / "nodes.npz").exists())
+            for name, kept in (("trajectory", self.trajectory), ("nodes", moved)):
+                if kept and frames:
+                    pack_trajectory(self.folder / name, self.folder / f"{name}.npz", frames)
+                    made.append(self.folder / f"{name}.npz")
             if self.images and frames:
                 made += [self.folder / place for place in self._picture_folders()]
                 for place in self._films:

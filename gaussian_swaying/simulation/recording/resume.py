@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gaussian_swaying._files import check_not_taken, kind_of
 from gaussian_swaying.gaussians.export import read_usd_frame
+from gaussian_swaying.simulation.recording.nodes import NODES
 from gaussian_swaying.simulation.recording.trajectory import check_trajectory
 
 
@@ -60,6 +61,13 @@ def check_positions(folder: Path, frames: int, particles: int | None) -> list[st
     held = check_trajectory(folder / "trajectory", folder / "trajectory.npz", frames, particles)
     lost = sorted(set(range(frames)) - held)
     return tell_missing([folder / "trajectory" / f"{index:05d}.npz" for index in lost], "trajectory.npz")
+
+
+def check_nodes(folder: Path, frames: int, nodes: int) -> list[str]:
+    """Check the displacements of the nodes of the frames so far; ValueError if a file is damaged."""
+    held = check_trajectory(folder / "nodes", folder / "nodes.npz", frames, nodes, NODES)
+    lost = sorted(set(range(frames)) - held)
+    return tell_missing([folder / "nodes" / f"{index:05d}.npz" for index in lost], "nodes.npz")
 
 
 def check_shards(folder: Path, wanted: Iterable[int]) -> list[str]:

@@ -1,4 +1,7 @@
-"""The trajectory of a run, ``trajectory.npz``: arrays ``position_00000`` and ``F_00000`` per frame."""
+"""Arrays of the frames of a run, packed into one file at its end.
+
+``trajectory.npz`` has arrays ``position_00000`` and ``F_00000`` per frame, ``nodes.npz`` those of :mod:`.nodes`.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import os
 import re
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO
 
@@ -17,7 +20,13 @@ from torch import Tensor
 from gaussian_swaying._files import atomic, check_not_taken
 from gaussian_swaying._inputs import check_archive
 
-_MEMBER = re.compile(r"(position|F)_(\d{5})\.npy")
+_MEMBER = re.compile(r"([A-Za-z]+)_(\d{5})\.npy")
+
+TRAJECTORY: dict[str, tuple[tuple[int, ...], type, bool]] = {
+    "position": ((3,), np.float32, True),
+    "F": ((3, 3), np.float16, True),
+}
+"""The arrays of a frame in ``trajectory.npz``: shape of a row, type, and whether every frame has as many rows."""
 
 
 def pack_trajectory(shards: Path, target: Path, frames: int) -> None:
@@ -48,7 +57,13 @@ def _sources(shards: Path, target: Path) -> Iterator[Path]:
         yield target
 
 
-def check_trajectory(shards: Path, target: Path, frames: int, particles: int | None = None) -> set[int]:
+def check_trajectory(
+    shards: Path,
+    target: Path,
+    frames: int,
+    particles: int | None = None,
+    arrays: Mapping[str, tuple[tuple[int, ...], type, bool]] = TRAJECTORY,
+) -> set[int]:
     """Check the files that :func:`pack_trajectory` would join, with the checksum of every array.
 
     Args:
@@ -56,24 +71,26 @@ def check_trajectory(shards: Path, target: Path, frames: int, particles: int | N
         target: The joined file of an earlier part, if any.
         frames: Number of frames that were recorded.
         particles: Number of particles that each must have; None for any.
+        arrays: The arrays of a frame.
 
     Returns:
-        The frames that have both position and F.
+        The frames that have all arrays.
 
     Raises:
         ValueError: If a file is damaged or not a regular file.
     """
-    found: dict[str, set[int]] = {"position": set(), "F": set()}
+    found: dict[str, set[int]] = {name: set() for name in arrays}
     for source in _sources(shards, target):
         check_not_taken(source)
         try:
             with zipfile.ZipFile(source) as archive:
                 for member in archive.infolist():
                     name = _MEMBER.fullmatch(member.filename)
-                    if name is None:
+                    if name is None or name[1] not in arrays:
                         raise ValueError(f"it contains {member.filename}, which no run writes")
                     with archive.open(member) as stream:
-                        _check_array(stream, name[1], particles)
+                        sizes, kind, fixed = arrays[name[1]]
+                        _check_array(stream, sizes, kind, particles if fixed else None)
                         while stream.read(1 << 20):  # up to the end, where its checksum is compared
                             pass
                     if int(name[2]) < frames:
@@ -83,15 +100,14 @@ def check_trajectory(shards: Path, target: Path, frames: int, particles: int | N
             raise ValueError(
                 f"{source} is damaged ({why}): remove it to go on without its frames, or start again without --resume."
             ) from error
-    return found["position"] & found["F"]
+    return set.intersection(*found.values())
 
 
-def _check_array(stream: IO[bytes], name: str, particles: int | None) -> None:
+def _check_array(stream: IO[bytes], sizes: tuple[int, ...], kind: type, particles: int | None) -> None:
     """Read the header of an array and check its shape and type."""
     if np.lib.format.read_magic(stream) != (1, 0):
         raise ValueError("an array has another format")
     shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    sizes, kind = ((3,), np.float32) if name == "position" else ((3, 3), np.float16)
     if shape[1:] != sizes or dtype != kind or (particles is not None and shape[0] != particles):
         raise ValueError(f"an array of {dtype} {shape} is not from this run")
 

@@ -103,6 +103,7 @@ def test_files_of_a_run(make_simulation, tmp_path):
         "frames/00000.png",
         "frames/00001.png",
         "frames/00002.png",
+        "nodes.npz",
         "ply",
         "ply/00000.ply",
         "ply/00002.ply",
@@ -126,7 +127,7 @@ def test_diagnostics_are_a_table_too(make_simulation, tmp_path):
 
 
 def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
-    recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0)
+    recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0, nodes=False)
     _run(make_simulation(), tmp_path / "run", recorder=recorder)
     assert _names(tmp_path / "run") == ["config.yaml", "diagnostics.csv", "run.json", "summary.json"]
     with pytest.raises(ValueError, match=r"`recorder.images`"):
@@ -494,7 +495,7 @@ def test_a_run_holds_no_more_than_the_queue(make_simulation, tmp_path, monkeypat
     _not_again(monkeypatch)
     _run(make_simulation(), tmp_path / "run", 5)
     assert max(most) == 3
-    assert len(most) == 20
+    assert len(most) == 25
     assert len(iio.imread(tmp_path / "run" / "video.mp4")) == 5
 
 

@@ -46,7 +46,8 @@ def _refused(resume, folder, case=""):
     return str(caught.value)
 
 
-READ = ["frames/00001.png", "depth/00001.png", "depth_raw/00001.png", "trajectory/00002.npz", "trajectory.npz"]
+READ = ["frames/00001.png", "depth/00001.png", "depth_raw/00001.png", "trajectory/00002.npz"]
+READ += ["trajectory.npz", "nodes.npz"]
 
 
 def test_damaged_files_are_found_at_the_start(run):
@@ -69,7 +70,7 @@ def test_damaged_files_are_found_at_the_start(run):
 
 
 def test_bits_that_change_are_found_or_change_nothing(run, tmp_path):
-    """60 single bits of pictures and trajectories: refused in the sentence, or the run ends with the same numbers."""
+    """72 single bits of what was recorded: refused in the sentence, or the run ends with the same numbers."""
     folder, resume = run
     generator, refused, same = random.Random(0), 0, 0
     kept = tmp_path / "kept"
@@ -99,8 +100,8 @@ def test_bits_that_change_are_found_or_change_nothing(run, tmp_path):
                 for one, other in zip(load_trajectory(folder / "trajectory.npz", frame), expected[frame], strict=True):
                     assert one.equal(other)
                 assert np.array_equal(iio.imread(folder / "frames" / f"{frame:05d}.png"), pictures[frame])
-    assert refused + same == 60
-    assert refused > 40
+    assert refused + same == 72
+    assert refused > 50
 
 
 def test_files_of_another_run_are_no_frames_of_this(run):

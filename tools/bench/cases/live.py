@@ -15,7 +15,7 @@ from bench import record
 from bench.page_client import PageClient
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.page import Page
-from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.session import Session, share_cores
 
 Row = dict[str, Any]
 SIZES = {"cpu": (640, 360), "cuda": (1920, 1080)}
@@ -28,6 +28,8 @@ def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
     """A page, and one client on the same machine."""
     parser = Simulation.parser()
     session = Session(parser, parser.parse_args([*arguments, "--device", device]))
+    if device == "cpu":
+        share_cores()
     page = Page(session, port=8700, largest=max(SIZES[device]))
     first = page.server.initial_camera
     wxyz = camera_rotation(first.position, first.look_at, session.simulation.scene.frame.rotation[2].tolist())

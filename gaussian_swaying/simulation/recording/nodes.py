@@ -1,0 +1,72 @@
+"""The displacement of nodes in a file: two bytes a number, and four for the few nodes that swing far.
+
+A node at the border of a body has almost no mass. It may swing far, even by thousands of times the size of the body,
+while all that is read from it nearly cancels. So such nodes need more than float16.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._inputs import check_archive
+
+NODES: dict[str, tuple[tuple[int, ...], type, bool]] = {
+    "displacement": ((3,), np.float16, True),
+    "far": ((4,), np.int32, False),
+}
+"""The arrays of a frame in ``nodes.npz``, as ``TRAJECTORY`` in :mod:`.trajectory`."""
+
+
+def split_far(displacement: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements in float16, and those of the nodes that moved farther than a limit.
+
+    Args:
+        displacement: Displacement of the nodes [m], float32, shape (N, 3).
+        limit: Longest displacement that float16 may round [m].
+
+    Returns:
+        The displacements, float16, shape (N, 3), zero for the far nodes; and index and displacement of the far ones,
+        the latter as the bits of float32, int32, shape (L, 4).
+    """
+    return split_at(displacement, ~(np.abs(displacement).max(axis=1, initial=0) <= min(limit, 65504.0)))
+
+
+def split_at(displacement: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`split_far` for given far nodes, bool, shape (N,)."""
+    index = far.nonzero()[0].astype(np.int32)
+    rows = np.concatenate([index[:, None], displacement[far].astype(np.float32).view(np.int32)], axis=1)
+    return np.where(far[:, None], 0, displacement).astype(np.float16), rows
+
+
+def join_far(near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """The displacements that :func:`split_far` split, float32, shape (N, 3)."""
+    displacement = near.astype(np.float32)
+    displacement[far[:, 0]] = np.ascontiguousarray(far[:, 1:]).view(np.float32)
+    return displacement
+
+
+def load_nodes(path: str | os.PathLike[str]) -> Tensor:
+    """Displacement of the recorded nodes [m, z up] in all frames, float32, shape (frames, nodes, 3).
+
+    The nodes are those of :meth:`~gaussian_swaying.simulation.followers.Followers.nodes`.
+
+    Args:
+        path: ``nodes.npz`` of a run of ``total``.
+
+    Raises:
+        ValueError: If a frame is missing, or the frames differ in their nodes.
+    """
+    with np.load(check_archive(path, "the run")) as arrays:
+        count = len(arrays.files) // len(NODES)
+        names = {f"{name}_{index:05d}" for index in range(count) for name in NODES}
+        if not count or names != set(arrays.files):
+            raise ValueError(f"{path} lacks frames: run the simulation again, without --resume.")
+        try:
+            frames = [join_far(arrays[f"displacement_{k:05d}"], arrays[f"far_{k:05d}"]) for k in range(count)]
+            return torch.from_numpy(np.stack(frames))
+        except (IndexError, ValueError) as error:
+            raise ValueError(f"{path} is damaged ({error}): run the simulation again, without --resume.") from error

@@ -1,0 +1,204 @@
+"""What a film shows, read from the folder of a run: Gaussians at rest, nodes that move, a camera."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
+from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.runs.seal import sha256
+from gaussian_swaying.simulation.config import parse_file
+from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.recording.nodes import load_nodes
+from gaussian_swaying.simulation.scene import SimulatedScene
+from gaussian_swaying.simulation.simulation import Simulation
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film of N Gaussians and M nodes in K frames.
+
+    The unit of length is the object's longest side at rest, with z up and the origin at its centre. A place is given in
+    cells of the grid, from its first node.
+
+    Attributes:
+        head: What the page needs besides: sizes, time between frames [s], grid, light, camera, title.
+        position: Centres at rest, float32, shape (N, 3).
+        place: Where each reads displacement and gradient [cells], float32, shape (N, 3); -1 for those that never move.
+        scale: Logarithm of the standard deviations, float16, shape (N, 3).
+        turn: Quaternions wxyz in steps of 1/32767, int16, shape (N, 4).
+        facing: Unit normals in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape (N, 4).
+        color: Red, green, blue and opacity in steps of 1/255, uint8, shape (N, 4).
+        nodes: Flat indices of the nodes in the grid, rising, uint32, shape (M,).
+        displacement: Displacement of the nodes [m], float32, shape (K, M, 3); float16 is enough for most.
+        notes: Sentences on what the film does not show as the run does.
+    """
+
+    head: dict[str, Any]
+    position: np.ndarray
+    place: np.ndarray
+    scale: np.ndarray
+    turn: np.ndarray
+    facing: np.ndarray
+    color: np.ndarray
+    nodes: np.ndarray
+    displacement: np.ndarray
+    notes: tuple[str, ...] = ()
+
+
+def read_film(run: Path) -> Film:
+    """The film of a recorded run of ``total``.
+
+    The Gaussians at rest are made again from the configuration of the run and its splat.
+
+    Args:
+        run: The output folder of ``gaussian-swaying sim``.
+
+    Raises:
+        ValueError: If the folder is not of a run, the run is of ``updated`` or has no recorded nodes, or its splat has
+            moved or changed.
+    """
+    summary = _summary(run)
+    simulation, name = _rebuild(run, summary)
+    displacement = load_nodes(run / "nodes.npz")
+    grid, scene = simulation.start().grid, simulation.scene
+    nodes = scene.follow.nodes(grid)
+    if displacement.shape[1] != len(nodes):
+        raise ValueError(
+            f"{run / 'nodes.npz'} has {displacement.shape[1]:,} nodes, but the scene of {run / 'config.yaml'} has "
+            f"{len(nodes):,}: export with the version of this program that made the run, or run it again."
+        )
+    with torch.inference_mode():
+        return _film(simulation, grid, nodes, displacement, name)
+
+
+def _summary(run: Path) -> dict[str, Any]:
+    """The summary of a run whose nodes were recorded."""
+    if not (run / "summary.json").is_file() or not (run / "config.yaml").is_file():
+        raise ValueError(f"{run} has no run: give the output folder of `gaussian-swaying sim`.")
+    try:
+        summary: dict[str, Any] = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+        formulation = summary["formulation"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{run / 'summary.json'} cannot be read ({error}): run the simulation again.") from error
+    if formulation != "total":
+        raise ValueError(
+            f"The run in {run} is of `solver.formulation: {formulation}`, where nodes do not move with the material: "
+            "a film needs a run of `total`."
+        )
+    if not (run / "nodes.npz").is_file():
+        raise ValueError(f"The run in {run} has no nodes.npz: run it again with `recorder.nodes: true`.")
+    return summary
+
+
+def _rebuild(run: Path, summary: dict[str, Any]) -> tuple[Simulation, str]:
+    """The simulation of a run, on the CPU, and a name for what it shows."""
+    config = run / "config.yaml"
+    parser = Simulation.parser()
+    try:
+        settings = parse_file(parser, config)
+    except ValueError as error:
+        raise ValueError(f"{config} cannot be read, as a run made from Python cannot be repeated ({error})") from error
+    splat = settings.scene.ply
+    if splat is not None:
+        if not Path(splat).is_file():
+            raise ValueError(
+                f"The splat {splat} of the run is not there (`scene.ply` in {config}): put it back, or export from the "
+                "folder in which the run was started."
+            )
+        if summary.get("splat_sha256") not in (None, sha256(Path(splat))):
+            raise ValueError(f"The splat {splat} has changed since the run in {run}: restore it, or run again.")
+    made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
+    return Simulation.from_settings(parser, settings, device="cpu"), made if splat is None else Path(splat).stem
+
+
+def _film(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement: Tensor, name: str) -> Film:
+    scene, painter = simulation.scene, simulation.painter
+    size, count = scene.size * scene.frame.metres_per_unit, len(scene.model.means)
+    position = scene.frame.point_to_sim(scene.model.means.double()) / size
+    turn, scale = covariance_to_quat_scale(scene.frame.covariance_to_sim(scene.rest_covariances.double()) / size**2)
+    place = torch.full((count, 3), -1.0)
+    place[scene.moving] = in_cells(scene.follow.places, grid).float()
+    facing = torch.zeros(count, 4)
+    facing[scene.moving, :3] = scene.rest_facing.float()
+    facing[scene.moving, 3] = scene.solid().float()
+    color = sh_to_color(scene.model.sh[:, :1], torch.ones(count, 3))
+    color = torch.cat([color, scene.model.opacity()[:, None]], dim=-1)
+    shader, light, notes = painter.shader, None, []
+    if isinstance(shader, DiffuseShader):
+        light = {"light": shader.light.tolist(), "two_sided": shader.two_sided, "ambient": shader.ambient}
+        light["relative"] = shader.relative
+    elif shader is not None:
+        notes.append(f"the film has no {type(shader).__name__}: the Gaussians keep the colours of the splat.")
+    if scene.model.view_dependent:
+        notes.append("colours that depend on the direction of view are the same from all sides.")
+    head = {
+        "count": count,
+        "nodes": len(nodes),
+        "frames": len(displacement),
+        "frame_dt": simulation.frame_dt,
+        "metre": 1 / size,
+        "cell": grid.dx / size,
+        "corner": [first * grid.dx / size for first in grid.offset],
+        "resolution": list(grid.resolution),
+        "max_stretch": scene.max_stretch,
+        "shader": light,
+        "background": painter.background.tolist(),
+        "camera": _camera(painter, scene, size),
+        "title": f"{name[:1].upper()}{name[1:]} in the wind",
+    }
+    return Film(
+        head,
+        position.float().numpy(),
+        place.numpy(),
+        scale.half().numpy(),
+        _steps(turn),
+        _steps(facing),
+        (color.clamp(0, 1) * 255).round().to(torch.uint8).numpy(),
+        nodes.numpy().astype(np.uint32),
+        displacement.numpy(),
+        tuple(notes),
+    )
+
+
+def in_cells(places: Tensor, grid: GridSpec) -> Tensor:
+    """Places [m] in cells of the grid, from its first node, shape (N, 3), float64.
+
+    Those that lie on a border between stencils but for rounding are moved onto it, as in
+    :func:`~gaussian_swaying.simulation.followers.follower_stencil`.
+    """
+    cells = places / grid.dx
+    border = cells.floor() + 0.5
+    close = (cells - border).abs() < torch.finfo(places.dtype).eps ** 0.5
+    return torch.where(close, border, cells).double() - torch.tensor(grid.offset)
+
+
+def _steps(values: Tensor) -> np.ndarray:
+    """Numbers from -1 to 1 in steps of 1/32767."""
+    found: np.ndarray = (values.double().clamp(-1, 1) * 32767).round().to(torch.int16).numpy()
+    return found
+
+
+def _camera(painter: Painter, scene: SimulatedScene, size: float) -> dict[str, Any]:
+    """The first camera of a run: eye, the point on its axis closest to the object, field of view [degrees]."""
+    camera = painter.camera_at(0)
+    eye = scene.frame.point_to_sim(camera.position.double()) / size
+    axis = scene.frame.direction_to_sim(camera.world_to_camera[2, :3].double())
+    target = eye + axis * float((-eye * axis).sum().clamp_min(0.2))
+    field = 2 * torch.atan(camera.height / (2 * camera.intrinsics[1, 1].double()))
+    across = camera.width * camera.intrinsics[1, 1] / (camera.height * camera.intrinsics[0, 0])
+    return {
+        "eye": eye.tolist(),
+        "target": target.tolist(),
+        "fov": float(field.rad2deg()),
+        "aspect": float(across),
+    }

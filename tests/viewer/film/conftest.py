@@ -1,0 +1,67 @@
+"""A small flag, recorded as a run."""
+
+import pytest
+import yaml
+
+from gaussian_swaying.simulation.simulation import Simulation
+
+FRAMES = 6
+
+SETTINGS = {
+    "background": [0.55, 0.68, 0.8],
+    "scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.05}}, "max_stretch": None},
+    "material": {"E": 9e3, "nu": 0.3, "density": 30.0, "thickness": 0.01},
+    "solver": {
+        "formulation": "total",
+        "dx": 0.1,
+        "boundaries": [
+            {
+                "class_path": "PinnedRegion",
+                "init_args": {
+                    "region": {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.1, None, None]}}
+                },
+            }
+        ],
+    },
+    "wind": {"flow": [6.0, 3.0, 0.0]},
+    "shader": {
+        "class_path": "DiffuseShader",
+        "init_args": {"light": [-0.3, -1.0, 0.6], "two_sided": True, "ambient": 0.3},
+    },
+    "camera": {
+        "class_path": "OrbitCamera",
+        "init_args": {"width": 320, "height": 180, "azimuth": -70.0, "elevation": 8.0, "radius": 1.5},
+    },
+    "recorder": {"video": False, "checkpoint_every": 1},
+}
+
+
+def _merged(settings, changes):
+    both = dict(settings)
+    for name, value in changes.items():
+        both[name] = (
+            _merged(both[name], value)
+            if isinstance(value, dict) and name in both and "class_path" not in value
+            else value
+        )
+    return both
+
+
+@pytest.fixture(scope="session")
+def make_flag(tmp_path_factory):
+    """The simulation of the flag, with some settings changed, from its file."""
+
+    def make(**changes):
+        path = tmp_path_factory.mktemp("flag") / "flag.yaml"
+        path.write_text(yaml.safe_dump(_merged(SETTINGS, changes)))
+        return Simulation.from_yaml(path, device="cpu")
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def run(make_flag, tmp_path_factory):
+    """The folder of a run of the flag."""
+    folder = tmp_path_factory.mktemp("run") / "flag"
+    make_flag().run(folder, FRAMES, progress=False)
+    return folder

@@ -1,0 +1,151 @@
+"""A film in a real browser. Skipped without Chromium or its client."""
+
+import shutil
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.viewer.film.page import write_film
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+client = pytest.importorskip("playwright.sync_api", reason="needs playwright, which drives the browser")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs an installed Chromium")
+
+SOFTWARE = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
+SOFTWARE += ["--disable-component-update", "--disable-sync"]
+DRAWN = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SHOWN = "!!window.film || !document.getElementById('message').textContent.startsWith('Loading')"
+
+
+STRETCHED = {"scene": {"max_stretch": 1.03}}  # many Gaussians are drawn at the limit
+
+
+@pytest.fixture(scope="module")
+def run(make_flag, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stretched") / "flag"
+    make_flag(**STRETCHED).run(folder, 6, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def film(run, tmp_path_factory):
+    target = tmp_path_factory.mktemp("film") / "film.html"
+    write_film(run, target)
+    return target
+
+
+@pytest.fixture
+def show():
+    """Opens a page of a size; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
+    with client.sync_playwright() as driver:
+        opened = []
+
+        def show(path, width=320, height=180, arguments=DRAWN):
+            browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE + arguments)
+            opened.append(browser)
+            page = browser.new_page(viewport={"width": width, "height": height})
+            page.told, page.asked = [], []
+            page.on("console", lambda message: page.told.append(message.text))
+            page.on("pageerror", lambda error: page.told.append(str(error)))
+            page.on("request", lambda request: page.asked.append(request.url))
+            page.goto(path.as_uri())
+            end = time.monotonic() + 60
+            while not page.evaluate(SHOWN):
+                assert time.monotonic() < end, page.told
+                time.sleep(0.1)
+            return page
+
+        yield show
+        for browser in opened:
+            browser.close()
+
+
+def _picture(page):
+    """The canvas as it is shown, without the controls, shape (H, W, 3)."""
+    import imageio.v3 as iio
+
+    page.add_style_tag(content="header, footer { display: none !important; }")
+    return iio.imread(page.screenshot())[..., :3].astype(float)
+
+
+def _psnr(one, other):
+    return 10 * np.log10(255**2 / np.mean((one - other) ** 2))
+
+
+def test_the_film_is_the_run(show, film, run, make_flag):
+    """Centres from the GPU, pictures as those of the run, scrubbing, playing; nothing is asked of a network."""
+    import imageio.v3 as iio
+
+    page, simulation = show(film), make_flag(**STRETCHED)
+    assert page.evaluate("document.getElementById('message').hidden")
+    scene = simulation.scene
+    size, pictures = scene.size * scene.frame.metres_per_unit, {}
+    for frame in simulation.frames(6):
+        if frame.index not in (0, 2, 5):
+            continue
+        page.evaluate(f"film.seek({frame.index})")
+        assert page.evaluate("film.frame()") == frame.index
+        values = page.evaluate("film.positions().then((found) => Array.from(found))")
+        found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
+        expected = scene.frame.point_to_sim(scene.deformed(frame.state).means.double()) / size
+        assert float((found - expected).norm(dim=-1).max()) < 1e-3  # of the object's size
+        pictures[frame.index] = _picture(page)
+        assert _psnr(pictures[frame.index], iio.imread(run / f"frames/{frame.index:05d}.png")) > 45
+    assert np.abs(pictures[0] - pictures[5]).max() > 50
+    assert float((expected - scene.frame.point_to_sim(scene.rest().means.double()) / size).abs().max()) > 0.02
+    before = page.evaluate("film.drawn()")
+    page.evaluate("film.play()")
+    end = time.monotonic() + 20
+    while page.evaluate("film.drawn()") < before + 5:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    page.evaluate("film.pause()")
+    assert page.told == []
+    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_controls_at_the_size_of_a_phone(show, film):
+    """Slider, button and a drag; everything lies within the window."""
+    page = show(film, 390, 844)
+    page.locator("#play").click()
+    page.evaluate("film.seek(0)")
+    first = _whole(page)
+    page.locator("#time").focus()
+    page.keyboard.press("End")
+    page.evaluate("film.seek(film.frame())")
+    assert page.evaluate("film.frame()") == 5
+    assert page.locator("#clock").inner_text() == "0.20 / 0.20 s"
+    second = _whole(page)
+    assert np.abs(first - second).max() > 50
+    page.mouse.move(195, 420)
+    page.mouse.down()
+    page.mouse.move(285, 420, steps=3)
+    page.mouse.up()
+    page.evaluate("film.seek(5)")
+    assert np.abs(_whole(page) - second).max() > 50
+    for name in ("#play", "#time", "#clock", "#loop"):
+        box = page.locator(name).bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+        assert box["y"] + box["height"] <= 844
+    page.locator("#loop").click()
+    assert page.locator("#loop").get_attribute("aria-pressed") == "false"
+    assert page.told == []
+
+
+def _whole(page):
+    import imageio.v3 as iio
+
+    return iio.imread(page.screenshot(clip={"x": 0, "y": 100, "width": 390, "height": 600}))[..., :3].astype(float)
+
+
+def test_a_browser_without_webgl2_says_so(show, film):
+    page = show(film, arguments=["--disable-gpu", "--disable-3d-apis"])
+    message = page.locator("#message")
+    assert message.is_visible()
+    assert message.inner_text() == (
+        "This film needs WebGL2, which this browser lacks or has switched off: open it in a current browser."
+    )
+    assert page.told == []

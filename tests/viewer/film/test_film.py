@@ -1,0 +1,240 @@
+"""What a film holds, against the Gaussians of the run; what is recorded for it; what cannot become a film."""
+
+import base64
+import json
+import re
+import shutil
+import zlib
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.cli.export import main
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.mpm.transfer import bspline_weights
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.recording.nodes import join_far, load_nodes, split_far
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.viewer.film.page import pack, page, unpack
+from gaussian_swaying.viewer.film.recorded import read_film
+
+FRAMES = 6
+
+
+def moved(film, frame):
+    """Centres and covariances of a film's frame [its units], by the formula of the page, in float64."""
+    head = film.head
+    row = np.full(np.prod(head["resolution"]), -1)
+    row[film.nodes] = np.arange(len(film.nodes))
+    place = torch.from_numpy(film.place).double()
+    base = (place - 0.5).floor()
+    w, slope = bspline_weights((place - base).T)
+    u, gradient = torch.zeros(len(place), 3).double(), torch.zeros(len(place), 3, 3).double()
+    displacement = torch.from_numpy(film.displacement[frame]).double() * head["metre"]
+    for i, j, k in np.ndindex(3, 3, 3):
+        x, y, z = (base + torch.tensor([i, j, k])).long().T.numpy()
+        _, ny, nz = head["resolution"]
+        at = row[np.maximum((x * ny + y) * nz + z, 0)]
+        q = displacement[np.maximum(at, 0)]
+        weights = w[0, i] * w[1, j] * w[2, k]
+        absent = (at < 0) & (film.place[:, 0] >= 0)
+        assert not bool((weights[absent] > 1e-12).any()), "a node is missing"
+        u += weights[:, None] * q
+        along = (slope[0, i] * w[1, j] * w[2, k], w[0, i] * slope[1, j] * w[2, k], w[0, i] * w[1, j] * slope[2, k])
+        gradient += q[:, :, None] * torch.stack(along, dim=-1)[:, None, :]
+    still = (place[:, 0] < 0)[:, None]
+    u = torch.where(still, 0, u)
+    F = torch.eye(3).double() + torch.where(still[..., None], 0, gradient / head["cell"])
+    centre = torch.from_numpy(film.position).double()
+    arm = centre - (place * head["cell"] + torch.tensor(head["corner"]))
+    own = covariance(torch.from_numpy(film.turn).double() / 32767, torch.from_numpy(film.scale).double())
+    position = centre + u + torch.where(still, 0, ((F - torch.eye(3)) @ arm[..., None])[..., 0])
+    return position, F @ own @ F.mT
+
+
+def check(simulation, film, frame, state):
+    """The film against the Gaussians of the state, within what float16 allows."""
+    scene = simulation.scene
+    size = scene.size * scene.frame.metres_per_unit
+    drawn = scene.deformed(state)
+    position, shape = moved(film, frame)
+    expected = scene.frame.point_to_sim(drawn.means.double()) / size
+    most = float(state.node_displacement.abs().max()) / size
+    rounding = most * 2**-11  # of each node; the weights are positive and add up to 1
+    in_gradient = 2 * rounding / film.head["cell"]  # slopes of a quadratic spline add up to at most 2
+    arms = 0.0 if scene.follow.arm is None else float(scene.follow.arm.norm(dim=-1).max()) / size
+    assert float((position - expected).abs().max()) <= rounding + 3 * in_gradient * arms + 1e-6
+    assert float((position - expected).norm(dim=-1).max()) < 1e-3
+    wanted = scene.frame.covariance_to_sim(drawn.covariances.double()) / size**2
+    scale = wanted.diagonal(dim1=-2, dim2=-1).sum(-1)
+    stored = 2 * 2**-9 + 1e-4  # float16 of a logarithm between 4 and 8 in size, twice; quaternions
+    assert float(((shape - wanted).abs().amax((-1, -2)) / scale).max()) <= stored + 6 * in_gradient
+    return most
+
+
+@pytest.mark.parametrize("points", ["grid", "gaussian"])
+def test_centres_and_covariances_are_those_of_the_run(make_flag, run, tmp_path, points):
+    """Every Gaussian in several frames; also where they follow material points, which read the same nodes."""
+    if points == "gaussian":
+        run = tmp_path / "run"
+        make_flag(scene={"points": "gaussian"}).run(run, FRAMES, progress=False)
+    simulation = make_flag(scene={"points": points})
+    film = read_film(run)
+    assert film.head["count"] == len(simulation.scene.model.means) == len(film.position)
+    for frame in simulation.frames(FRAMES):
+        most = check(simulation, film, frame.index, frame.state)
+    assert most > 0.02  # it moved
+
+
+def test_carried_static_and_plated_gaussians(make_flag, tmp_path):
+    """Part of the flag is static, part is faint and follows, and the sheet has three layers."""
+    region = {"class_path": "Box", "init_args": {"min": [None, None, 0.2], "max": [None, None, None]}}
+    make = lambda: make_flag(scene={"region": region, "layers": 3, "up": [0.0, 0.6, 0.8], "longest_side": 0.5})  # noqa: E731
+    make().run(tmp_path / "run", 4, progress=False)
+    simulation, film = make(), read_film(tmp_path / "run")
+    assert 0 < (film.place[:, 0] < 0).sum() == len(film.place) - len(simulation.scene.moving)
+    for frame in simulation.frames(4):
+        check(simulation, film, frame.index, frame.state)
+
+
+def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
+    """What stands in the page is what was put there; the page names nothing outside itself; its size is bounded."""
+    assert main(["--web", str(run)]) == 0
+    told = capsys.readouterr().out
+    text = (run / "film.html").read_text()
+    assert re.search(r"384 Gaussians, 6 frames of \d+ nodes\nwrote .*film\.html \(1\.\d MB\)\n", told)
+    parts = dict(re.findall(r'<script type="text/plain" id="film-(\w+)">([^<]+)</script>', text))
+    blocks = {name: zlib.decompress(base64.b64decode(part)) for name, part in parts.items()}
+    assert b"SparkRenderer" in blocks.pop("code")
+    film, again = read_film(run), unpack(blocks)
+    assert film.head == again.head
+    for name in ("position", "place", "scale", "turn", "facing", "color", "nodes", "displacement"):
+        one, other = getattr(film, name), getattr(again, name)
+        assert one.dtype == other.dtype
+        assert np.array_equal(one, other)
+    assert not re.search(r'(src|href)="(?!data:,)', text)
+    for licence in ("WORLD LABS", "three.js authors", "Arjun Barrett"):
+        assert licence in text
+    data = sum(len(block) for block in pack(film).values())
+    head, rest = film.head, len(parts["code"]) + 16_384
+    raw = 50 * head["count"] + head["nodes"] * (4 + 6 * head["frames"]) + len(json.dumps(head))
+    raw += 4 * head["frames"] + len(blocks["far"]) - 4 * head["frames"]
+    assert data == raw
+    assert len(text) < rest + 4 / 3 * (1.001 * raw + 256)
+    again = page(film)
+    assert again == text
+    (run / "film.html").unlink()
+
+
+def test_other_light_is_told(make_flag, tmp_path, capsys):
+    phong = {"class_path": "PhongShader", "init_args": {"light": [0.0, -1.0, 0.0]}}
+    make_flag(shader=phong).run(tmp_path / "run", 1, progress=False)
+    assert main(["--web", str(tmp_path / "run"), str(tmp_path / "phong.html")]) == 0
+    assert (
+        "note: the film has no PhongShader: the Gaussians keep the colours of the splat.\n" in capsys.readouterr().out
+    )
+    assert read_film(tmp_path / "run").head["shader"] is None
+
+
+# ---- what a run records
+
+
+def test_nodes_that_swing_far_keep_their_digits(tmp_path):
+    """Nodes with hardly any mass move by thousands of metres, beyond what float16 rounds well or holds at all."""
+    generator = torch.Generator().manual_seed(0)
+    moved = (torch.rand(50, 3, generator=generator) - 0.5).numpy()
+    moved[[3, 20]] = [[1e5, 2.00001, -3e7], [0.1, 0.61, 0.2]]
+    near, far = split_far(moved, 0.6)
+    assert far[:, 0].tolist() == [3, 20]
+    assert np.array_equal(join_far(near, far)[[3, 20]], moved[[3, 20]])
+    assert np.abs(join_far(near, far) - moved).max() <= 0.6 * 2**-11
+    assert near.dtype == np.float16
+    assert split_far(moved[:0], 0.6)[1].shape == (0, 4)
+    np.savez(tmp_path / "nodes.npz", displacement_00000=near, far_00000=np.full((1, 4), 77, np.int32))
+    with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(index 77 is out of bounds"):
+        load_nodes(tmp_path / "nodes.npz")
+
+
+def test_nodes_are_recorded_in_total_unless_switched_off(make_flag, tmp_path):
+    make_flag(recorder={"nodes": False}).run(tmp_path / "off", 2, progress=False)
+    make_flag(solver={"formulation": "updated"}).run(tmp_path / "updated", 2, progress=False)
+    for name in ("off", "updated"):
+        assert not (tmp_path / name / "nodes.npz").exists()
+        assert not (tmp_path / name / "nodes").exists()
+
+
+def test_a_resumed_run_records_the_same(make_flag, run, tmp_path):
+    folder = tmp_path / "run"
+    make_flag().run(folder, 3, progress=False)
+    make_flag().run(folder, FRAMES, resume=True, progress=False)
+    whole, parts = load_nodes(run / "nodes.npz"), load_nodes(folder / "nodes.npz")
+    assert whole.dtype == torch.float32
+    assert whole.shape[0] == FRAMES
+    assert torch.equal(whole, parts)
+    assert float(whole[-1].abs().max()) > 0
+    assert not (folder / "nodes").exists()
+    content = (folder / "nodes.npz").read_bytes()
+    (folder / "nodes.npz").write_bytes(content[:5000] + bytes([content[5000] ^ 1]) + content[5001:])
+    with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(.*start again without --resume"):
+        make_flag().run(folder, FRAMES + 1, resume=True, progress=False)
+
+
+def test_a_resumed_run_without_earlier_nodes_says_so(make_flag, tmp_path, capsys):
+    folder = tmp_path / "run"
+    make_flag().run(folder, 2, progress=False, recorder=Recorder(video=False, nodes=False))
+    make_flag().run(folder, 3, resume=True, progress=False)
+    assert "so nodes.npz will be without them; start again without --resume to have them." in capsys.readouterr().err
+    assert _refusal([str(folder)], capsys).endswith("lacks frames: run the simulation again, without --resume.\n")
+
+
+# ---- what cannot become a film
+
+
+def _refusal(arguments, capsys):
+    """The one sentence of a film that cannot be made."""
+    capsys.readouterr()
+    assert main(["--web", *arguments]) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith("error: ")
+    assert told.err.count("\n") == 1
+    assert told.out == ""
+    return told.err
+
+
+def test_what_is_no_run_of_total_is_refused(make_flag, run, tmp_path, capsys):
+    assert "has no run: give the output folder of `gaussian-swaying sim`" in _refusal([str(tmp_path)], capsys)
+    assert "to end in .html, but got " in _refusal([str(run), str(tmp_path / "film.mp4")], capsys)
+    assert "--fps is not for --web" in _refusal([str(run), "--fps", "25"], capsys)
+    copy = shutil.copytree(run, tmp_path / "copy")
+    (copy / "nodes.npz").unlink()
+    assert "run it again with `recorder.nodes: true`." in _refusal([str(copy)], capsys)
+    summary = json.loads((copy / "summary.json").read_text())
+    (copy / "summary.json").write_text(json.dumps(summary | {"formulation": "updated"}))
+    assert "`solver.formulation: updated`" in _refusal([str(copy)], capsys)
+    (copy / "summary.json").write_text("{")
+    assert "summary.json cannot be read" in _refusal([str(copy)], capsys)
+    assert not list(tmp_path.glob("**/film.*"))
+
+
+def test_another_grid_is_refused(run, tmp_path, capsys):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    text = (copy / "config.yaml").read_text()
+    (copy / "config.yaml").write_text(text.replace("dx: 0.1", "dx: 0.11"))
+    assert re.search(
+        r"nodes.npz has [\d,]+ nodes, but the scene of .* has [\d,]+: export", _refusal([str(copy)], capsys)
+    )
+
+
+def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
+    splat, folder = tmp_path / "flag.ply", tmp_path / "run"
+    cloud = FlagScene(spacing=0.1).generate()
+    write_ply(splat, cloud)
+    make_flag(scene={"generator": None, "ply": str(splat)}, recorder={"images": False}).run(folder, 2, progress=False)
+    assert main(["--web", str(folder)]) == 0
+    cloud.means[0] += 0.001
+    write_ply(splat, cloud)
+    assert "flag.ply has changed since the run in" in _refusal([str(folder)], capsys)
+    splat.unlink()
+    assert "flag.ply of the run is not there (`scene.ply` in " in _refusal([str(folder)], capsys)
