@@ -223,6 +223,7 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 
+@pytest.mark.slow
 def test_a_click_takes_hold_of_the_flag(page, window, until):
     time.sleep(1.0)
     window.mouse.click(520, 480)
