@@ -19,6 +19,7 @@ from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
 from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.simulation.config import parse_text
 from gaussian_swaying.simulation.preview.as_data import cost_dict, run_dict, suggestion_dict
 from gaussian_swaying.simulation.preview.calibration import (
     SWAY,
@@ -222,20 +223,10 @@ def _pipeline(arguments: list[str], text: str | None = None) -> tuple[Simulation
     check_config_files(arguments)
     try:
         with guessing(parser):
-            settings = parser.parse_args(arguments) if text is None else _parse_text(parser, arguments, text)
+            settings = parser.parse_args(arguments) if text is None else parse_text(parser, text, arguments)
     except ArgumentError as error:
         raise ValueError(parser_sentence(str(error), arguments)) from error
     return Simulation.from_settings(parser, settings), settings
-
-
-def _parse_text(parser: Any, arguments: list[str], text: str) -> Any:
-    """Settings from YAML text and options after it."""
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "starter.yaml"
-        path.write_text(text, encoding="utf-8")
-        return parser.parse_args(["--config", str(path), *arguments])
 
 
 def _up(values: Sequence[str]) -> list[float] | str:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import inspect
 import os
 import sys
+import tempfile
 from argparse import SUPPRESS, Action, ArgumentError
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
@@ -149,6 +150,23 @@ def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespac
         return parser.parse_args(arguments)
     except ArgumentError as error:
         raise ValueError(str(error)) from error
+
+
+def parse_text(parser: ArgumentParser, text: str, arguments: Sequence[str] = ()) -> Namespace:
+    """The settings of a configuration that is not in a file.
+
+    Args:
+        parser: From :func:`build_parser`.
+        text: The YAML.
+        arguments: Options that override it.
+
+    Raises:
+        ArgumentError: If a value is invalid.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "starter.yaml"
+        path.write_text(text, encoding="utf-8")
+        return parser.parse_args(["--config", str(path), *arguments])
 
 
 def check_settings(schema: type, settings: Namespace) -> None:

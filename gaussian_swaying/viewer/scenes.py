@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,17 +10,14 @@ from typing import TYPE_CHECKING
 import torch
 
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.simulation.preview.calibration import calibrated_suggestion
+from gaussian_swaying.simulation.config import parse_text
+from gaussian_swaying.simulation.preview.calibration import SWAY, calibrated_suggestion
 from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
 from gaussian_swaying.simulation.preview.suggest import suggest
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
-
-
-SWAY = 0.25
-"""How far a splat without a configuration sways, as the preview's default: a share of its longest side."""
 
 
 def settings_of_splat(
@@ -41,14 +37,8 @@ def settings_of_splat(
     """
     file = Path(path).resolve()
     found = suggest(read_gaussians(file), quality="draft" if device.type == "cpu" else "normal")
-    draft = _parsed(parser, draft_yaml(found, str(file)), device)
+    own = ["--device", device.type]
+    draft = parse_text(parser, draft_yaml(found, str(file)), own)
     found = calibrated_suggestion(found, Simulation.from_settings(parser, draft), SWAY)
     text = draft_yaml(found, str(file)) if device.type == "cpu" else starter_yaml(found, str(file))
-    return _parsed(parser, text, device, further)
-
-
-def _parsed(parser: ArgumentParser, text: str, device: torch.device, further: Sequence[str] = ()) -> Namespace:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "starter.yaml"
-        path.write_text(text, encoding="utf-8")
-        return parser.parse_args(["--config", str(path), "--device", device.type, *further])
+    return parse_text(parser, text, [*own, *further])

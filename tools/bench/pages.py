@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench import record, slots
 from bench.cases import gallery  # noqa: F401  registers its slots
-from bench.tables import (
+from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     accuracy_plot,
     flags,
@@ -29,25 +29,6 @@ from bench.tables import (
     web,
 )
 from gaussian_swaying._files import write_text
-
-TABLES = (
-    accuracy,
-    flags,
-    goals,
-    gradients,
-    live,
-    long_flag,
-    pareto,
-    peers,
-    pins,
-    points,
-    previews,
-    runs,
-    speed,
-    training,
-    web,
-)
-"""The modules that register the slots."""
 
 PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
     "accuracy_*": accuracy_plot.draw,

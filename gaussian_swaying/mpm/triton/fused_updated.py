@@ -329,8 +329,8 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
     substep grows with their share. Together with the time of the sorts it is least after :math:`\sqrt{S / r}` substeps,
     with the rate r at which particles enter other cells. S suits a cube with eight points in a cell, turning and sorted
     after 4 to 64 substeps, on an H200. A cell with fewer points gains less from the order; one with more belongs to a
-    sheet, whose neighbours cross into other cells together (constant 32 was faster there than 4). A small body waits
-    for the host, not for sums.
+    sheet, whose neighbours cross into other cells together; how far the interval should grow there is not measured.
+    A small body waits for the host, not for sums.
 
     Args:
         crowd: Points in a cell.

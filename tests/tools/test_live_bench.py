@@ -1,0 +1,35 @@
+"""``bench.py live``: what it shows of what was recorded."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from bench.cases import live
+from bench.tables.live import rates
+from PIL import Image
+
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+
+
+def test_the_table_names_the_goal_and_the_size_of_the_picture():
+    row = {"name": "guitar", "gaussians": 90_854, "points": 1_815, "window": [640, 360], "pictures_per_s": 5.87}
+    row |= {"picture": "170x96", "picture_bytes": 1498.0, "real_time": 0.067, "step_s": 0.0025, "latency_ms": 382.0}
+    about = {"versions": {"torch": "2", "gsplat": "1"}, "rows": [row]}
+    last = rates({"device": "x86_64 CPU"} | about)[-1]
+    assert last.startswith("| guitar | 90,854 | 1,815 | 640x360 | 170x96 | 5.9 | 5 | 1 | 0.067 | 0.0025 | 382 |")
+    assert "| 5.9 | - |" in rates({"device": "NVIDIA H200"} | about)[-1]
+
+
+def test_the_camera_of_the_client_looks_at_its_target():
+    turn = live.camera_rotation([0.0, -3.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0])
+    rotation = quat_to_rotation(torch.tensor(turn, dtype=torch.float64))
+    assert rotation[:, 2].tolist() == pytest.approx([0, 1, 0])  # forward
+    assert rotation[:, 1].tolist() == pytest.approx([0, 0, -1])  # down
+
+
+def test_pixels_of_a_received_picture():
+    buffer = io.BytesIO()
+    Image.fromarray(np.full((12, 20, 3), 200, dtype=np.uint8)).save(buffer, "jpeg")
+    assert live.size_of(buffer.getvalue()) == "20x12"
+    assert live.pixels_of(buffer.getvalue()).mean() == pytest.approx(200, abs=1)
