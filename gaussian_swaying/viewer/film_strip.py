@@ -33,10 +33,15 @@ class FilmStrip:
         """Length so far [s]."""
         return self._frames / FPS
 
+    @property
+    def full(self) -> bool:
+        """Whether the video has its greatest length, and takes no more pictures."""
+        return self.seconds >= LONGEST
+
     def add(self, time: float, picture: np.ndarray) -> None:
         """Add a picture, uint8 (H, W, 3), at a simulated time [s]; it gets the size of the first."""
         with self._lock:
-            if not self._done and self.seconds < LONGEST:
+            if not self._done and not self.full:
                 self._add(time, picture)
 
     def _add(self, time: float, picture: np.ndarray) -> None:

@@ -295,6 +295,9 @@ class Page:
         film = self.recording
         if film is not None and self.recorder == client.client_id:
             film.add(snapshot.health.time, np.ascontiguousarray(picture))
+            if film.full:
+                self.controls.stop_recording(client)
+                self.tell(f"The video has the greatest length, {film.seconds:.0f} s, and was saved.")
 
     def _keep_telling(self) -> None:
         """Keep the figures in the corner up to date."""

@@ -200,7 +200,9 @@ class Session:
         health, simulation = self.snapshot.health, self.simulation
         if len(steps) < 2:
             return Rates(0.0, 0.0, simulation.frame_dt, health.substeps)
-        took = max(now - steps[0][0], 1e-6)
+        between = steps[-1][0] - steps[0][0]
+        overdue = now - steps[-1][0] - between / (len(steps) - 1)  # a step that is under way is not late yet
+        took = max(between + max(overdue, 0.0), 1e-6)
         passed = steps[-1][1] - steps[0][1]
         return Rates((len(steps) - 1) / took, passed / took, simulation.frame_dt, health.substeps)
 

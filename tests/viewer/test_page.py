@@ -194,6 +194,16 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.5)
+    with window.expect_download(timeout=60_000):
+        window.get_by_role("button", name="Record a video").click()
+    window.get_by_text("has the greatest length").wait_for(timeout=5_000)
+    window.get_by_role("button", name="Record a video").wait_for(timeout=5_000)
+    assert page.recording is None
+
+
+@pytest.mark.slow
 def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()

@@ -82,6 +82,19 @@ def test_a_film_is_as_long_as_the_simulated_time():
     assert frames[0].mean() < frames[10].mean() < frames[-1].mean()
 
 
+def test_a_film_ends_at_its_greatest_length(monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.2)
+    film = FilmStrip()
+    picture = np.zeros((32, 48, 3), dtype=np.uint8)
+    film.add(0.0, picture)
+    assert not film.full
+    film.add(0.2, picture)
+    assert film.full
+    film.add(5.0, picture)
+    assert film.seconds < 0.3
+    film.finish()
+
+
 def test_a_film_without_pictures_is_refused():
     with pytest.raises(ValueError, match="Nothing was recorded"):
         FilmStrip().finish()

@@ -274,3 +274,12 @@ def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings, unt
     assert len(pictures) > 50
     assert abs(pictures[0].astype(int) - pictures[-1].astype(int)).max() > 30
     assert torch.isfinite(session.snapshot.state.position).all()
+
+
+def test_a_step_that_is_under_way_does_not_lower_the_rates(session):
+    now = time.perf_counter()
+    session._steps.extend((now - 1.03 + 0.04 * k, 0.04 * k) for k in range(26))  # the last one 0.03 s ago
+    assert session.rates().real_time == pytest.approx(1.0, abs=0.02)
+    session._steps.clear()
+    session._steps.extend((now - 1.5 + 0.04 * k, 0.04 * k) for k in range(26))  # and 0.5 s ago: it is late
+    assert session.rates().real_time == pytest.approx(1.0 / 1.46, abs=0.03)
