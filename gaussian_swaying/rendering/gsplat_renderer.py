@@ -140,6 +140,7 @@ def rasterize_splat(
     background: Tensor | None = None,
     eps2d: float = 0.3,
     absgrad: bool = False,
+    channels: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """``gsplat.rasterization`` for one camera, built from gsplat's functions.
 
@@ -156,9 +157,11 @@ def rasterize_splat(
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
         absgrad: Keep absolute gradients of the centres on the screen.
+        channels: Further values to blend behind the colours, over zero, shape (N, E).
 
     Returns:
-        Colours (1, H, W, 3), alphas (1, H, W, 1), centres on the screen (1, N, 2) and radii (1, N, 2) [pixels].
+        Colours and further values (1, H, W, 3 + E), alphas (1, H, W, 1), centres on the screen (1, N, 2) and radii
+        (1, N, 2) [pixels].
     """
     load_kernels()
     from gsplat import fully_fused_projection, spherical_harmonics
@@ -181,6 +184,9 @@ def rasterize_splat(
     colors = spherical_harmonics(sh_degree(sh.shape[1]), toward, sh[None], masks=seen)
     values = (colors + 0.5).clamp_min(0.0)
     behind = None if background is None else background.to(means)[None]
+    if channels is not None:
+        values = torch.cat([values, channels[None]], dim=-1)
+        behind = None if behind is None else torch.nn.functional.pad(behind, (0, channels.shape[1]))
     pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera, behind, absgrad)
     return pixels, alpha, means2d, radii
 
@@ -266,6 +272,7 @@ class GsplatRenderer(nn.Module):
         camera: Camera,
         background: Tensor | None = None,
         absgrad: bool = False,
+        channels: Tensor | None = None,
     ) -> SplatOutput:
         """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`.
 
@@ -276,7 +283,9 @@ class GsplatRenderer(nn.Module):
             raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
         view = camera.to(means.device, torch.float32)
         pixels, alpha, means2d, radii = rasterize_splat(
-            means, quats, log_scales.exp(), opacities, sh, view, background, self.eps2d, absgrad
+            means, quats, log_scales.exp(), opacities, sh, view, background, self.eps2d, absgrad, channels
         )
         screen = ScreenGaussians(means2d, radii, None, camera.width, camera.height)
-        return SplatOutput(pixels[0], alpha[0], screen)
+        if channels is None:
+            return SplatOutput(pixels[0], alpha[0], screen)
+        return SplatOutput(pixels[0, ..., :3], alpha[0], screen, pixels[0, ..., 3:])

@@ -96,11 +96,13 @@ class SplatOutput:
         color: As :attr:`RenderOutput.color`, shape (H, W, 3).
         alpha: As :attr:`RenderOutput.alpha`, shape (H, W, 1).
         screen: Where the Gaussians are on the screen.
+        channels: Further values, blended like the colours over zero, shape (H, W, E), or None.
     """
 
     color: Tensor
     alpha: Tensor
     screen: ScreenGaussians
+    channels: Tensor | None = None
 
 
 class SplatRenderer(Renderer, Protocol):
@@ -116,6 +118,7 @@ class SplatRenderer(Renderer, Protocol):
         camera: Camera,
         background: Tensor | None = None,
         absgrad: bool = False,
+        channels: Tensor | None = None,
     ) -> SplatOutput:
         """Render one picture, differentiable with respect to every tensor of the splat.
 
@@ -129,6 +132,7 @@ class SplatRenderer(Renderer, Protocol):
             background: Colour behind the Gaussians, shape (3,); black when None.
             absgrad: Whether the backward pass stores sums of absolute gradients in ``screen.means2d.absgrad`` (Ye et
                 al. 2024, "AbsGS").
+            channels: Further values of each Gaussian to blend in the same pass, shape (N, E).
 
         Returns:
             The picture, on the device and in the precision of ``means``.

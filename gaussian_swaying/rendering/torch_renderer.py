@@ -346,6 +346,7 @@ class TorchRenderer(nn.Module):
         camera: Camera,
         background: Tensor | None = None,
         absgrad: bool = False,
+        channels: Tensor | None = None,
     ) -> SplatOutput:
         """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`."""
         if absgrad:
@@ -356,10 +357,12 @@ class TorchRenderer(nn.Module):
         finite = finite_gaussians(means, covariances, opacities, sh.flatten(1))
         projected = project_gaussians(means, covariances, torch.where(finite, opacities, 0.0), camera, self.eps2d)
         colors = sh_to_color(sh[projected.index], means[projected.index] - camera.position)
-        color, alpha = composite_gaussians(projected, colors, camera.width, camera.height, self.max_pairs)
+        values = colors if channels is None else torch.cat([colors, channels[projected.index]], dim=-1)
+        blended, alpha = composite_gaussians(projected, values, camera.width, camera.height, self.max_pairs)
+        color = blended[..., :3]
         if background is not None:
             color = color + (1.0 - alpha) * background.to(color)
         with torch.no_grad():
             radii = _extent(projected.covariances2d, projected.log_opacities)
         screen = ScreenGaussians(projected.means2d, radii, projected.index, camera.width, camera.height)
-        return SplatOutput(color, alpha, screen)
+        return SplatOutput(color, alpha, screen, None if channels is None else blended[..., 3:])

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_shape
 from gaussian_swaying.metrics.ssim import PADDINGS, check_pictures, ssim_map
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.planes import SurfaceMaps
 
 _MIN_OPACITY = 1e-7
 _REDUCTIONS = ("mean", "sum")
@@ -115,6 +117,21 @@ def _reduce(values: Tensor, reduction: str) -> Tensor:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class OtherView:
+    """Another view of the scene, for losses that compare two.
+
+    Attributes:
+        image: Photo, over the background of this step, shape (H, W, 3).
+        camera: Its camera, on the device of the Gaussians.
+        surface: The surface rendered there, without gradient.
+    """
+
+    image: Tensor
+    camera: Camera
+    surface: SurfaceMaps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LossInputs:
     """The inputs of a loss term in a training step.
 
@@ -128,6 +145,9 @@ class LossInputs:
         log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         opacities: Opacities from 0 to 1, shape (N,).
         step: Number of images trained on before this one.
+        camera: The camera, on the device of the Gaussians.
+        surface: The surface in the picture, if a term needs ``surface``.
+        other: Another view of the same place, if a term needs ``other_view`` and there is one close enough.
     """
 
     image: Tensor
@@ -139,10 +159,25 @@ class LossInputs:
     log_scales: Tensor
     opacities: Tensor
     step: int
+    camera: Camera | None = None
+    surface: SurfaceMaps | None = None
+    other: OtherView | None = None
+
+
+NEEDS = ("surface", "other_view")
+"""What a term may need beside the picture; it is made only while such a term is active."""
 
 
 class LossTerm(nn.Module, ABC):
-    """Base class of all terms; a YAML can name any subclass by its class path."""
+    """Base class of all terms; a YAML can name any subclass by its class path.
+
+    Attributes:
+        start: Images trained on before the term begins.
+        needs: Some of :data:`NEEDS`.
+    """
+
+    start: int = 0
+    needs: frozenset[str] = frozenset()
 
     @abstractmethod
     def forward(self, inputs: LossInputs) -> Tensor:
@@ -267,7 +302,7 @@ class TotalLoss(nn.Module):
     r"""Weighted sum of named terms, :math:`\mathcal L = \sum_k \lambda_k \mathcal L_k`.
 
     The four terms of Gaussian Swaying are included with its weights: ``rgb`` 1, ``anisotropy`` 10, ``entropy`` 0.01 and
-    ``size`` 0.01. A term with weight 0 is not computed.
+    ``size`` 0.01. A term with weight 0 is not computed, nor is one before its ``start``.
 
     Args:
         terms: Further terms by name, or others in place of the four.
@@ -298,13 +333,22 @@ class TotalLoss(nn.Module):
             raise ValueError("Expected one of `loss_weights` not to be zero.")
         self.terms = nn.ModuleDict({name: term for name, term in named.items() if self.weights[name] != 0.0})
 
+    def active(self, step: int) -> dict[str, nn.Module]:
+        """The terms that have begun at a step, by name."""
+        return {name: term for name, term in self.terms.items() if getattr(term, "start", 0) <= step}
+
+    def needs(self, step: int) -> frozenset[str]:
+        """What these terms need, see :data:`NEEDS`."""
+        wanted: frozenset[str] = frozenset()
+        return wanted.union(*(getattr(term, "needs", wanted) for term in self.active(step).values()))
+
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The sum, with its gradient, and each term before its weight, detached.
+        """The sum, with its gradient, and each active term before its weight, detached.
 
         Raises:
             ValueError: If a term is not a number.
         """
-        values = {name: term(inputs) for name, term in self.terms.items()}
+        values = {name: term(inputs) for name, term in self.active(inputs.step).items()}
         for name, value in values.items():
             if value.dim():
                 raise ValueError(
@@ -312,5 +356,6 @@ class TotalLoss(nn.Module):
                     "or the sum."
                 )
         total = sum(self.weights[name] * value for name, value in values.items())
-        assert isinstance(total, Tensor)  # at least one weight is not zero
+        if not isinstance(total, Tensor):  # no term has begun
+            total = inputs.image.new_zeros(())
         return total, {name: value.detach() for name, value in values.items()}

@@ -24,13 +24,15 @@ from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
+from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
-from gaussian_swaying.training.losses import LossInputs, LossTerm, TotalLoss
+from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
 from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
 from gaussian_swaying.training.random_stream import random_state, set_random_state
 from gaussian_swaying.training.rates import LearningRates, means_rate
+from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 
 _CLOCK_STEP = 20_000_000  # [ns] by which file times may lag behind the clock
 
@@ -43,7 +45,8 @@ class SplatTrainer(lightning.LightningModule):
     changes them, and a resumed run continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
-    the colours of the image are not premultiplied. The initial Gaussians come from ``init_ply``, or else from
+    the colours of the image are not premultiplied. Losses that compare two views also need the item ``index``, and
+    ``datamodule.other_view(index, pick)``. The initial Gaussians come from ``init_ply``, or else from
     ``datamodule.initial_cloud(sh_degree)``, and the extent of the scene from ``datamodule.scene_scale``.
 
     Args:
@@ -199,7 +202,12 @@ class SplatTrainer(lightning.LightningModule):
         return self.sh_degree if self.sh_every == 0 else min(step // self.sh_every, self.sh_degree)
 
     def render(
-        self, camera: Camera, background: Tensor | None = None, degree: int | None = None, absgrad: bool = False
+        self,
+        camera: Camera,
+        background: Tensor | None = None,
+        degree: int | None = None,
+        absgrad: bool = False,
+        surface: bool = False,
     ) -> SplatOutput:
         """Draw the Gaussians.
 
@@ -208,6 +216,7 @@ class SplatTrainer(lightning.LightningModule):
             background: Colour behind them, shape (3,); black when None.
             degree: Degree of the harmonics in use; all when None.
             absgrad: Whether to compute absolute gradients.
+            surface: Whether to blend the channels that :func:`~gaussian_swaying.rendering.planes.surface_maps` needs.
 
         Returns:
             The picture.
@@ -215,8 +224,12 @@ class SplatTrainer(lightning.LightningModule):
         splat = self.splat
         degree = self.sh_degree if degree is None else degree
         sh = torch.cat([splat.sh0, splat.shN[:, : (degree + 1) ** 2 - 1]], dim=1) if degree else splat.sh0
+        channels = None
+        if surface:
+            view = camera.to(splat.means.device, splat.means.dtype)
+            channels = plane_channels(splat.means, splat.quats, splat.scales, view)
         return self._drawing().render_splat(
-            splat.means, splat.quats, splat.scales, splat.opacity(), sh, camera, background, absgrad
+            splat.means, splat.quats, splat.scales, splat.opacity(), sh, camera, background, absgrad, channels
         )
 
     def _drawing(self) -> SplatRenderer:
@@ -247,11 +260,26 @@ class SplatTrainer(lightning.LightningModule):
         rate = means_rate(self.rates, self.scene_scale, step, int(self.trainer.max_steps))
         means_optimizer.param_groups[0]["lr"] = rate
         target, alpha, background = self._target(batch, train=True)
-        output = self.render(batch["camera"], background, self.active_degree(step), self.densification.absgrad)
+        needs = self.loss.needs(step)
+        output = self.render(
+            batch["camera"], background, self.active_degree(step), self.densification.absgrad, bool(needs)
+        )
         self._check_pending()  # of the previous step: gsplat has already waited for the GPU
         splat = self.splat
+        camera, surface = self._surface(output, batch["camera"]) if needs else (None, None)
         inputs = LossInputs(
-            output.color, target, output.alpha, alpha, splat.means, splat.quats, splat.scales, splat.opacity(), step
+            output.color,
+            target,
+            output.alpha,
+            alpha,
+            splat.means,
+            splat.quats,
+            splat.scales,
+            splat.opacity(),
+            step,
+            camera,
+            surface,
+            self._other_view(batch, background) if "other_view" in needs else None,
         )
         loss, terms = self.loss(inputs)
         if not loss.requires_grad:  # no Gaussian in the picture, and the loss depends only on the picture
@@ -279,6 +307,32 @@ class SplatTrainer(lightning.LightningModule):
         if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
+
+    def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
+        assert output.channels is not None
+        camera = camera.to(output.channels.device, output.channels.dtype)
+        return camera, surface_maps(output.channels, output.alpha, camera)
+
+    def _other_view(self, batch: Mapping[str, Any], background: Tensor | None) -> OtherView | None:
+        """Another training image of the same place with its surface; None if there is none."""
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
+        if not hasattr(datamodule, "other_view"):
+            raise ValueError(
+                "Expected a datamodule with `other_view(index, pick)`, as a loss compares two views: use "
+                "CaptureDataModule, or set the weights of the multi-view losses to 0."
+            )
+        other = datamodule.other_view(batch["index"], float(torch.rand(())))
+        if other is None:
+            return None
+        other = other.to(self.device) if hasattr(other, "to") else other
+        image, alpha = other["image"], other.get("alpha")
+        image = image.to(self.device)
+        if alpha is not None:
+            alpha = alpha.to(self.device)
+            image = image * alpha + (1.0 - alpha) * (self.fixed_background if background is None else background)
+        with torch.no_grad():
+            camera, surface = self._surface(self.render(other["camera"], degree=0, surface=True), other["camera"])
+        return OtherView(image, camera, surface)
 
     def _target(self, batch: Mapping[str, Any], train: bool) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Photo over the background, its alpha (H, W, 1), and that background, None where it is black."""

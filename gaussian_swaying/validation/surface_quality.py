@@ -8,6 +8,7 @@ import torch
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.metrics.patch_normals import patch_normal_error
 
 
 @torch.no_grad()
@@ -36,7 +37,9 @@ def surface_quality(
         ``gaussians`` and ``simulated`` (numbers); ``round_share``, ``small_share`` and ``near_share`` of the simulated
         ones; ``decided_share`` of all with an opacity outside [0.1, 0.9]; ``flatness_median`` (smallest over second
         largest scale); ``angle_median_deg`` and ``angle_p90_deg`` between patch normals and the normals of the nearest
-        points, ignoring the sign; ``distance_median_m`` and ``distance_p90_m``; ``area_paper_ratio`` and
+        points, ignoring the sign; ``tilt_10cm_deg``, ``tilt_20cm_deg`` and ``tilt_40cm_deg`` of patches, see
+        :func:`~gaussian_swaying.metrics.patch_normals.patch_normal_error`, weighted by ``coverage`` areas, of the
+        Gaussians near the surface; ``distance_median_m`` and ``distance_p90_m``; ``area_paper_ratio`` and
         ``area_coverage_ratio``, sums of areas over the true area of one side.
     """
     opacity = model.opacity()
@@ -54,6 +57,10 @@ def surface_quality(
     cosine = (part.normals().double() * normals).sum(-1).abs().clamp(max=1.0)
     angle = torch.rad2deg(torch.acos(cosine))
     found["near_share"] = float((distance <= near).float().mean())
+    close = distance <= near
+    for size in (0.1, 0.2, 0.4):
+        parts = (places[close], part.normals()[close], normals[close], size, part.areas()[close])
+        found[f"tilt_{round(100 * size)}cm_deg"] = patch_normal_error(*parts) if bool(close.any()) else math.nan
     for name, values in (("angle", angle), ("distance", distance)):
         unit = "deg" if name == "angle" else "m"
         found[f"{name}_median_{unit}"] = float(values.median())

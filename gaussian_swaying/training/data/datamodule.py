@@ -12,9 +12,11 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying.captures.capture import Capture, View, read_capture
 from gaussian_swaying.captures.images import straight_colors
 from gaussian_swaying.captures.initial_points import initial_points
+from gaussian_swaying.captures.neighbours import neighbouring_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.training.data.order import EndlessShuffle
@@ -132,6 +134,9 @@ class CaptureDataModule(LightningDataModule):
         initial_opacity: Opacity of the Gaussians at these points, between 0 and 1; 0.5 suits MCMC.
         initial_scale: Their standard deviation as a multiple of the distance to their neighbours, 0.001 to 100; 0.1
             suits MCMC.
+        other_views: For losses that compare two views: how many others of each are used, see
+            :func:`~gaussian_swaying.captures.neighbours.neighbouring_views`.
+        other_view_angle: Largest angle between the optical axes of the two [degrees].
 
     Raises:
         ValueError: If an argument is out of range; in ``setup``, if the capture is bad.
@@ -151,8 +156,14 @@ class CaptureDataModule(LightningDataModule):
         seed: int | None = None,
         initial_opacity: float = 0.1,
         initial_scale: float = 1.0,
+        other_views: int = 8,
+        other_view_angle: float = 30.0,
     ) -> None:
         super().__init__()
+        check_positive("other_views", other_views)
+        check_positive("other_view_angle", other_view_angle)
+        self.other_views, self.other_view_angle = int(other_views), float(other_view_angle)
+        self._others: list[list[int]] | None = None
         if not 0.0 < initial_opacity < 1.0:
             raise ValueError(f"Expected `initial_opacity` between 0 and 1 (both excluded), but got {initial_opacity}.")
         if not 1e-3 <= initial_scale <= 100:
@@ -263,6 +274,23 @@ class CaptureDataModule(LightningDataModule):
                     "the old value, or start a new run."
                 )
         self._seen = int(state_dict["seen"])
+
+    def other_view(self, index: int, pick: float) -> TrainingImage | None:
+        """A training image that shows the same place as another one, for losses that compare two views.
+
+        Args:
+            index: Index of the training image.
+            pick: Which of its neighbours, as a number from 0 to 1 (excluded).
+
+        Returns:
+            The image, or None if no other view is close enough.
+        """
+        dataset = self._dataset("train")
+        if self._others is None:
+            cameras = [view.camera for view in dataset.views]
+            self._others = neighbouring_views(cameras, self.other_views, self.other_view_angle)
+        others = self._others[index]
+        return dataset[others[int(pick * len(others))]] if others else None
 
     def val_dataloader(self) -> DataLoader[TrainingImage]:
         """Validation images in order."""

@@ -1,0 +1,137 @@
+"""Normals, plane distances and depths of a rendered surface."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.rotations import rotation_from_z, rotation_to_quat
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.planes import depth_normals, pixel_rays, plane_channels, surface_maps
+from gaussian_swaying.rendering.torch_renderer import TorchRenderer
+
+NORMAL = torch.nn.functional.normalize(torch.tensor([0.3, -1.0, 0.2], dtype=torch.float64), dim=0)
+OFFSET = 0.1  # [m] of the plane from the origin
+
+
+def _camera(width=40, height=30):
+    return look_at_camera((0.4, -2.0, 0.3), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 35.0, width, height, dtype=torch.float64)
+
+
+def _plane(count=2500, half=0.9):
+    """Discs on a tilted plane, each turned about its normal at random."""
+    generator = torch.Generator().manual_seed(0)
+    flat = torch.rand(count, 2, generator=generator, dtype=torch.float64) * 2 * half - half
+    frame = rotation_from_z(NORMAL)
+    means = torch.nn.functional.pad(flat, (0, 1)) @ frame.T + OFFSET * NORMAL
+    angle = torch.rand(count, generator=generator, dtype=torch.float64) * 2 * math.pi
+    turn = torch.zeros(count, 3, 3, dtype=torch.float64)
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
+    turn[:, 2, 2] = 1.0
+    quats = rotation_to_quat(frame @ turn)
+    scales = torch.tensor([0.05, 0.04, 0.001], dtype=torch.float64).log().repeat(count, 1)
+    return means, quats, scales
+
+
+def _maps(camera, means, quats, scales, renderer=None):
+    opacities = torch.full((len(means),), 0.9, dtype=means.dtype, device=means.device)
+    sh = torch.zeros(len(means), 1, 3, dtype=means.dtype, device=means.device)
+    view = camera.to(means.device, means.dtype)
+    channels = plane_channels(means, quats, scales, view)
+    drawn = (renderer or TorchRenderer()).render_splat(means, quats, scales, opacities, sh, view, channels=channels)
+    return surface_maps(drawn.channels, drawn.alpha, view), drawn
+
+
+def _true_depth(camera):
+    rotation, eye = camera.world_to_camera[:3, :3], camera.position
+    rays = pixel_rays(camera) @ rotation
+    return (OFFSET - eye @ NORMAL) / (rays @ NORMAL)
+
+
+def test_discs_of_a_plane_show_that_plane():
+    """Its depth at every pixel, not that of the centres, which differ from it within each disc."""
+    camera = _camera()
+    maps, _ = _maps(camera, *_plane())
+    known = maps.known[..., 0]
+    assert known.float().mean() > 0.5
+    torch.testing.assert_close(maps.depth[known][:, 0], _true_depth(camera)[known], rtol=1e-6, atol=0)
+    facing = camera.world_to_camera[:3, :3] @ NORMAL
+    torch.testing.assert_close(maps.unit[known], facing.expand(int(known.sum()), 3), rtol=0, atol=1e-6)
+    assert (maps.distance[known] < 0).all()
+    assert maps.depth[~known].eq(0).all()
+
+
+def test_normals_of_depths_are_those_of_the_plane():
+    camera = _camera()
+    known = torch.ones(camera.height, camera.width, 1, dtype=torch.bool)
+    known[10, 12] = False
+    normal, inner = depth_normals(_true_depth(camera)[..., None], known, camera)
+    assert not inner[[0, -1]].any()
+    assert not inner[:, [0, -1]].any()
+    assert not inner[9:12, 12].any()
+    assert not inner[10, 11:14].any()
+    assert int(inner.sum()) == (camera.height - 2) * (camera.width - 2) - 5
+    facing = camera.world_to_camera[:3, :3] @ NORMAL
+    found = normal[inner[..., 0]]
+    torch.testing.assert_close(found, facing.expand(len(found), 3), rtol=0, atol=1e-9)
+
+
+def test_a_picture_without_gaussians_shows_no_surface():
+    camera = _camera()
+    maps, _ = _maps(camera, *(part[:0] for part in _plane()))
+    assert not maps.known.any()
+    assert maps.depth.eq(0).all()
+
+
+def test_seen_from_behind_the_normal_turns():
+    means, quats, scales = _plane(50)
+    front = _camera()
+    behind = look_at_camera((0.0, 2.0, 0.3), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 35.0, 40, 30, dtype=torch.float64)
+    for camera in (front, behind):
+        channels = plane_channels(means, quats, scales, camera)
+        seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        assert (channels[:, 3] < 0).all()
+        torch.testing.assert_close((channels[:, :3] * seen).sum(-1), channels[:, 3])
+
+
+def test_derivatives_of_the_maps():
+    camera = _camera(8, 6)
+    means, quats, scales = _plane(6, half=0.2)
+    scales = scales + math.log(5.0)
+
+    def values(means, quats):
+        maps, _ = _maps(camera, means, quats, scales)
+        return torch.cat([maps.unit, maps.distance, maps.depth], dim=-1)
+
+    assert values(means, quats).abs().sum() > 0
+    inputs = (means.clone().requires_grad_(), quats.clone().requires_grad_())
+    assert torch.autograd.gradcheck(values, inputs, eps=1e-7, atol=1e-4)
+
+
+@pytest.mark.gpu
+def test_gsplat_blends_the_same_channels():
+    """Colours are as without channels, the background is not blended into them, and gradients agree with torch."""
+    from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
+
+    camera, background = _camera(), torch.tensor([0.2, 0.5, 0.7], device="cuda")
+    found, gradients = [], []
+    for renderer in (GsplatRenderer(), TorchRenderer()):
+        means, quats, scales = (part.float().cuda().requires_grad_() for part in _plane())
+        maps, drawn = _maps(camera, means, quats, scales, renderer)
+        (maps.depth.square().sum() + maps.unit[..., 0].sum()).backward()
+        found.append((maps, drawn))
+        gradients.append((means.grad, quats.grad))
+        opacities, sh = torch.full((len(means),), 0.9).cuda(), torch.zeros(len(means), 1, 3).cuda()
+        plain = renderer.render_splat(means, quats, scales, opacities, sh, camera, background)
+        view = camera.to("cuda", torch.float32)
+        channels = plane_channels(means, quats, scales, view)
+        both = renderer.render_splat(means, quats, scales, opacities, sh, camera, background, channels=channels)
+        torch.testing.assert_close(both.color, plain.color)
+        torch.testing.assert_close(both.channels, drawn.channels)
+    (ours, _), (expected, _) = found
+    same = (ours.known == expected.known).float().mean()
+    assert float(same) > 0.999
+    known = ours.known & expected.known
+    assert float((ours.depth - expected.depth)[known].abs().max()) < 1e-4
+    for one, two in zip(*gradients, strict=True):
+        assert float((one - two).norm() / two.norm()) < 0.02
