@@ -23,6 +23,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.regions import Everything, Region
+from gaussian_swaying.geometry.surface_normals import neighbour_normals
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
@@ -77,6 +78,10 @@ class Scene:
             cell, a solid the cube, a cord as many. With 1 an object falls apart. An even number keeps the second
             moments of a group too (see :func:`~gaussian_swaying.simulation.sampling.matched_points`), so 2 is more
             accurate than 3.
+        normals: Normals of the patches: ``smallest_axis`` of each Gaussian, as in the paper, or ``neighbours``, of
+            planes through neighbouring centres (see
+            :func:`~gaussian_swaying.geometry.surface_normals.neighbour_normals`), which are better on large smooth
+            surfaces whose Gaussians lie well but are turned badly.
     """
 
     def __init__(
@@ -98,6 +103,7 @@ class Scene:
         points: str | None = None,
         points_per_cell: int = 2,
         loose: str = "simulate",
+        normals: str = "smallest_axis",
     ) -> None:
         if points is not None:
             check_choice("scene.points", points, ("gaussian", "grid"))
@@ -109,6 +115,7 @@ class Scene:
         check_choice("scene.loose", loose, ("simulate", "carry"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
         check_choice("scene.area", area, ("coverage", "paper", "equal"))
+        check_choice("scene.normals", normals, ("smallest_axis", "neighbours"))
         if not any(check_vector("scene.up", up)):
             raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
         if not 0 <= opacity_threshold < 1:
@@ -133,7 +140,7 @@ class Scene:
         self.filling, self.wind_on = filling, wind_on
         self.max_stretch = None if max_stretch is None else float(max_stretch)
         self.layers, self.particle_spacing, self.loose = layers, particle_spacing, loose
-        self.points, self.points_per_cell = points, int(points_per_cell)
+        self.points, self.points_per_cell, self.normals = points, int(points_per_cell), normals
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -236,6 +243,10 @@ class SimulatedScene(nn.Module):
                 simulated = chosen.nonzero()[:, 0]
                 pieces = _pieces(cloud, simulated, spacing, hole)
         normals = self.model.normals()
+        if scene.normals == "neighbours":
+            weight = opacity[simulated] * patch_area(cloud.scales[simulated])
+            parts = cloud.means[simulated], normals[simulated], weight
+            normals = normals.index_put((simulated,), neighbour_normals(*parts))
         position = self.frame.point_to_sim(cloud.means[simulated].double())
         filling = None
         if scene.filling is not None:

@@ -10,6 +10,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -440,3 +441,23 @@ def test_three_layers_are_a_plate(make_cloud):
 def test_layers_that_do_not_fit(make_cloud, scene, material, words):
     with pytest.raises(ValueError, match=words):
         SimulatedScene(Scene(points="gaussian", generator=_Given(make_cloud()), **scene), Material(**material), 0.25)
+
+
+def test_normals_from_neighbours(make_cloud, make_scene):
+    """Of a sheet whose Gaussians are turned at random: patches, pictures and pressure use the normal of the sheet."""
+    generator = torch.Generator().manual_seed(2)
+    cloud = FlagScene(width=0.6, height=0.4, spacing=0.02, ripple=0.0).generate()
+    turn = torch.nn.functional.pad(0.15 * torch.randn(len(cloud.means), 3, generator=generator), (1, 0), value=1.0)
+    cloud = dataclasses.replace(cloud, quats=rotation_to_quat(quat_to_rotation(turn) @ quat_to_rotation(cloud.quats)))
+    material = Material(E=1e4, nu=0.3, density=100.0, thickness=0.01)
+    found = {}
+    for normals in ("smallest_axis", "neighbours"):
+        scene = Scene(ply="unused", normals=normals, metres_per_unit=1.0)
+        found[normals] = SimulatedScene(scene, material, dx=0.05, cloud=cloud)
+    flat = found["neighbours"].rest_normals[:, 1].abs()
+    assert float(flat.min()) > 1 - 1e-6
+    assert float(found["smallest_axis"].rest_normals[:, 1].abs().min()) < 0.97
+    assert float(found["neighbours"].rest_facing[:, 1].abs().min()) > 1 - 1e-6
+    assert float(found["neighbours"].patches.normal[:, 1].abs().min()) > 1 - 1e-6
+    with pytest.raises(ValueError, match=r"scene\.normals"):
+        Scene(ply="unused", normals="random")
