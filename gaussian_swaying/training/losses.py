@@ -183,13 +183,6 @@ class LossTerm(nn.Module, ABC):
     def forward(self, inputs: LossInputs) -> Tensor:
         """The term as a number, before its weight."""
 
-    def memory(self) -> Tensor | None:
-        """What the term keeps from one image to the next, for checkpoints; None for nothing."""
-        return None
-
-    def remember(self, memory: Tensor | None) -> None:
-        """Go on with what :meth:`memory` returned."""
-
 
 class PhotometricLoss(LossTerm):
     """Distance between picture and photo, see :func:`photometric_loss`.
@@ -348,17 +341,6 @@ class TotalLoss(nn.Module):
         """What these terms need, see :data:`NEEDS`."""
         wanted: frozenset[str] = frozenset()
         return wanted.union(*(getattr(term, "needs", wanted) for term in self.active(step).values()))
-
-    def memory(self) -> dict[str, Tensor]:
-        """What the terms keep from one image to the next, by name."""
-        kept = {name: term.memory() for name, term in self.terms.items() if isinstance(term, LossTerm)}
-        return {name: memory for name, memory in kept.items() if memory is not None}
-
-    def remember(self, memory: Mapping[str, Tensor]) -> None:
-        """Go on with what :meth:`memory` returned; what belongs to no term is left out."""
-        for name, term in self.terms.items():
-            if name in memory and isinstance(term, LossTerm):
-                term.remember(memory[name])
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
         """The sum, with its gradient, and each active term before its weight, detached.

@@ -386,7 +386,6 @@ class SplatTrainer(lightning.LightningModule):
             "seed": self.seed,
             "random": self._random,
             "seen": self.global_step,
-            "losses": self.loss.memory(),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -412,7 +411,6 @@ class SplatTrainer(lightning.LightningModule):
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
         self._random = {name: state.cpu() for name, state in stored["random"].items()}
         self._seen = int(stored["seen"])
-        self.loss.remember(stored.get("losses", {}))
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
         else:

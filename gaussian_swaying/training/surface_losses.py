@@ -11,9 +11,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.gaussians.area import patch_area
-from gaussian_swaying.geometry.patches import smallest_axis_normal
-from gaussian_swaying.geometry.surface_normals import neighbour_normals
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.planes import SurfaceMaps, depth_normals
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView
@@ -230,52 +227,6 @@ class DepthNormalLoss(SurfaceTerm):
         """See :func:`depth_normal_loss`."""
         maps, camera = surface_of(inputs)
         return depth_normal_loss(maps, camera, edge_weight(inputs.target) if self.edges else None)
-
-
-class NeighbourPlaneLoss(LossTerm):
-    r"""Smallest axes of the Gaussians against planes through neighbouring centres, :math:`1 - (n_i \cdot p_i)^2`.
-
-    The mean over the Gaussians. Photos determine the centres better than the axes, see
-    :func:`~gaussian_swaying.geometry.surface_normals.neighbour_normals`, so the planes are taken as they are and only
-    the axes turn. They are found anew every so many images, and whenever Gaussians were added or removed.
-
-    Args:
-        start: Images trained on before this term begins.
-        neighbours: Nearest centres that a plane goes through, at least 3.
-        every: Images between two searches for neighbours.
-
-    Raises:
-        ValueError: If a number is out of range.
-    """
-
-    def __init__(self, start: int = 7000, neighbours: int = 16, every: int = 200) -> None:
-        super().__init__()
-        check_positive("start", start, allow_zero=True)
-        check_positive("every", every)
-        if neighbours < 3:
-            raise ValueError(f"Expected `neighbours` to be at least 3, but got {neighbours}.")
-        self.start, self.neighbours, self.every = int(start), int(neighbours), int(every)
-        self._planes: Tensor | None = None
-
-    def forward(self, inputs: LossInputs) -> Tensor:
-        """See above; 0 without Gaussians."""
-        normals = smallest_axis_normal(inputs.quats, inputs.log_scales)
-        if not len(normals):
-            return normals.sum()
-        if self._planes is None or len(self._planes) != len(normals) or inputs.step % self.every == 0:
-            with torch.no_grad():
-                weight = inputs.opacities * patch_area(inputs.log_scales)
-                self._planes = neighbour_normals(inputs.means, normals, weight, self.neighbours)
-        planes = self._planes.to(normals)
-        return (1.0 - (normals * planes).sum(-1).square()).mean()
-
-    def memory(self) -> Tensor | None:
-        """The planes, so that a resumed training goes on with the same."""
-        return self._planes
-
-    def remember(self, memory: Tensor | None) -> None:
-        """Go on with planes from :meth:`memory`."""
-        self._planes = memory
 
 
 class MultiViewGeometricLoss(SurfaceTerm):

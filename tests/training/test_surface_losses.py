@@ -5,7 +5,6 @@ from functools import cache
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
@@ -18,7 +17,6 @@ from gaussian_swaying.training.surface_losses import (
     DepthNormalLoss,
     MultiViewGeometricLoss,
     MultiViewPhotometricLoss,
-    NeighbourPlaneLoss,
     chosen_pixels,
     cross_correlation,
     depth_normal_loss,
@@ -301,56 +299,6 @@ def test_a_training_with_all_terms_on_a_gpu(data, make_trainer):
     last = [row for row in logged if "train/loss" in row][-1]
     assert {f"train/{name}" for name in TERMS} <= set(last)
     assert all(math.isfinite(value) for value in last.values())
-
-
-def test_axes_turn_to_planes_through_neighbours():
-    """The value is the mean squared sine; its gradient turns the axes alone, and centres stay."""
-    generator = torch.Generator().manual_seed(0)
-    means = torch.nn.functional.pad(torch.rand(400, 2, generator=generator), (0, 1)).requires_grad_()
-    tilt = 0.1
-    quats = torch.tensor([math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0]).repeat(400, 1).requires_grad_()
-    log_scales = torch.tensor([0.03, 0.02, 0.001]).log().repeat(400, 1)
-    term = NeighbourPlaneLoss(start=0, every=10)
-
-    def value(step):
-        return term(_inputs(means=means, quats=quats, log_scales=log_scales, opacities=torch.ones(400), step=step))
-
-    loss = value(0)
-    assert float(loss) == pytest.approx(math.sin(tilt) ** 2, rel=1e-3)
-    loss.backward()
-    assert means.grad is None
-    descent = torch.optim.Adam([quats], lr=0.01)
-    for step in range(1, 60):
-        descent.zero_grad()
-        value(step).backward()
-        descent.step()
-    assert float(value(61)) < 1e-5
-    planes = term.memory()
-    with torch.no_grad():
-        means += torch.tensor([0.0, 0.0, 1.0]) * means[:, :1]
-    value(62)
-    assert term.memory() is planes  # not yet
-    value(70)
-    assert term.memory() is not planes
-    again = NeighbourPlaneLoss(start=0, every=10)
-    again.remember(planes)
-    assert again.memory() is planes
-    with pytest.raises(ValueError, match="neighbours"):
-        NeighbourPlaneLoss(neighbours=2)
-
-
-def test_a_resumed_training_goes_on_with_the_same_planes(data, make_trainer, tmp_path):
-    def module():
-        return SplatTrainer(loss_terms={"plane": NeighbourPlaneLoss(start=2, every=5)}, sh_degree=0, lpips=None)
-
-    straight = module()
-    make_trainer(9).fit(straight, data)
-    save = ModelCheckpoint(dirpath=tmp_path, every_n_train_steps=7, save_top_k=-1, filename="{step}")
-    make_trainer(9, enable_checkpointing=True, callbacks=[save]).fit(module(), data)
-    resumed = module()
-    make_trainer(9).fit(resumed, data, ckpt_path=tmp_path / "step=7.ckpt", weights_only=False)
-    assert torch.equal(resumed.splat.quats, straight.splat.quats)
-    assert torch.equal(resumed.splat.means, straight.splat.means)
 
 
 def test_a_datamodule_without_other_views_is_named(data, make_trainer):
