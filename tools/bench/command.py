@@ -21,6 +21,7 @@ from bench.cases import (
     previews,
     runs,
     speed,
+    surfaces,
     training,
     web,
 )
@@ -77,6 +78,8 @@ COMMANDS = {
     "points": Command("Measure error and time against the points of a cell.", points.run, points.add_arguments),
     "gradients": Command("Measure the memory of gradients through long rollouts, and fit a flag.",
                          gradients.run, device=False, page="validation.md"),
+    "surfaces": Command("Measure how trained normals are tilted, by which losses, and what it does to a flag.",
+                        _going_on("surfaces", surfaces.measure), surfaces.add_arguments, page="training.md"),
     "train": Command("Measure training: a bare gsplat loop and Lightning, and the effect of the surface losses.",
                      _going_on("train", training.measure), training.add_arguments),
     "flags": Command("Train, simulate and compare the flags of the paper with Blender's cloth.",

@@ -25,6 +25,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     runs,
     speed,
     speed_plot,
+    surfaces,
     training,
     web,
 )

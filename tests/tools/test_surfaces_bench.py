@@ -1,0 +1,79 @@
+"""``bench.py surfaces``: what it measures of a splat, how it trains, and what it shows."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from bench.cases import surfaces
+from bench.tables.surfaces import goal_table, limits_table, rows_table
+
+from gaussian_swaying.captures.generated_capture import GeneratedCapture
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
+from gaussian_swaying.scenes.procedural import FlagScene
+
+
+@pytest.fixture
+def cloth(tmp_path):
+    """The rest shape of a flat flag as the data set stores it."""
+    x, z = np.meshgrid(np.linspace(0, 1.2, 61), np.linspace(0, 0.8, 41), indexing="ij")
+    vertices = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], -1)
+    normals = np.tile([0.0, -1.0, 0.0], (x.size, 1))
+    path = tmp_path / "cloth.npz"
+    np.savez(path, positions=vertices[None].astype(np.float32), rest_normals=normals)
+    return path
+
+
+def test_axes_that_are_turned_and_centres_that_are_not(cloth, tmp_path):
+    """All axes turned by half a degree: so are patches, not planes through neighbours. A stray Gaussian is left out."""
+    cloud = FlagScene(spacing=0.02, ripple=0.0).generate()
+    half = math.radians(0.25)
+    turn = quat_to_rotation(torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)]))
+    cloud = replace(cloud, quats=rotation_to_quat(turn @ quat_to_rotation(cloud.quats)))
+    cloud.means[0, 1] += 0.3
+    write_ply(tmp_path / "flag.ply", cloud)
+    found = surfaces.tilts(tmp_path / "flag.ply", cloth)
+    assert found["gaussians"] == len(cloud.means) - 1
+    assert found["height_rms_mm"] < 1e-3
+    for size in (10, 20, 40):
+        assert found["smallest_axis"][f"tilt_{size}cm_deg"] == pytest.approx(0.5, abs=0.01)
+        assert found["neighbours"][f"tilt_{size}cm_deg"] < 0.01
+    assert found["smallest_axis"]["median_deg"] == pytest.approx(0.5, abs=0.01)
+
+
+def test_what_cameras_allow(tmp_path):
+    photos = GeneratedCapture(views=24, size=8).write(tmp_path / "photos")
+    found = surfaces.limits(photos)
+    assert found["all of the views"]["all_views"] > 3 * found["a quarter of the views"]["all_views"]
+    assert 0 < found["all of the views"]["tilt_deg"] < found["a quarter of the views"]["tilt_deg"]
+
+
+def test_terms_begin_half_way_through():
+    command = surfaces.train_command(Path("photos"), "views", 1, 7000, Path("out"))
+    assert "--model.loss_terms.photometric.init_args.start=3500" in command
+    assert "--data.init_args.seed=1" in command
+    assert not any("loss_terms" in part for part in surfaces.train_command(Path("p"), "paper", 0, 10, Path("o")))
+
+
+def _result():
+    tilt = {"tilt_10cm_deg": 0.6, "tilt_20cm_deg": 0.4, "tilt_40cm_deg": 0.3, "median_deg": 1.0}
+    row = {"tilt": {"smallest_axis": tilt, "neighbours": tilt | {"tilt_40cm_deg": 0.08}, "height_rms_mm": 0.4}}
+    row |= {"chamfer": {"smallest_axis": 0.03, "neighbours": 0.015}, "psnr_db": 34.1, "seconds": 200.0}
+    limit = {"all_views": 175, "views": 71.0, "height": 1e-6, "height_common": 1e-5, "tilt_deg": 0.001}
+    return {
+        "device": "NVIDIA H200", "versions": {"torch": "2"}, "pattern": 2, "steps": 7000, "at_once": 4,
+        "rows": {"views": {"0": row, "1": row}}, "limits": {"all of the views": limit},
+    }  # fmt: skip
+
+
+def test_tables():
+    result = _result()
+    assert goal_table(result)[-2] == "| tilt over 40 cm at most 0.1° | 0.08°, 0.08° | yes |"
+    assert goal_table(result)[-1].endswith("| 1.50 %, 1.50 % | yes |")
+    result["rows"]["views"]["1"]["chamfer"] = {"smallest_axis": 0.03, "neighbours": 0.021}
+    assert goal_table(result)[-1].endswith("| no |")
+    assert "| 0.60, 0.60 | 0.40, 0.40 | 0.08, 0.08 | 1.00, 1.00 |" in rows_table(result)[-1]
+    assert limits_table(result)[-1] == "| all of the views (175) | 71 | 0.0010 | 0.010 | 0.0010 |"
