@@ -74,9 +74,10 @@ def _discs(means: Tensor, normals: Tensor, spacing: float, opacity: float, area:
     return Body(means, normals, scales.contiguous(), means.new_full((len(means),), opacity), area)
 
 
-def plate(count: int = 20_000, opacity: float = 0.95, seed: int = 0) -> Body:
-    """A free sheet of one square metre, at random places."""
-    place = _random(count, seed)[1] * torch.tensor([1.0, 1.0, 0.0])
+def plate(count: int = 20_000, opacity: float = 0.95, seed: int = 0, roughness: float = 0.0) -> Body:
+    """A free sheet of one square metre, at random places, off its plane by ``roughness`` spacings (rms)."""
+    noise, draw = _random(count, seed)
+    place = draw * torch.tensor([1.0, 1.0, 0.0]) + noise * torch.tensor([0.0, 0.0, roughness * count**-0.5])
     return _discs(place, torch.tensor([[0.0, 0.0, 1.0]]).double().expand(count, 3), count**-0.5, opacity, 1.0)
 
 
@@ -164,6 +165,7 @@ def of_cloud(cloud: GaussianCloud, threshold: float = 0.1, above: float | None =
 
 BODIES: dict[str, Callable[[], Body]] = {
     "plate": plate,
+    "plate, rough by 0.2 spacings": lambda: plate(roughness=0.2),
     "faint plate, opacity 0.4": lambda: plate(opacity=0.4),
     "sphere": shell,
     "sphere, opacity 0.6": lambda: shell(opacity=0.6),
@@ -183,6 +185,7 @@ BODIES: dict[str, Callable[[], Body]] = {
     "leafy branch, 150 leaves": lambda: of_cloud(LeavesScene().generate()),
     "crown of 300 leaves": lambda: of_cloud(FicusScene(leaves=300).generate(), above=CROWN),
     "crown of 2,400 leaves": lambda: of_cloud(FicusScene().generate(), above=CROWN),
+    "unresolved: plate, rough by 1 spacing": lambda: plate(roughness=1.0),
     "unresolved: clutter right under a sphere": lambda: cluttered_sphere(radius=0.98),
     "unresolved: haze with normals tilted by 45 degrees": lambda: hazy_sphere(tilt=0.8),
 }
