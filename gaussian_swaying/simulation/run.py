@@ -302,6 +302,7 @@ class Run:
             "filled_particles": scene.filled,
             "mass_kg": float(solver.points.mass.sum()),
             "patch_area_m2": float(scene.patches.area.sum()),
+            "hull_area_m2": scene.hull_area(),
             "formulation": solver.formulation,
             "dtype": str(state.position.dtype).removeprefix("torch."),
             "grid": {"dx_m": solver.dx, "resolution": list(state.grid.resolution)},

@@ -17,8 +17,10 @@ from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.grouping import loose_points
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
+from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
+from gaussian_swaying.geometry.directions import hull_area
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
@@ -51,9 +53,12 @@ class Scene:
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Cannot be combined with
             metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
-        area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface), ``paper`` (pi s1 s2), or
-            ``equal`` (the same area for all, with the total of ``coverage``; for comparison with a wind that does not
-            use patches).
+        area: Patch area, for wind and mass: ``coverage`` (independent of how many Gaussians carry the surface),
+            ``open`` (the same, weighed by how open each patch is to the outside, see
+            :func:`~gaussian_swaying.gaussians.openness.openness`: layers behind the skin of a capture count for almost
+            nothing), ``paper`` (pi s1 s2), or ``equal`` (the same area for all, with the total of ``coverage``; for
+            comparison with a wind that does not use patches). Null for ``open`` with ``ply`` and ``coverage`` with
+            ``generator`` or ``wind_on: all``.
         filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
         wind_on: Which simulated Gaussians feel the wind: ``surface`` (those in contact with open air) or ``all`` (also
             those inside the solid that ``filling`` finds). Without ``filling``, all are on the surface.
@@ -94,7 +99,7 @@ class Scene:
         up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
         longest_side: float | None = None,
         metres_per_unit: float | None = None,
-        area: str = "coverage",
+        area: str | None = None,
         filling: InteriorFilling | None = None,
         wind_on: str = "surface",
         max_stretch: float | None = 2.0,
@@ -114,8 +119,13 @@ class Scene:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.loose", loose, ("simulate", "carry"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
-        check_choice("scene.area", area, ("coverage", "paper", "equal"))
         check_choice("scene.normals", normals, ("smallest_axis", "neighbours"))
+        if area is not None:
+            check_choice("scene.area", area, ("coverage", "open", "paper", "equal"))
+        if area == "open" and wind_on == "all":
+            raise ValueError(
+                'Expected `scene.wind_on` surface with `scene.area` "open": areas behind the surface feel no wind.'
+            )
         if not any(check_vector("scene.up", up)):
             raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
         if not 0 <= opacity_threshold < 1:
@@ -141,6 +151,13 @@ class Scene:
         self.max_stretch = None if max_stretch is None else float(max_stretch)
         self.layers, self.particle_spacing, self.loose = layers, particle_spacing, loose
         self.points, self.points_per_cell, self.normals = points, int(points_per_cell), normals
+
+    @property
+    def area_kind(self) -> str:
+        """``area``, or what null stands for."""
+        if self.area is not None:
+            return self.area
+        return "open" if self.ply is not None and self.wind_on == "surface" else "coverage"
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -259,8 +276,10 @@ class SimulatedScene(nn.Module):
         source = source if pieces is None else torch.cat([source, pieces.parent])
         outer = torch.ones(len(source), dtype=torch.bool) if filling is None else filling.on_surface
         areas = cloud.means.new_zeros(len(source))
-        for part in (outer, ~outer):  # inner points take no area from the surface
-            areas[part] = _areas(cloud.select(simulated), normals[simulated], source, pieces, part, scene.area)
+        kind = scene.area_kind
+        # inner points take no area from the surface
+        for part, mode in ((outer, kind), (~outer, "coverage" if kind == "open" else kind)):
+            areas[part] = _areas(cloud.select(simulated), normals[simulated], source, pieces, part, mode)
         body_area = self.frame.area_to_sim(areas).double()
         area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
         facing = self.frame.direction_to_sim(normals[simulated[source]].double())
@@ -327,6 +346,10 @@ class SimulatedScene(nn.Module):
     def center(self) -> Tensor:
         """Centre of the simulated part at rest, scene units, shape (3,)."""
         return self.frame.origin
+
+    def hull_area(self) -> float:
+        """Area of the convex hull of the simulated Gaussians at rest [m²]; that of a flat sheet has two sides."""
+        return hull_area(self.model.means[self.simulated]) * self.frame.metres_per_unit**2
 
     def rest(self) -> DeformedGaussians:
         """The Gaussians at rest."""
@@ -429,7 +452,10 @@ def _areas(
     means, log_scales, opacity = cloud.means, cloud.scales, torch.sigmoid(cloud.opacities)
     if pieces is not None:
         means, log_scales, opacity = torch.cat([means, pieces.means]), pieces.log_scales, pieces.opacity
-    found = coverage_area(means[group], normals[source[group]], log_scales[group], opacity[group])
+    shape = means[group], normals[source[group]], log_scales[group]
+    found = coverage_area(*shape, opacity[group])
+    if mode == "open":
+        return found * openness(*shape, found, opacity[group])
     return found.mean().expand(len(found)) if mode == "equal" and len(found) else found
 
 

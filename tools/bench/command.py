@@ -11,6 +11,7 @@ from typing import Any
 from bench import pages, record, show
 from bench.cases import (
     accuracy,
+    area,
     flags,
     gallery,
     gradients,
@@ -90,6 +91,8 @@ COMMANDS = {
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
     "previews": Command("Compare the times that previews announce with those of runs.",
                         _going_on("previews", previews.measure), previews.add_arguments),
+    "area": Command("Measure the areas of bodies with a known skin, of captures, and the time that they take.",
+                    area.run, area.add_arguments, device=False, page="validation.md"),
     "web": Command("Measure films for the web: size, error, and speed in headless Chromium.",
                    _going_on("web", web.measure), web.add_arguments, page="web.md"),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
