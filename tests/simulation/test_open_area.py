@@ -5,14 +5,18 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.preview.as_data import run_dict
 from gaussian_swaying.simulation.preview.report import run_lines
+from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.simulation.preview.suggest import suggest
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.validation.bodies import cluttered_sphere
@@ -101,6 +105,12 @@ def test_preview_tells_area_and_hull(capture):
     assert run["hull_area_m2"] == pytest.approx(math.pi, rel=0.01)
     line = f"  area            {run['area_m2']:.3g} m^2 in the wind; the convex hull has {run['hull_area_m2']:.3g} m^2"
     assert line in run_lines(run)
+
+
+def test_starter_of_a_capture_is_open(capture):
+    found = suggest(read_gaussians(capture), quality="draft")
+    for text in (starter_yaml(found, capture), draft_yaml(found, capture)):
+        assert yaml.safe_load(text)["scene"]["area"] == "open"
 
 
 def test_summary_has_area_and_hull(tmp_path, capture):
