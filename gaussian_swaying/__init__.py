@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from gaussian_swaying.aero.carried import CarriedField, Turbulence
+    from gaussian_swaying.aero.effects import LogProfile, PowerProfile, WindEffect
     from gaussian_swaying.aero.force import AeroForce, aero_force
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
     from gaussian_swaying.aero.wind_force import WindForce
@@ -74,6 +76,15 @@ if TYPE_CHECKING:
     from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
+    "aero.carried": (
+        "CarriedField",
+        "Turbulence",
+    ),
+    "aero.effects": (
+        "LogProfile",
+        "PowerProfile",
+        "WindEffect",
+    ),
     "aero.force": (
         "AeroForce",
         "aero_force",
@@ -206,6 +217,7 @@ __all__ = [
     "Capture",
     "CaptureCamera",
     "CaptureDataModule",
+    "CarriedField",
     "ChamferDistance",
     "ConstitutiveLaw",
     "Cylinder",
@@ -230,6 +242,7 @@ __all__ = [
     "Impulse",
     "InteriorFilling",
     "KeyframedCamera",
+    "LogProfile",
     "LookAtCamera",
     "LossInputs",
     "LossTerm",
@@ -249,6 +262,7 @@ __all__ = [
     "Plane",
     "Plasticine",
     "PointCloud",
+    "PowerProfile",
     "Recorder",
     "Sand",
     "Scene",
@@ -268,9 +282,11 @@ __all__ = [
     "TorchRenderer",
     "TotalLoss",
     "TransformsCamera",
+    "Turbulence",
     "UniformGust",
     "VelocityBox",
     "View",
+    "WindEffect",
     "WindField",
     "WindForce",
     "aero_force",

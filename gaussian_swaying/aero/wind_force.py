@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record, tensors_in
+from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -88,18 +89,13 @@ class WindForce(Force):
     @property
     def uniform(self) -> bool:
         """Whether the wind is the same everywhere in a scene."""
-        return all(isinstance(wind, WindField) for wind in self._fields)
+        return all(isinstance(wind, WindField) and wind.uniform for wind in self._fields)
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
         """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
         return all(
-            wind.recordable if isinstance(wind, SpatialWind) else type(wind) is WindField for wind in self._fields
-        ) and all(
-            getattr(part, "recordable", False)
-            for wind in self._fields
-            if isinstance(wind, WindField)
-            for part in wind.modulations
+            wind.recordable and (isinstance(wind, SpatialWind) or type(wind) is WindField) for wind in self._fields
         )
 
     @property
@@ -171,12 +167,9 @@ class WindForce(Force):
         if self.uniform:
             return self._winds(time, 0.0, 1)[0]
         if self._shared:
-            return self._fields[0](time, position)
-        parts = [
-            wind(time, place) if isinstance(wind, SpatialWind) else wind(time).to(place).expand_as(place)
-            for wind, place in zip(self._fields, position, strict=True)
-        ]
-        return torch.stack([part.expand_as(position[0]).to(position) for part in parts])
+            return _air(self._fields[0], time, position)
+        parts = [_air(wind, time, place) for wind, place in zip(self._fields, position, strict=True)]
+        return torch.stack([part.to(position).expand_as(position[0]) for part in parts])
 
     def samples(self, state: MPMState, dt: float, steps: int) -> Tensor:
         """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
@@ -207,11 +200,17 @@ class WindForce(Force):
         return self.force(state, self.air(state.time, state.position))
 
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
-        """See ``Force.during``: a uniform wind is computed for all substeps at once."""
-        if not self.uniform:
+        """See ``Force.during``: what does not depend on the place is computed for all substeps at once."""
+        if self.uniform:
+            winds = self.winds(time, dt, steps)
+            return lambda state, k: self.force(state, winds[k])
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)):
             return super().during(time, dt, steps)
-        winds = self.winds(time, dt, steps)
-        return lambda state, k: self.force(state, winds[k])
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        moments = list(map(Moment, times, wind.mean_flow(times), wind.carried(times)))
+        blown = _blow(wind, times)
+        return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
 
     @property
     def has_twin(self) -> bool:
@@ -249,6 +248,12 @@ class WindForce(Force):
             numbers=numbers,
             vectors=self.winds,
         )
+
+
+def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
+    """Velocity of one wind at given places, broadcastable to them."""
+    found: Tensor = wind.at(time, position) if isinstance(wind, WindField) else wind(time, position)
+    return found
 
 
 def _blow(wind: nn.Module, times: Tensor) -> Tensor:
