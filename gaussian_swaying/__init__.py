@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.aero.carried import CarriedField, Turbulence
     from gaussian_swaying.aero.effects import LogProfile, PowerProfile, WindEffect
     from gaussian_swaying.aero.force import AeroForce, aero_force
+    from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
     from gaussian_swaying.aero.wind_force import WindForce
     from gaussian_swaying.captures.capture import Capture, View, read_capture
@@ -76,6 +77,10 @@ if TYPE_CHECKING:
     from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
+    "aero.recorded": (
+        "FrozenWind",
+        "RecordedWind",
+    ),
     "aero.carried": (
         "CarriedField",
         "Turbulence",
@@ -232,6 +237,7 @@ __all__ = [
     "Force",
     "Frame",
     "FrechetVideoDistance",
+    "FrozenWind",
     "GaussianCloud",
     "GaussianGust",
     "GaussianSurfaceModel",
@@ -263,6 +269,7 @@ __all__ = [
     "Plasticine",
     "PointCloud",
     "PowerProfile",
+    "RecordedWind",
     "Recorder",
     "Sand",
     "Scene",

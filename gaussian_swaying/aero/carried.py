@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying.aero.effects import Moment, WindEffect
+from gaussian_swaying.aero.effects import Moment, WindEffect, placed
 from gaussian_swaying.aero.lookup import trilinear
 from gaussian_swaying.aero.spectra import SPECTRA, resolved_share
 from gaussian_swaying.aero.turbulence_box import sheared_variances, turbulence_box
+from gaussian_swaying.geometry.frame import SimFrame
 
 
 def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
@@ -54,7 +56,8 @@ class CarriedField(WindEffect):
     Args:
         table: Velocities at the corners of its cells, along its own axes, shape (X, Y, Z, 3), float32.
         spacing: Sides of a cell [m].
-        start: Where the object's centre is in the field at time zero, from its first corner [m].
+        origin: A point in scene units; in Python [m], z up, from the object's centre.
+        anchor: Where that point is in the field at time zero, from its first corner, along its axes [m].
         wraps: Whether it repeats along each axis; if not, its outermost values go on outside.
         scale: Factor of the velocities.
         tilted: See :func:`box_axes`.
@@ -69,7 +72,8 @@ class CarriedField(WindEffect):
         self,
         table: Tensor,
         spacing: Sequence[float],
-        start: Sequence[float] = (0.0, 0.0, 0.0),
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
+        anchor: Sequence[float] = (0.0, 0.0, 0.0),
         wraps: tuple[bool, bool, bool] = (True, True, True),
         scale: float = 1.0,
         tilted: bool = False,
@@ -78,7 +82,7 @@ class CarriedField(WindEffect):
         if table.ndim != 4 or table.shape[-1] != 3 or min(table.shape[:3]) < 2:
             raise ValueError(f"Expected `table` of shape (X, Y, Z, 3), at least 2 each, but got {tuple(table.shape)}.")
         self.spacing = check_vector("spacing", spacing)
-        self.start, self.wraps = check_vector("start", start), tuple(bool(w) for w in wraps)
+        self.origin, self.wraps = check_vector("origin", origin), wraps
         self.scale, self.tilted = float(scale), bool(tilted)
         self.register_buffer("table", table, persistent=False)
         self.register_buffer("axes", torch.eye(3, dtype=torch.float64), persistent=False)
@@ -86,25 +90,35 @@ class CarriedField(WindEffect):
         self.register_buffer("sides", sides, persistent=False)
         step = torch.tensor(self.spacing, dtype=torch.float64)
         self.register_buffer("step", step, persistent=False)
-        self.register_buffer("first", torch.tensor(self.start, dtype=torch.float64), persistent=False)
-        self.register_buffer("repeats", torch.tensor(self.wraps), persistent=False)
+        self.register_buffer("place", torch.tensor(self.origin, dtype=torch.float64), persistent=False)
+        found = torch.tensor(check_vector("anchor", anchor), dtype=torch.float64)
+        self.register_buffer("anchor", found, persistent=False)
+        self.register_buffer("repeats", torch.tensor(wraps), persistent=False)
         self.table: Tensor
         self.axes: Tensor
         self.sides: Tensor
         self.step: Tensor
-        self.first: Tensor
+        self.place: Tensor
+        self.anchor: Tensor
         self.repeats: Tensor
 
     def along(self, flow: Tensor) -> None:
         """Turn the x axis of the field into the flow."""
         self.axes = box_axes(flow.detach().cpu(), self.sides.tolist(), self.tilted).to(self.axes.device)
 
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The origin in metres."""
+        other = copy(self)
+        other._buffers = dict(self._buffers)
+        other.place = torch.tensor(placed(frame, self.origin), dtype=torch.float64, device=self.place.device)
+        return other
+
     def offset(self, carried: Tensor) -> Tensor:
         """Place of the object's centre in the field, in cells, when the flow has ``carried`` it [m], shape (..., 3).
 
         Within the first period along the axes that repeat, so that the small numbers of float32 are enough for it.
         """
-        place = self.first - carried @ self.axes.T
+        place = self.anchor - (self.place + carried) @ self.axes.T
         return torch.where(self.repeats, place.remainder(self.sides), place) / self.step
 
     def strength(self, flow: Tensor) -> Tensor | float:
@@ -115,7 +129,7 @@ class CarriedField(WindEffect):
         """Add the velocity of the field."""
         axes = self.axes.to(position.dtype)
         place = position @ (axes / self.step[:, None].to(position.dtype)).T + self.offset(moment.carried).to(position)
-        found = trilinear(self.table, place, self.wraps) @ axes  # type: ignore[arg-type]
+        found = trilinear(self.table, place, self.wraps) @ axes
         strength = self.strength(moment.flow)
         return velocity.to(found) + (strength.to(found) if isinstance(strength, Tensor) else strength) * found
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.aero.effects import Moment, WindEffect
+from gaussian_swaying.aero.wind_files import read_anemometer
 from gaussian_swaying.geometry.frame import SimFrame
 
 
@@ -191,7 +192,9 @@ class WindField(nn.Module):
 
     Args:
         flow: Steady air velocity [m/s], z up.
-        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time.
+        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time. Or
+            the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
+            interpolation.
         interpolation: Between entries of the schedule: ``step`` (hold) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.
@@ -207,7 +210,7 @@ class WindField(nn.Module):
     def __init__(
         self,
         flow: Sequence[float] = (0.0, 0.0, 0.0),
-        schedule: list[FlowKey] | None = None,
+        schedule: list[FlowKey] | str | None = None,
         interpolation: str = "step",
         modulations: Sequence[Modulation] = (),
         seed: int = 0,
@@ -215,6 +218,8 @@ class WindField(nn.Module):
     ) -> None:
         super().__init__()
         check_choice("interpolation", interpolation, ("step", "linear"))
+        if isinstance(schedule, str):
+            schedule, interpolation = list(map(FlowKey, *read_anemometer(schedule))), "linear"
         keys = schedule or [FlowKey(0.0, list(flow))]
         times = [float(key.time) for key in keys]
         if any(a >= b for a, b in pairwise(times)):
