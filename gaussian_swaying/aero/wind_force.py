@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record, tensors_in
 from gaussian_swaying.aero.effects import Moment
+from gaussian_swaying.aero.effects_twin import has_twin, packed, vectors
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -75,11 +77,12 @@ class WindForce(Force):
             )
         self._key: tuple[tuple[object, ...], ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
+        self._space: tuple[object, tuple[int, ...], Tensor] | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """The state without the CUDA graph, which cannot be copied."""
         kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
-        return kept | {"_key": (), "_graph": None}
+        return kept | {"_key": (), "_graph": None, "_space": None}
 
     @property
     def wind(self) -> nn.Module | tuple[nn.Module, ...]:
@@ -214,15 +217,23 @@ class WindForce(Force):
 
     @property
     def has_twin(self) -> bool:
-        """Whether the kernels can compute the force: only if the wind is uniform, and the lists are not too long."""
-        return self.uniform and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
+        """Whether the kernels can compute the force: they must know all effects, and the lists must not be too long."""
+        wind = self._fields[0]
+        known = self.uniform or (self._shared and isinstance(wind, WindField) and has_twin(wind))
+        return known and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
 
     def twin(self) -> ForceTwin:
-        """See ``Force.twin``; for a uniform wind only."""
+        """See ``Force.twin``."""
+        from gaussian_swaying.aero.effects_triton import shaped_wind_force, shaped_wind_on_groups
         from gaussian_swaying.aero.force_triton import wind_force, wind_on_groups
 
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
+        options: tuple[Any, ...] = (aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit)
+        functions, space = (wind_force, wind_on_groups), None
+        if not self.uniform:
+            kinds, space = self._packed()
+            functions, options = (shaped_wind_force, shaped_wind_on_groups), (*options, *kinds)
 
         def numbers() -> Tensor:
             half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
@@ -230,24 +241,47 @@ class WindForce(Force):
 
         if self.sums is not None:
             return ForceTwin(
-                function=wind_on_groups,
-                options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
+                function=functions[1],
+                options=options,
                 implicit=implicit,
                 sources=(self.sums.tensor, self.sums.vector),
                 values=self.sums.lists,
                 numbers=numbers,
-                vectors=self.winds,
+                vectors=self.winds if self.uniform else self._vectors,
                 table=self.sums.table,
+                space=space,
             )
         return ForceTwin(
-            function=wind_force,
-            options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
+            function=functions[0],
+            options=options,
             implicit=implicit,
             sources=(self.normal, self.area),
             values=lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1),
             numbers=numbers,
-            vectors=self.winds,
+            vectors=self.winds if self.uniform else self._vectors,
+            space=space,
         )
+
+    def _packed(self) -> tuple[tuple[int, ...], Tensor]:
+        """What the kernels read of the effects, again where they changed, at the same address where possible."""
+        wind = self._fields[0]
+        assert isinstance(wind, WindField)
+        tensors = tensors_in([wind.effects])
+        key = (fingerprint(wind.effects), tuple(None if t.is_inference() else t._version for t in tensors))
+        if self._space is None or self._space[0] != key:
+            with torch.inference_mode(False), torch.no_grad():
+                kinds, space = packed(wind, self.area.device)
+                if self._space is not None and self._space[1] == kinds and len(self._space[2]) == len(space):
+                    space = self._space[2].copy_(space)
+                self._space = (key, kinds, space)
+        return self._space[1], self._space[2]
+
+    def _vectors(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """As :meth:`winds`, for a wind with effects; shape (steps, 7)."""
+        wind = self._fields[0]
+        assert isinstance(wind, WindField)
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        return vectors(wind, _blow(wind, times), times)
 
 
 def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
