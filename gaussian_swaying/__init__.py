@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from gaussian_swaying.aero.carried import CarriedField, Turbulence
     from gaussian_swaying.aero.effects import LogProfile, PowerProfile, WindEffect
     from gaussian_swaying.aero.force import AeroForce, aero_force
+    from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
     from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
+    from gaussian_swaying.aero.shelter import Shelter
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
     from gaussian_swaying.aero.wind_force import WindForce
     from gaussian_swaying.captures.capture import Capture, View, read_capture
@@ -77,6 +79,12 @@ if TYPE_CHECKING:
     from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
+    "aero.shelter": ("Shelter",),
+    "aero.obstacles": (
+        "CylinderObstacle",
+        "EllipsoidObstacle",
+        "SphereObstacle",
+    ),
     "aero.recorded": (
         "FrozenWind",
         "RecordedWind",
@@ -226,9 +234,11 @@ __all__ = [
     "ChamferDistance",
     "ConstitutiveLaw",
     "Cylinder",
+    "CylinderObstacle",
     "DefaultDensification",
     "DiffuseShader",
     "Edit",
+    "EllipsoidObstacle",
     "EnclosingBox",
     "FixedCorotated",
     "FlowKey",
@@ -274,6 +284,7 @@ __all__ = [
     "Sand",
     "Scene",
     "SequentialRelease",
+    "Shelter",
     "SimFrame",
     "SimulatedScene",
     "Simulation",
@@ -282,6 +293,7 @@ __all__ = [
     "Snow",
     "SpatialWind",
     "Sphere",
+    "SphereObstacle",
     "SplatTrainer",
     "SpringNetwork",
     "StVKHencky",

@@ -59,16 +59,6 @@ class WindEffect(Recordable, nn.Module, ABC):
     def along(self, flow: Tensor) -> None:
         """Take the flow at the start [m/s], shape (3,), on the CPU; called once, when the wind is made."""
 
-    def refresh(self, position: Tensor, area: Tensor, drag: float, flow: Tensor) -> None:
-        """Take in how the body stands now, before a frame; most effects do not depend on it.
-
-        Args:
-            position: Of the particles [m], shape (..., P, 3).
-            area: Of their patches [m²], shape (..., P).
-            drag: How much of the momentum of the air that meets a patch it takes: half the drag coefficient.
-            flow: Undisturbed flow at that time [m/s], shape (3,).
-        """
-
 
 def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:
     """A point in scene units in metres, z up."""

@@ -10,6 +10,7 @@ from torch import Tensor
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, PowerProfile, WindEffect
 from gaussian_swaying.aero.recorded import FrozenWind
+from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 
 LOG, POWER, CARRIED, SHELTER = range(4)  # as in `effects_triton`
@@ -22,6 +23,8 @@ def kind_of(effect: WindEffect) -> int | None:
         return LOG
     if type(effect) is PowerProfile:
         return POWER
+    if type(effect) is Shelter:
+        return SHELTER
     return CARRIED if type(effect) in (CarriedField, Turbulence, FrozenWind) else None
 
 
@@ -39,7 +42,7 @@ def packed(wind: WindField, device: torch.device) -> tuple[tuple[int, ...], Tens
         axis); and their numbers: a header for each, and then their tables, float32, shape (n,).
     """
     effects = list(wind.effects)
-    sizes = [effect.table.numel() if isinstance(effect, CarriedField) else 0 for effect in effects]
+    sizes = [effect.table.numel() if isinstance(effect, CarriedField | Shelter) else 0 for effect in effects]
     space = torch.zeros(HEADER * len(effects) + sum(sizes), device=device)
     start, kinds = HEADER * len(effects), [len(effects)]
     for number, (effect, size) in enumerate(zip(effects, sizes, strict=True)):
@@ -55,6 +58,11 @@ def packed(wind: WindField, device: torch.device) -> tuple[tuple[int, ...], Tens
             head[18:21] = torch.tensor(effect.table.shape[:3])
             space[start : start + size] = effect.table.reshape(-1)
             wraps = effect.wraps
+        elif isinstance(effect, Shelter):
+            head[:9] = effect.turn.reshape(-1)
+            head[9:12] = effect.shift
+            head[18:21] = effect.cells
+            space[start : start + size] = effect.table.reshape(-1)
         kinds += [kind_of(effect) or 0, start, *map(int, wraps)]  # type: ignore[arg-type]
         start += size
     return tuple(kinds), space

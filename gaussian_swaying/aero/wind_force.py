@@ -14,6 +14,7 @@ from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.effects_twin import has_twin, packed, vectors
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
+from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.geometry.patches import compiles, deform_patch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
@@ -201,6 +202,28 @@ class WindForce(Force):
     def forward(self, state: MPMState) -> tuple[Tensor, Tensor | None]:
         """:meth:`force` in the wind of ``state.time``."""
         return self.force(state, self.air(state.time, state.position))
+
+    def refresh(self, state: MPMState) -> None:
+        """Take in how the body stands now, for :class:`~gaussian_swaying.aero.shelter.Shelter`; once in a frame.
+
+        Args:
+            state: The state at the start of the frame.
+        """
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)) or state.position.ndim > 2:
+            return
+        shelters = [effect for effect in wind.effects if isinstance(effect, Shelter)]
+        if not shelters:
+            return
+        with torch.no_grad():
+            flow = wind.mean_flow(state.time)
+            axes = wind_axes(flow)
+            still = state.replace(velocity=torch.zeros_like(state.velocity))
+            force, _ = self.force(still, axes[0].to(still.velocity))  # in a wind of 1 m/s
+            area = (force * axes[0].to(force)).sum(-1).clamp(min=0) / max(0.5 * self.aero.air_density, 1e-30)
+            area = area * (flow.square().sum() > 0)
+            for shelter in shelters:
+                shelter.refresh(state.position, area, axes)
 
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
         """See ``Force.during``: what does not depend on the place is computed for all substeps at once."""

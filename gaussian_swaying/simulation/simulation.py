@@ -467,6 +467,8 @@ class Simulation(nn.Module):
         Returns:
             The frame. An error of it is raised by its ``finish``.
         """
+        if not self.idle:
+            self.wind_force.refresh(state)
         return Launched(self, state)
 
     def measured(

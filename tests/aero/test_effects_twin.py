@@ -7,6 +7,7 @@ from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, PowerProfile
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -54,6 +55,7 @@ def _wind(name):
         "power": [PowerProfile(**low, exponent=0.3)],
         "turbulence": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)],
         "all": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), LogProfile(**low, roughness=0.02)],
+        "sheltered": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), Shelter(cells=8, strength=20.0)],
         "half": [PowerProfile(**low), _field((True, False, False))],
         "held": [_field((False, True, False))],
     }
@@ -86,11 +88,12 @@ def _same(found, expected):
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-@pytest.mark.parametrize("name", ["log", "power", "turbulence", "all", "half", "held"])
+@pytest.mark.parametrize("name", ["log", "power", "turbulence", "all", "sheltered", "half", "held"])
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
     solver, state, load = _bodies(kernel_device, formulation, _wind(name))
     assert load.has_twin
     reference, _, _ = _bodies(kernel_device, formulation, _wind(name), transfer="torch")
+    load.refresh(state)
     found, expected = solver.rollout(state, DT, 6, load), reference.rollout(state, DT, 6, load)
     _same(found, expected)
     load.wind.effects = torch.nn.ModuleList()
