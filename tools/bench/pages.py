@@ -27,6 +27,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     speed_plot,
     training,
     web,
+    winds,
 )
 from gaussian_swaying._files import write_text
 
