@@ -178,7 +178,7 @@ class Turbulence(CarriedField):
         if spacing is not None:
             check_positive("spacing", spacing)
         side = length / 16 if spacing is None else float(spacing)
-        table = _box(tuple(cells), side, float(length), spectrum, float(gamma), int(seed))
+        table = _box(tuple(cells), side, float(length), spectrum, float(gamma), int(seed)).clone()
         relative = 1 / math.sqrt(sheared_variances(float(gamma))[0])  # the component along the wind has the intensity
         # Mann's box has a direction, and so has one whose repetition is avoided by a turn
         super().__init__(table, [side] * 3, scale=float(intensity) * relative, tilted=gamma == 0)

@@ -14,7 +14,10 @@ LOG, POWER, CARRIED = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 
 @triton.jit
 def _corners(x, n, WRAPS: tl.constexpr):
-    """The two rows of a table around a place on one axis, and the share of the second; n is a whole number."""
+    """The two rows of a table around a place on one axis, and the share of the second; n is a whole number.
+
+    They lie in the table even if the place is NaN or infinite, as where a simulation diverges.
+    """
     if not WRAPS:
         x = tl.minimum(tl.maximum(x, 0.0), n - 1)
     first = tl.floor(x)
@@ -26,7 +29,9 @@ def _corners(x, n, WRAPS: tl.constexpr):
     else:
         low = first
         high = tl.minimum(first + 1, n - 1)
-    return low.to(tl.int32), high.to(tl.int32), share
+    last = n.to(tl.int32) - 1
+    row = tl.minimum(tl.maximum(low.to(tl.int32), 0), last)
+    return row, tl.minimum(tl.maximum(high.to(tl.int32), 0), last), share
 
 
 @triton.jit

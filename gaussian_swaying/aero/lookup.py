@@ -42,8 +42,8 @@ def trilinear(
         high = low + 1
         if wraps[axis]:
             low, high = low.remainder(n), high.remainder(n)
-        else:
-            high = high.clamp(max=n - 1)
+        else:  # NaN, as where a simulation diverges, must not lead out of the table
+            low, high = low.clamp(0, n - 1), high.clamp(0, n - 1)
         below.append((low, high))
         weights.append((1 - share, share))
     (x0, x1), (y0, y1), (z0, z1) = below

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import trilinear
+from gaussian_swaying.geometry.frame import SimFrame
 
 
 def extinction(density: Tensor, spacing: Tensor) -> Tensor:
@@ -58,6 +61,7 @@ def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
     Returns:
         Shape (cells, cells, cells).
     """
+    place = place.nan_to_num(0.0)
     low = place.floor().clamp(0, cells - 2)
     share = place - low
     unit = amount.double().amax().clamp(min=1e-300) * 2.0**-40
@@ -100,6 +104,12 @@ class Shelter(WindEffect):
         self.table: Tensor
         self.turn: Tensor
         self.shift: Tensor
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """A copy, which a simulation refreshes; the given one stays as it is, for the comparison before a resume."""
+        other = copy(self)
+        other._buffers = {name: None if held is None else held.clone() for name, held in self._buffers.items()}
+        return other
 
     def refresh(self, position: Tensor, drag_area: Tensor, axes: Tensor) -> None:
         """Compute the share of the wind that is left, from how the body stands.

@@ -193,6 +193,16 @@ def test_trilinear_is_exact_for_a_linear_field():
     torch.testing.assert_close(around, torch.tensor([[1.5, 0.0, 1.25]], dtype=torch.float64))
 
 
+@pytest.mark.parametrize("wraps", [True, False])
+def test_places_that_are_no_numbers_stay_in_the_table(wraps):
+    """A diverged simulation is reported as such, and does not end with an index out of range."""
+    table = torch.ones(4, 5, 6, 3)
+    place = torch.tensor([[float("nan"), 1.0, 1.0], [float("inf"), 1.0, 1.0], [1e30, -1e30, 1.0]])
+    found = trilinear(table, place, (wraps,) * 3)
+    assert found.shape == (3, 3)
+    assert bool(found[0].isnan().all())
+
+
 def test_shear_has_the_variances_of_the_standard():
     """IEC 61400-1 (ed. 3, annex B): with 3.9 the deviations are 1, 0.7 and 0.5, isotropic ones 0.55; it rounds."""
     along, across, up = (math.sqrt(v) for v in sheared_variances(3.9))
