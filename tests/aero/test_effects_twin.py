@@ -1,12 +1,15 @@
 """A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU."""
 
+import numpy as np
 import pytest
 import torch
 
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, PowerProfile
 from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.recorded import RecordedWind
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
 from gaussian_swaying.aero.wind_force import WindForce
@@ -137,6 +140,37 @@ def test_the_last_place_of_a_table_that_repeats(kernel_device):
     solver, state, load = _bodies(kernel_device, "total", wind)
     reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
     _same(solver.rollout(state, DT, 2, load), reference.rollout(state, DT, 2, load))
+
+
+def _obstacle(name, tmp_path):
+    middle = [0.1, 0.15, 0.1]
+    if name == "recorded":
+        axis = np.linspace(-0.2, 0.5, 5)
+        velocity = np.random.default_rng(0).normal(size=(4, 5, 5, 5, 3))
+        np.savez(tmp_path / "w.npz", time=DT * np.arange(4.0), x=axis, y=axis, z=axis, velocity=velocity)
+        return RecordedWind(tmp_path / "w.npz", repeat=True)
+    return {
+        "sphere": lambda: SphereObstacle(middle, 0.05),
+        "cylinder": lambda: CylinderObstacle(middle, 0.05, axis=[0.0, 1.0, 1.0]),
+        "ellipsoid": lambda: EllipsoidObstacle(middle, [0.03, 0.08, 0.05], turn=20.0),
+    }[name]()
+
+
+@pytest.mark.parametrize("name", ["sphere", "cylinder", "ellipsoid", "recorded"])
+def test_other_effects_run_in_torch_between_the_kernels(kernel_device, name, tmp_path):
+    """On a GPU inside the recorded graphs: the third rollout is replayed, at another time."""
+    wind = WindField(schedule=TURNING, interpolation="linear", effects=[_obstacle(name, tmp_path)])
+    solver, state, load = _bodies(kernel_device, "total", wind)
+    reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
+    assert not load.has_twin
+    assert load.recordable
+    for _ in range(3):
+        found, expected = solver.rollout(state, DT, 3, load), reference.rollout(state, DT, 3, load)
+        _same(found, expected)
+        state = expected
+    still = WindForce(load.aero, WindField([0.0] * 3).to(kernel_device), load.normal, load.area)
+    bare = reference.rollout(state, DT, 3, still)
+    assert float((bare.velocity - reference.rollout(state, DT, 3, load).velocity).abs().max()) > 1e-4
 
 
 def test_what_the_kernels_do_not_know_runs_in_torch():
