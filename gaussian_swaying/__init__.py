@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from gaussian_swaying.aero.carried import CarriedField, Turbulence
+    from gaussian_swaying.aero.effects import LogProfile, PowerProfile, WindEffect
     from gaussian_swaying.aero.force import AeroForce, aero_force
+    from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+    from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
+    from gaussian_swaying.aero.shelter import Shelter
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
     from gaussian_swaying.aero.wind_force import WindForce
     from gaussian_swaying.captures.capture import Capture, View, read_capture
@@ -74,6 +79,25 @@ if TYPE_CHECKING:
     from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
+    "aero.shelter": ("Shelter",),
+    "aero.obstacles": (
+        "CylinderObstacle",
+        "EllipsoidObstacle",
+        "SphereObstacle",
+    ),
+    "aero.recorded": (
+        "FrozenWind",
+        "RecordedWind",
+    ),
+    "aero.carried": (
+        "CarriedField",
+        "Turbulence",
+    ),
+    "aero.effects": (
+        "LogProfile",
+        "PowerProfile",
+        "WindEffect",
+    ),
     "aero.force": (
         "AeroForce",
         "aero_force",
@@ -206,12 +230,15 @@ __all__ = [
     "Capture",
     "CaptureCamera",
     "CaptureDataModule",
+    "CarriedField",
     "ChamferDistance",
     "ConstitutiveLaw",
     "Cylinder",
+    "CylinderObstacle",
     "DefaultDensification",
     "DiffuseShader",
     "Edit",
+    "EllipsoidObstacle",
     "EnclosingBox",
     "FixedCorotated",
     "FlowKey",
@@ -220,6 +247,7 @@ __all__ = [
     "Force",
     "Frame",
     "FrechetVideoDistance",
+    "FrozenWind",
     "GaussianCloud",
     "GaussianGust",
     "GaussianSurfaceModel",
@@ -230,6 +258,7 @@ __all__ = [
     "Impulse",
     "InteriorFilling",
     "KeyframedCamera",
+    "LogProfile",
     "LookAtCamera",
     "LossInputs",
     "LossTerm",
@@ -249,10 +278,13 @@ __all__ = [
     "Plane",
     "Plasticine",
     "PointCloud",
+    "PowerProfile",
+    "RecordedWind",
     "Recorder",
     "Sand",
     "Scene",
     "SequentialRelease",
+    "Shelter",
     "SimFrame",
     "SimulatedScene",
     "Simulation",
@@ -261,6 +293,7 @@ __all__ = [
     "Snow",
     "SpatialWind",
     "Sphere",
+    "SphereObstacle",
     "SplatTrainer",
     "SpringNetwork",
     "StVKHencky",
@@ -268,9 +301,11 @@ __all__ = [
     "TorchRenderer",
     "TotalLoss",
     "TransformsCamera",
+    "Turbulence",
     "UniformGust",
     "VelocityBox",
     "View",
+    "WindEffect",
     "WindField",
     "WindForce",
     "aero_force",

@@ -15,6 +15,7 @@
 ``python tools/bench.py previews``   announced and taken times of runs; writes docs/results/previews_<device>.json
 ``python tools/bench.py area``       areas that the wind can reach; writes docs/results/area_cpu.json
 ``python tools/bench.py web``        films for the web in a browser; writes docs/results/web_<device>.json
+``python tools/bench.py winds``      winds that differ from place to place; writes docs/results/winds_<device>.json
 ``python tools/bench.py pages``      fills the slots of docs/benchmarks.md, validation.md, training.md and so on
 ``python tools/bench.py pictures``   a strip of frames of a finished run
 ``python tools/bench.py film``       the README's moving picture from finished runs

@@ -9,14 +9,18 @@ from gaussian_swaying.scenes.sand import SandScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.scenes.telephone import TelephoneScene
 from gaussian_swaying.scenes.vase import VaseScene
+from gaussian_swaying.scenes.windbreaks import FicusBehindWallScene, FlagBehindPoleScene, PlantRowScene
 
 __all__ = [
     "AlocasiaScene",
+    "FicusBehindWallScene",
     "FicusScene",
+    "FlagBehindPoleScene",
     "FlagOnStandScene",
     "FlagScene",
     "GivenScene",
     "LeavesScene",
+    "PlantRowScene",
     "ProceduralScene",
     "SandScene",
     "SolidScene",

@@ -103,9 +103,14 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud
     return solver
 
 
-def as_wind(wind: WindLike | None) -> WindField | SpatialWind:
-    """Return the given wind, a steady wind from three numbers [m/s], or still air for None."""
-    if isinstance(wind, WindField | SpatialWind):
+def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
+    """Return the given wind, a steady wind from three numbers [m/s], or still air for None.
+
+    Places of its effects are converted from scene units to metres.
+    """
+    if isinstance(wind, WindField):
+        return wind.in_frame(frame)
+    if isinstance(wind, SpatialWind):
         return wind
     return WindField([0.0, 0.0, 0.0] if wind is None else list(check_vector("wind", wind)))
 

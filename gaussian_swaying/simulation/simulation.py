@@ -162,7 +162,7 @@ class Simulation(nn.Module):
         )
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
-        self.wind = as_wind(wind)
+        self.wind = as_wind(wind, model.frame)
         self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in as_forces(forces))
         self.to(target)
         self.editor = SceneEditor(model, edits)
@@ -195,7 +195,7 @@ class Simulation(nn.Module):
                 check_positive(name, value)
                 value = float(value)
             else:
-                value = (as_wind(value) if name == "wind" else value or AeroForce()).to(self.device)
+                value = (as_wind(value, self.scene.frame) if name == "wind" else value or AeroForce()).to(self.device)
             self._given[name] = value
             self._changed.add(name)
         super().__setattr__(name, value)
@@ -467,6 +467,8 @@ class Simulation(nn.Module):
         Returns:
             The frame. An error of it is raised by its ``finish``.
         """
+        if not self.idle:
+            self.wind_force.refresh(state)
         return Launched(self, state)
 
     def measured(

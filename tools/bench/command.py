@@ -25,6 +25,7 @@ from bench.cases import (
     surfaces,
     training,
     web,
+    winds,
 )
 from bench.slots import SlotError
 
@@ -95,6 +96,8 @@ COMMANDS = {
                     area.run, area.add_arguments, device=False, page="validation.md"),
     "web": Command("Measure films for the web: size, error, and speed in headless Chromium.",
                    _going_on("web", web.measure), web.add_arguments, page="web.md"),
+    "winds": Command("Measure substeps in winds that differ from place to place, and a box of turbulence.",
+                     winds.run, winds.add_arguments, page="wind.md"),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),

@@ -29,6 +29,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     surfaces,
     training,
     web,
+    winds,
 )
 from gaussian_swaying._files import write_text
 

@@ -184,8 +184,9 @@ class FusedTotal(Fused):
             self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
             self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, partial,
-            self.schedule, self.vectors, self.scenes, self.numbers, self.first_step, offset,
-            ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
+            self.schedule, self.vectors, self.scenes, self.numbers, self.space, self.first_step, offset,
+            ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
+            self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
             **_REGISTERS.get(self.lanes, {}),
         )  # fmt: skip
