@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.body import Body, Held
+from gaussian_swaying.mpm.contact.stage import ContactStage
+from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
-from gaussian_swaying.mpm.point_holds import PointHolds
+from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
@@ -35,6 +37,7 @@ class Total(Formulation):
         node_inverse_mass: Its inverse [1/kg], 0 for a node without mass, shape (..., G).
         node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary needs node
             positions.
+        contact: Contact with obstacles and itself, or None.
 
     Raises:
         ValueError: If a law is plastic, a pin holds nothing or the grid is too large.
@@ -69,6 +72,7 @@ class Total(Formulation):
         )
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
+        self.contact = self._contact()
 
     @property
     def point_holds(self) -> PointHolds | None:
@@ -81,12 +85,20 @@ class Total(Formulation):
     def _point_windows(self) -> tuple[tuple[float, float], ...]:
         """The time windows of the boundaries that hold points [s]."""
         pairs = zip(self.body.boundaries, self.kinds, strict=True)
-        return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind != "nodes")
+        return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind in POINTS)
 
     def _hold_points(self) -> PointHolds | None:
-        if all(kind == "nodes" for kind in self.kinds):
+        if not any(kind in POINTS for kind in self.kinds):
             return None
         return PointHolds(self.body, self.kinds, self.stencil.first, self.grid, self.node_inverse_mass)
+
+    def _contact(self) -> ContactStage | None:
+        body, surface = self.body, self.body.surface
+        if "surface" not in self.kinds and (surface is None or surface.contact is None):
+            return None
+        if surface is None:
+            surface = Surface.of_points(body.points)
+        return ContactStage(surface, body.boundaries, self.kinds, self.grid, self.node_inverse_mass)
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
@@ -157,6 +169,8 @@ class Total(Formulation):
             position = self.node_rest + scatter(self.stencil, shift[..., None, :]) * inverse_mass
         if self.needs_lattice:
             lattice = state.grid.node_positions(velocity) + displacement
+        if self.contact is not None:
+            self.contact.update(state, dt)
         velocity, taken = self.hold(velocity, displacement, position, lattice, state.time, dt)
         state = state.replace(time=state.time + dt, substep=dt, impulse=state.impulse + taken)
         return self.read_particles(state, displacement + dt * velocity, velocity)
@@ -170,8 +184,13 @@ class Total(Formulation):
         time: Tensor,
         dt: float | Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Apply all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
+        """Apply contact and all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
+        pressed = None
+        if self.contact is not None:
+            velocity, pressed = self.contact.apply(velocity, displacement, time, dt)
         velocity, taken = self.constrain(velocity, self.node_mass, self.share_at(time), position, lattice, time, dt)
+        if pressed is not None:
+            taken = taken + pressed.reshape(taken.shape)
         holds = self.point_holds
         if holds is not None:
             velocity, more = holds.hold(velocity, displacement, time, dt)
