@@ -12,7 +12,9 @@ so that a gap closes at most to zero within a substep, and an overlap is removed
 per cent of the wave speed (the substep is 0.4 of the time in which a wave crosses a cell). The impulse only pushes
 (:math:`\lambda \ge 0`), and Coulomb's friction is at most :math:`\mu\lambda` against the sliding velocity.
 
-The impulses are found by Jacobi's iteration, all at once. The step of a constraint is one over the sum of the absolute
+The impulses are found by Jacobi's iteration, all at once, with Nesterov's momentum (Mazhar et al. 2015, "Using
+Nesterov's method to accelerate multibody dynamics with friction and contact"), so that a pile of n layers takes of
+order n iterations. The step of a constraint is one over the sum of the absolute
 values of its row in :math:`A = J M^{-1} J^T`, so the iteration cannot overshoot (Gershgorin): for a lone place it is
 the mass that the place really has, and for a whole area in contact the mass of the area. With :math:`c` constraints at
 each place the sum is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, without forming A.
@@ -33,6 +35,9 @@ PUSH = 0.2
 
 PUSH_CELLS = 0.004
 """Most of an overlap that a substep removes [cells]."""
+
+CHECK = 4
+"""After how many iterations the impulses are checked."""
 
 SLACK = 0.02
 """Gap up to which a constraint counts as acting [cells]."""
@@ -111,7 +116,13 @@ def acting(rows: Rows, held: Constraints, velocity: Tensor, dt: float | Tensor, 
 
 
 def resolve(
-    velocity: Tensor, rows: Rows, held: Constraints, dt: float | Tensor, dx: float, iterations: int
+    velocity: Tensor,
+    rows: Rows,
+    held: Constraints,
+    dt: float | Tensor,
+    dx: float,
+    iterations: int,
+    tolerance: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """The velocity of the nodes after the impulses of all constraints; see the module.
 
@@ -123,7 +134,9 @@ def resolve(
         held: The constraints that act; those that are not ``valid`` do nothing.
         dt: Substep [s].
         dx: Grid spacing [m].
-        iterations: How often the impulses are improved.
+        iterations: How often the impulses are improved, at most.
+        tolerance: Stop if no constraint is violated by more than this within the substep [m]; the host waits. None to
+            make all iterations.
 
     Returns:
         The velocity, shape (G, 3), and the impulse on the first place of each constraint [N s], shape (M, 3).
@@ -137,21 +150,36 @@ def resolve(
     overlap = (-held.gap * PUSH).clamp(max=PUSH_CELLS * dx)
     target = torch.where(held.gap > 0, -held.gap, overlap) / dt_
     normal, tiny = held.normal, torch.finfo(velocity.dtype).tiny
-    pressed = torch.zeros_like(held.gap)
-    rubbed = torch.zeros_like(normal)
-    for _ in range(iterations):
+    pressed, rubbed = torch.zeros_like(held.gap), torch.zeros_like(normal)
+    applied, theta = torch.zeros_like(normal), torch.ones_like(dt_)
+    for k in range(iterations):
         moving = rows.read(velocity)
         relative = moving[held.first] - moving[held.second] - held.drive
         along = (relative * normal).sum(-1)
-        press = (pressed + step * (target - along)).clamp(min=0.0)
-        rub = rubbed - step[:, None] * (relative - along[:, None] * normal)
+        lacking = torch.where(held.valid, target - along, 0.0)
+        if tolerance is not None and k > 0 and k % CHECK == 0 and float(lacking.detach().amax() * dt_) < tolerance:
+            break
+        ahead = (applied * normal).sum(-1)
+        press = (ahead + step * lacking).clamp(min=0.0)
+        rub = applied - ahead[:, None] * normal - step[:, None] * (relative - along[:, None] * normal)
         length = (rub * rub).sum(-1).clamp(min=tiny).sqrt()
         rub = rub * (held.friction * press / length).clamp(max=1.0)[:, None]
-        change = (press - pressed)[:, None] * normal + (rub - rubbed)
-        impulse = velocity.new_zeros(len(rows.node), 3).index_add(0, held.first, change)
-        velocity = rows.push(velocity, impulse.index_add(0, held.second, -change))
-        pressed, rubbed = press, rub
-    return velocity, pressed[:, None] * normal + rubbed
+        new, old = press[:, None] * normal + rub, pressed[:, None] * normal + rubbed
+        following = 0.5 * (1 + (1 + 4 * theta * theta).sqrt())
+        back = ((applied - new) * (new - old)).sum().detach() > 0  # going the wrong way: start again
+        momentum = torch.where(back, 0.0, (theta - 1) / following)
+        theta = torch.where(back, torch.ones_like(theta), following)
+        wanted = new if k == iterations - 1 else new + momentum * (new - old)
+        velocity = _push(velocity, rows, held, wanted - applied)
+        applied, pressed, rubbed = wanted, press, rub
+    end = pressed[:, None] * normal + rubbed
+    return _push(velocity, rows, held, end - applied), end
+
+
+def _push(velocity: Tensor, rows: Rows, held: Constraints, impulse: Tensor) -> Tensor:
+    """The velocity after impulses (M, 3) on the first places, and the opposite on the second."""
+    total = velocity.new_zeros(len(rows.node), 3).index_add(0, held.first, impulse)
+    return rows.push(velocity, total.index_add(0, held.second, -impulse))
 
 
 def pair_gaps(

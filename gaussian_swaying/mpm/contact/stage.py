@@ -13,7 +13,7 @@ from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.pairs import close_pairs
 from gaussian_swaying.mpm.contact.solve import Constraints, Rows, acting, pair_gaps, resolve
-from gaussian_swaying.mpm.contact.surface import Surface
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.transfer import bspline_stencil
 
@@ -22,6 +22,9 @@ LEAST_MARGIN = 0.5
 
 ARM = 1.2
 """How much farther a place may move than any material point."""
+
+TOLERANCE = 1e-4
+"""Violation of a constraint within a substep at which the impulses are good enough [cells]."""
 
 AHEAD = 3.0
 """For how many substeps ahead points are followed before the lists are made again."""
@@ -82,7 +85,7 @@ class ContactStage:
         self.surface, self.contact, self.grid, self.dx = surface, surface.contact, grid, grid.dx
         self.count = len(boundaries)
         self.obstacles = [(k, b) for k, b in enumerate(boundaries) if kinds[k] == "surface" and isinstance(b, Obstacle)]
-        self.iterations = 4 if self.contact is None else self.contact.iterations
+        self.iterations = Contact.iterations if self.contact is None else self.contact.iterations
         self.inverse_mass = inverse_mass.reshape(-1)
         self.scenes = len(self.inverse_mass) // grid.node_count
         each = len(surface.place) // self.scenes
@@ -185,7 +188,7 @@ class ContactStage:
         first, second = places.reshape(2, -1)
         rows = Rows(rows.node[used], rows.weight[used], rows.inverse[used])
         held = Constraints(first, second, held.normal, held.gap, held.drive, held.friction, held.valid)
-        flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations)
+        flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
         with torch.no_grad():
             real = torch.cat([lists.place, lists.place.new_zeros(1)])[used]
             flat_owner = self.scene[real[first]] * (self.count + 1) + owner  # the last one for pairs

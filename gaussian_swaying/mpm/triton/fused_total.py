@@ -39,6 +39,11 @@ class FusedTotal(Fused):
 
     fixed_order = True
 
+    @property
+    def recordable(self) -> bool:
+        """Whether substeps can be recorded: contact makes the host wait."""
+        return super().recordable and self.bound.contact is None
+
     def __init__(self, bound: Formulation) -> None:
         super().__init__(bound)
         assert isinstance(bound, Total)
@@ -84,7 +89,8 @@ class FusedTotal(Fused):
         self.found = torch.zeros(self.room if self.count <= RECORDED else 0, device=self.device)
         self.taken_and_done = torch.zeros(self.impulse.numel() + self.scenes, dtype=torch.float64, device=self.device)
         pins = (PinnedRegion, PinnedPoints)
-        self.plain = all(type(b) in pins and b.start <= 0 and b.end == math.inf for b in body.boundaries)
+        held = all(type(b) in pins and b.start <= 0 and b.end == math.inf for b in body.boundaries)
+        self.plain = held and bound.contact is None
         self.position = bound.needs_position
         self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
@@ -174,6 +180,8 @@ class FusedTotal(Fused):
         )  # fmt: skip
 
     def _substep(self, offset: int, options: dict[str, Any]) -> None:
+        if self.bound.contact is not None:
+            self.bound.contact.update(self._look_at(), float(self.dt))
         if self.asked:
             self._push()
         width = 8 if self.position else 4
@@ -302,7 +310,8 @@ class FusedTotal(Fused):
         affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
         self._read_into(position, velocity, affine, F, self.schedule, False, False)
         lost = self._room("lost", *shape[:-1], dtype=torch.bool)
-        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid)
+        nodes = self.displacement[:, :3].reshape(self.shapes["displacement"])
+        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid, nodes)
 
 
 def _padded(shape: torch.Size) -> int:
