@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
     from gaussian_swaying.mpm.boundaries.plane import Plane
     from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+    from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
     from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
     from gaussian_swaying.mpm.contact.surface import Contact, Surface
     from gaussian_swaying.mpm.forces import Force
@@ -144,6 +145,7 @@ _HOMES = {
     "mpm.boundaries.pinned_region": ("PinnedRegion",),
     "mpm.boundaries.plane": ("Plane",),
     "mpm.boundaries.sequential_release": ("SequentialRelease",),
+    "mpm.boundaries.still_gaussians": ("StillGaussians",),
     "mpm.boundaries.velocity_box": ("VelocityBox",),
     "mpm.contact.surface": (
         "Contact",
@@ -288,6 +290,7 @@ __all__ = [
     "SplatTrainer",
     "SpringNetwork",
     "StVKHencky",
+    "StillGaussians",
     "Surface",
     "TearingGauge",
     "TorchRenderer",

@@ -10,6 +10,7 @@ from pkgutil import iter_modules
 import pytest
 import torch
 
+from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
@@ -27,6 +28,7 @@ from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.solver import MPMSolver
 
@@ -51,6 +53,18 @@ CONDITIONS = {
     "mesh": lambda r: MeshObstacle(MESH, 12, [0.113, 0.207, 0.181], 0.3, path=MOVING, end=0.5),
     "velocity-travels": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5, travels=True),
 }
+
+
+def _still():
+    """A ball made of distances, as a simulation makes them of Gaussians."""
+    axis = torch.arange(8, dtype=torch.float64) * 0.1 - 0.33
+    nodes = torch.cartesian_prod(axis, axis, axis).reshape(8, 8, 8, 3)
+    obstacle = StillGaussians(friction=0.3, end=0.5)
+    obstacle.take(DistanceGrid((nodes - 0.03).norm(dim=-1) - 0.26, nodes[0, 0, 0], 0.1))
+    return obstacle
+
+
+METRES = {"still": lambda r: _still()}  # it is in metres, whatever the frame
 POINTS = {"points": lambda r: PinnedPoints([[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]], end=0.5)}  # they hold no nodes
 REGIONS = {
     "everything": Everything(),
@@ -61,10 +75,14 @@ REGIONS = {
     "not": Not(Cylinder([0.2, 0.2, 0.2], [0.0, 0.0, 1.0], 0.15, 0.3)),
 }
 # every condition, and the one that evaluates its region in each substep with each kind of region
-ACTING = CONDITIONS | {
-    f"velocity-{name}": lambda _, region=region: VelocityBox(region, [0.1, 0.2, 0.3], end=0.5)
-    for name, region in REGIONS.items()
-}
+ACTING = (
+    CONDITIONS
+    | METRES
+    | {
+        f"velocity-{name}": lambda _, region=region: VelocityBox(region, [0.1, 0.2, 0.3], end=0.5)
+        for name, region in REGIONS.items()
+    }
+)
 
 
 def _acting(name, device, dtype=torch.float64):
@@ -92,7 +110,7 @@ def test_a_boundary_is_one_file():
     found = boundaries.BOUNDARIES
     assert {kind.__module__.rsplit(".", 1)[1] for kind in found.values()} == files
     assert len(found) == len(files)
-    assert {type(make(Everything())) for make in (CONDITIONS | POINTS).values()} == set(found.values())
+    assert {type(make(Everything())) for make in (CONDITIONS | METRES | POINTS).values()} == set(found.values())
 
 
 def test_the_documented_boundaries_are_those_that_there_are():
