@@ -24,6 +24,9 @@ PER_CELL = 2
 DISC = 0.75
 """Least radius of a disc, in distances of the places: discs on a square lattice overlap from 0.71 on."""
 
+BAND = 4
+"""Distance up to which the distance from Gaussians is computed [cells]; beyond it is constant."""
+
 FACING = 0.8
 """Two places are of different layers if at least this share of their distance is along a normal."""
 
@@ -108,7 +111,7 @@ def still_distance(
         level: The density of the surface.
 
     Returns:
-        The distance at the centres of the cells, negative where the density is higher.
+        The distance at the centres of the cells, negative where the density is higher; at most :data:`BAND` cells.
 
     Raises:
         ValueError: If no cell is that dense.
@@ -139,5 +142,10 @@ def still_distance(
     origin = low.double() + 0.5 * spacing
     if len(surface) == 0:  # dense everywhere
         return DistanceGrid(torch.full(shape, -spacing, dtype=torch.float64), origin, spacing)
-    away = nearest_neighbours(surface, 1, nodes.reshape(-1, 3))[0][:, 0].reshape(shape)
+    # exact within a band, as nothing else is near enough to touch
+    width = 2 * BAND + 1
+    most, least = (torch.nn.functional.max_pool3d(s * dense[None].float(), width, 1, BAND)[0] for s in (1, -1))
+    band = most != -least
+    away = torch.full(shape, float(BAND), dtype=torch.float64)
+    away[band] = nearest_neighbours(surface, 1, nodes[band])[0][:, 0].clamp(max=BAND)
     return DistanceGrid(spacing * torch.where(dense, -away, away), origin, spacing)
