@@ -152,6 +152,7 @@ def resolve(
     normal, tiny = held.normal, torch.finfo(velocity.dtype).tiny
     pressed, rubbed = torch.zeros_like(held.gap), torch.zeros_like(normal)
     applied, theta = torch.zeros_like(normal), torch.ones_like(dt_)
+    back = torch.zeros_like(dt_, dtype=torch.bool)  # whether the momentum led the wrong way: it then starts again
     for k in range(iterations):
         moving = rows.read(velocity)
         relative = moving[held.first] - moving[held.second] - held.drive
@@ -166,11 +167,11 @@ def resolve(
         rub = rub * (held.friction * press / length).clamp(max=1.0)[:, None]
         new, old = press[:, None] * normal + rub, pressed[:, None] * normal + rubbed
         following = 0.5 * (1 + (1 + 4 * theta * theta).sqrt())
-        back = ((applied - new) * (new - old)).sum().detach() > 0  # going the wrong way: start again
         momentum = torch.where(back, 0.0, (theta - 1) / following)
         theta = torch.where(back, torch.ones_like(theta), following)
         wanted = new if k == iterations - 1 else new + momentum * (new - old)
         velocity = _push(velocity, rows, held, wanted - applied)
+        back = ((applied - new) * (new - old)).sum().detach() > 0
         applied, pressed, rubbed = wanted, press, rub
     end = pressed[:, None] * normal + rubbed
     return _push(velocity, rows, held, end - applied), end

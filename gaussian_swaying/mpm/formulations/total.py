@@ -169,11 +169,21 @@ class Total(Formulation):
             position = self.node_rest + scatter(self.stencil, shift[..., None, :]) * inverse_mass
         if self.needs_lattice:
             lattice = state.grid.node_positions(velocity) + displacement
+        pressed = None
         if self.contact is not None:
             self.contact.update(state, dt)
+            velocity, pressed = self.touch(velocity, displacement, state.time, dt)
         velocity, taken = self.hold(velocity, displacement, position, lattice, state.time, dt)
+        if pressed is not None:
+            taken = taken + pressed
         state = state.replace(time=state.time + dt, substep=dt, impulse=state.impulse + taken)
         return self.read_particles(state, displacement + dt * velocity, velocity)
+
+    def touch(self, velocity: Tensor, displacement: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
+        """Apply the impulses of contact; also the momentum that each boundary took, as :meth:`hold`."""
+        assert self.contact is not None
+        velocity, taken = self.contact.apply(velocity, displacement, time, dt)
+        return velocity, taken.reshape(*velocity.shape[:-2], -1, 3)
 
     def hold(
         self,
@@ -184,13 +194,8 @@ class Total(Formulation):
         time: Tensor,
         dt: float | Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Apply contact and all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
-        pressed = None
-        if self.contact is not None:
-            velocity, pressed = self.contact.apply(velocity, displacement, time, dt)
+        """Apply all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
         velocity, taken = self.constrain(velocity, self.node_mass, self.share_at(time), position, lattice, time, dt)
-        if pressed is not None:
-            taken = taken + pressed.reshape(taken.shape)
         holds = self.point_holds
         if holds is not None:
             velocity, more = holds.hold(velocity, displacement, time, dt)
