@@ -27,22 +27,22 @@ class ClothScene(ProceduralScene):
     The cloths come first, so a configuration can select them by their height or place.
 
     Args:
-        kind: ``ball`` (radius 0.3 m, centre 0.35 m high, the cloth 0.68 m high), ``table`` (1 x 0.7 m, 0.5 m high, the
-            cloth at 0.58 m) or ``flags`` (poles at x = 0, y = 0 and at x = 0.45 m, y = 0.16 m).
+        setting: ``ball`` (radius 0.3 m, centre 0.35 m high, the cloth 0.68 m high), ``table`` (1 x 0.7 m, 0.5 m high,
+            the cloth at 0.58 m) or ``flags`` (poles at x = 0, y = 0 and at x = 0.45 m, y = 0.16 m).
         side: Sides of the cloth [m]: of a flag, its length along x; it is two thirds as high.
         spacing: Distance between Gaussians [m].
     """
 
-    def __init__(self, kind: str = "ball", side: float = 1.2, spacing: float = 0.0125) -> None:
-        check_choice("generator.kind", kind, ("ball", "table", "flags"))
+    def __init__(self, setting: str = "ball", side: float = 1.2, spacing: float = 0.0125) -> None:
+        check_choice("generator.setting", setting, ("ball", "table", "flags"))
         check_positive("generator.side", side)
         check_positive("generator.spacing", spacing)
-        self.kind, self.side, self.spacing = kind, float(side), float(spacing)
+        self.setting, self.side, self.spacing = setting, float(side), float(spacing)
 
     def generate(self) -> GaussianCloud:
         """Make the splat."""
-        cloths, rest = {"ball": self._ball, "table": self._table, "flags": self._flags}[self.kind]()
-        shadows = [cast([0.0, 0.0, 0.3], 0.35, 0.3)] if self.kind != "flags" else []
+        cloths, rest = {"ball": self._ball, "table": self._table, "flags": self._flags}[self.setting]()
+        shadows = [cast([0.0, 0.0, 0.3], 0.35, 0.3)] if self.setting != "flags" else []
         ground = floor(0.04, GROUND, shadows, flat=1.5)
         return to_cloud(join([*cloths, *rest, ground]))
 

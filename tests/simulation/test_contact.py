@@ -105,7 +105,7 @@ def test_surfaces_that_start_too_close_are_warned_of(gap, warned):
 def test_a_configuration_turns_contact_on(tmp_path):
     text = """
 scene:
-  generator: {class_path: ClothScene, init_args: {kind: ball, side: 0.4, spacing: 0.04}}
+  generator: {class_path: ClothScene, init_args: {setting: ball, side: 0.4, spacing: 0.04}}
   region: {class_path: Box, init_args: {min: [null, null, 0.67], max: [null, null, 0.69]}}
   metres_per_unit: 1.0
 contact: {thickness: 0.007, friction: 0.1}

@@ -12,7 +12,7 @@ from torch import Tensor
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.contact.solve import Constraints, Rows, acting, pair_gaps, resolve
+from gaussian_swaying.mpm.contact.solve import Constraints, Rows, acting, pair_gaps, resolve, weighted
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.transfer import bspline_stencil
@@ -251,7 +251,8 @@ class ContactStage:
 
     def normals(self, place: Tensor, displacement: Tensor) -> Tensor:
         """Unit normals of some places (A,) now, shape (A, 3), from the node displacement (G, 3)."""
-        gradient = self.slope[place] @ displacement[self.node[place]]  # [axis, component]
+        node, slope = self.node[place], self.slope[place].unbind(1)
+        gradient = torch.stack([weighted(displacement, node, part) for part in slope], dim=1)  # [axis, component]
         F = gradient.mT + torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         a, b, c = F.unbind(-1)
         cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
