@@ -11,6 +11,7 @@ from bench.cases import gallery  # noqa: F401  registers its slots
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     accuracy_plot,
+    contact,
     flags,
     goals,
     gradients,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -58,6 +59,19 @@ class Lists:
     fastest: float
 
 
+@contextmanager
+def in_fixed_order(wanted: bool) -> Iterator[None]:
+    """Make PyTorch sum in a fixed order on a GPU, if wanted."""
+    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    if wanted:
+        torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        if wanted:
+            torch.use_deterministic_algorithms(before, warn_only=warns)
+
+
 class ContactStage:
     """Contact of a body with obstacles and with itself, bound to its grid.
 
@@ -69,6 +83,7 @@ class ContactStage:
         kinds: What each acts on (``Boundary.hold_kind``).
         grid: The nodes.
         inverse_mass: Their inverse mass [1/kg], 0 for a node without mass, shape (..., G).
+        deterministic: Whether sums on a GPU have a fixed order.
 
     Raises:
         ValueError: If a place has no material.
@@ -81,7 +96,9 @@ class ContactStage:
         kinds: Sequence[str],
         grid: GridSpec,
         inverse_mass: Tensor,
+        deterministic: bool = False,
     ) -> None:
+        self.deterministic = deterministic
         self.surface, self.contact, self.grid, self.dx = surface, surface.contact, grid, grid.dx
         self.count = len(boundaries)
         self.obstacles = [(k, b) for k, b in enumerate(boundaries) if kinds[k] == "surface" and isinstance(b, Obstacle)]
@@ -189,7 +206,8 @@ class ContactStage:
         first, second = places.reshape(2, -1)
         rows = Rows(rows.node[used], rows.weight[used], rows.inverse[used])
         held = Constraints(first, second, held.normal, held.gap, held.drive, held.friction, held.valid)
-        flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
+        with in_fixed_order(self.deterministic and flat.is_cuda):
+            flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
         with torch.no_grad():
             real = torch.cat([lists.place, lists.place.new_zeros(1)])[used]
             flat_owner = self.scene[real[first]] * (self.count + 1) + owner  # the last one for pairs
@@ -256,4 +274,4 @@ class ContactStage:
         F = gradient.mT + torch.eye(3, dtype=gradient.dtype, device=gradient.device)
         a, b, c = F.unbind(-1)
         cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
-        return torch.nn.functional.normalize((cofactor @ self.surface.normal[place][..., None])[..., 0], dim=-1)
+        return torch.nn.functional.normalize((cofactor * self.surface.normal[place][:, None]).sum(-1), dim=-1)

@@ -98,7 +98,8 @@ class Total(Formulation):
             return None
         if surface is None:
             surface = Surface.of_points(body.points)
-        return ContactStage(surface, body.boundaries, self.kinds, self.grid, self.node_inverse_mass)
+        inverse = self.node_inverse_mass
+        return ContactStage(surface, body.boundaries, self.kinds, self.grid, inverse, self.settings.deterministic)
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
