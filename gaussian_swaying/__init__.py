@@ -32,18 +32,26 @@ if TYPE_CHECKING:
     from gaussian_swaying.gaussians.model import GaussianSurfaceModel
     from gaussian_swaying.gaussians.ply import read_ply, write_ply
     from gaussian_swaying.geometry.frame import SimFrame
+    from gaussian_swaying.geometry.keyed_path import KeyedPath
     from gaussian_swaying.geometry.regions import Box, Cylinder, Sphere
     from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance, frechet_distance
+    from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+    from gaussian_swaying.mpm.boundaries.block import BoxObstacle
     from gaussian_swaying.mpm.boundaries.boundary import Boundary
+    from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
     from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+    from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
     from gaussian_swaying.mpm.boundaries.handle import Handle
     from gaussian_swaying.mpm.boundaries.impulse import Impulse
+    from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
     from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
     from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
     from gaussian_swaying.mpm.boundaries.plane import Plane
     from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+    from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
     from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+    from gaussian_swaying.mpm.contact.surface import Contact, Surface
     from gaussian_swaying.mpm.forces import Force
     from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
     from gaussian_swaying.mpm.laws.fluid import Fluid
@@ -134,6 +142,7 @@ _HOMES = {
         "write_ply",
     ),
     "geometry.frame": ("SimFrame",),
+    "geometry.keyed_path": ("KeyedPath",),
     "geometry.regions": (
         "Box",
         "Cylinder",
@@ -147,15 +156,25 @@ _HOMES = {
         "FrechetVideoDistance",
         "frechet_distance",
     ),
+    "mpm.boundaries.ball": ("BallObstacle",),
+    "mpm.boundaries.block": ("BoxObstacle",),
     "mpm.boundaries.boundary": ("Boundary",),
+    "mpm.boundaries.capsule": ("CapsuleObstacle",),
     "mpm.boundaries.enclosing_box": ("EnclosingBox",),
+    "mpm.boundaries.half_space": ("HalfSpaceObstacle",),
     "mpm.boundaries.handle": ("Handle",),
     "mpm.boundaries.impulse": ("Impulse",),
+    "mpm.boundaries.mesh": ("MeshObstacle",),
     "mpm.boundaries.pinned_points": ("PinnedPoints",),
     "mpm.boundaries.pinned_region": ("PinnedRegion",),
     "mpm.boundaries.plane": ("Plane",),
     "mpm.boundaries.sequential_release": ("SequentialRelease",),
+    "mpm.boundaries.still_gaussians": ("StillGaussians",),
     "mpm.boundaries.velocity_box": ("VelocityBox",),
+    "mpm.contact.surface": (
+        "Contact",
+        "Surface",
+    ),
     "mpm.forces": ("Force",),
     "mpm.laws.fixed_corotated": ("FixedCorotated",),
     "mpm.laws.fluid": ("Fluid",),
@@ -223,16 +242,20 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "AeroForce",
+    "BallObstacle",
     "Boundary",
     "Box",
+    "BoxObstacle",
     "Camera",
     "CameraKey",
+    "CapsuleObstacle",
     "Capture",
     "CaptureCamera",
     "CaptureDataModule",
     "CarriedField",
     "ChamferDistance",
     "ConstitutiveLaw",
+    "Contact",
     "Cylinder",
     "CylinderObstacle",
     "DefaultDensification",
@@ -254,9 +277,11 @@ __all__ = [
     "GeneratedCapture",
     "GridSpec",
     "GsplatRenderer",
+    "HalfSpaceObstacle",
     "Handle",
     "Impulse",
     "InteriorFilling",
+    "KeyedPath",
     "KeyframedCamera",
     "LogProfile",
     "LookAtCamera",
@@ -267,6 +292,7 @@ __all__ = [
     "MPMState",
     "Material",
     "MaterialPoints",
+    "MeshObstacle",
     "Metal",
     "NeoHookean",
     "Normalisation",
@@ -297,6 +323,8 @@ __all__ = [
     "SplatTrainer",
     "SpringNetwork",
     "StVKHencky",
+    "StillGaussians",
+    "Surface",
     "TearingGauge",
     "TorchRenderer",
     "TotalLoss",

@@ -1,6 +1,7 @@
 """Splats made in code, among them stand-ins for the captures of the paper."""
 
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
+from gaussian_swaying.scenes.cloths import ClothScene
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.leaves import LeavesScene
@@ -13,6 +14,7 @@ from gaussian_swaying.scenes.windbreaks import FicusBehindWallScene, FlagBehindP
 
 __all__ = [
     "AlocasiaScene",
+    "ClothScene",
     "FicusBehindWallScene",
     "FicusScene",
     "FlagBehindPoleScene",

@@ -32,7 +32,7 @@ COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer")
-NULLABLE = ("normalisation",)
+NULLABLE = ("contact", "normalisation")
 # arguments that may change between a run and the one that resumes it
 NOT_COMPARED = ("device", "recorder", "renderer")
 

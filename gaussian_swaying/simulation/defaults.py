@@ -16,6 +16,7 @@ from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
@@ -141,6 +142,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
     "material": (Material,),
     "solver": (MPMSolver,),
+    "contact": (Contact,),
     "aero": (AeroForce,),
     "forces": (list, tuple),
     "shader": (Shader,),

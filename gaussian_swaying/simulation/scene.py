@@ -26,12 +26,16 @@ from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.followers import Followers, GridFollowers, PointFollowers, on_material
 from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.sampling import grouped, sample_object, shared_wind
+from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
+from gaussian_swaying.simulation.touching import still_distance, surface_of
 
 __all__ = ["Material", "MaterialRegion", "Scene", "SimulatedScene"]
 
@@ -208,6 +212,7 @@ class SimulatedScene(nn.Module):
         rest_facing: Normals at rest of the Gaussians that move, in the z-up frame, shape (M, 3).
         further: Number of extra points on large Gaussians.
         tracked: Number of places that :meth:`surface` returns.
+        surface_places: The places that touch obstacles and each other, or None.
         source: The .ply file; None for a scene made in code.
     """
 
@@ -299,6 +304,9 @@ class SimulatedScene(nn.Module):
         self.patches = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], self.points.count)
         self.max_stretch = scene.max_stretch
         self._kept: tuple[MaterialPoints, Tensor] | None = None
+        self._dx, self._near = dx, owner
+        self._samples: Samples | None = samples
+        self.surface_places: Surface | None = None
         carried = carried.nonzero()[:, 0]
         self.register_buffer("simulated", simulated)
         self.register_buffer("carried", carried)
@@ -340,7 +348,37 @@ class SimulatedScene(nn.Module):
     def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
         super()._apply(fn, recurse)
         self.points = self.points.map(fn)
+        if self.surface_places is not None:
+            self.surface_places = self.surface_places.map(fn)
         return self
+
+    def take_contact(self, contact: Contact | None, obstacles: Sequence[Obstacle]) -> None:
+        """Find the places that touch, and give obstacles of Gaussians those that stand still.
+
+        Args:
+            contact: How the surface touches itself; None if it does not.
+            obstacles: Obstacles of the solver.
+        """
+        samples, self._samples = self._samples, None
+        if samples is None or (contact is None and not obstacles):
+            return
+        self.surface_places = surface_of(samples, self._near, self.points, self._dx, contact)
+        for obstacle in obstacles:
+            if isinstance(obstacle, StillGaussians):
+                low, high = self._box(obstacle.margin)
+                still = torch.ones(len(self.model.means), dtype=torch.bool)
+                still[self.moving] = False
+                means = self.frame.point_to_sim(self.model.means.detach()[still].double())
+                shape = self.frame.covariance_to_sim(self.rest_covariances[still].double())
+                opacity = self.model.opacity().detach()[still]
+                obstacle.take(still_distance(means, shape, opacity, low, high, obstacle.cells, obstacle.level))
+
+    def _box(self, margin: float) -> tuple[Tensor, Tensor]:
+        """Corners [m] of a box around the points at rest, with a margin in lengths of its longest side."""
+        position = self.points.position.double()
+        low, high = position.amin(0), position.amax(0)
+        more = margin * float((high - low).amax())
+        return low - more, high + more
 
     @property
     def center(self) -> Tensor:

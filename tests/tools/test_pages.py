@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 NAMES = (
     "benchmarks.md",
+    "contact.md",
     "flag_benchmark.md",
     "gallery.md",
     "live.md",

@@ -12,6 +12,7 @@ from bench import pages, record, show
 from bench.cases import (
     accuracy,
     area,
+    contact,
     flags,
     gallery,
     gradients,
@@ -88,6 +89,8 @@ COMMANDS = {
                      _going_on("flags", flags.measure), flags.add_arguments),
     "pins": Command("Compare ways to hold an edge on flags made in code, with Blender's cloth.",
                     _going_on("pins", pins.measure), pins.add_arguments),
+    "contact": Command("Measure what contact costs, and how close surfaces come.",
+                       _going_on("contact", contact.measure), contact.add_arguments, page="contact.md"),
     "gallery": Command("Run the paper's scenes and make pictures of them.",
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
     "previews": Command("Compare the times that previews announce with those of runs.",

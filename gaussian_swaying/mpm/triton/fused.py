@@ -134,6 +134,11 @@ class Fused(ABC):
                 return f"the law {type(law).__name__} has no Triton twin"
         return None
 
+    @property
+    def recordable(self) -> bool:
+        """Whether substeps can be recorded in a CUDA graph."""
+        return all(boundary.recordable for boundary in self.body.boundaries)
+
     def holds(self) -> bool:
         """Whether buffers and graphs are still valid: nothing that they were made from was replaced."""
         return self._made_from == _made_from(self.body)
@@ -334,9 +339,8 @@ class Fused(ABC):
                 body(offset)
             self.first_step.add_(count)
 
-        recordable = all(boundary.recordable for boundary in self.body.boundaries)
         places = (self.numbers.data_ptr(), self.space.data_ptr())
-        self.repeater.run(steps, (key, places, self._asked_key()), several, recordable)
+        self.repeater.run(steps, (key, places, self._asked_key()), several, self.recordable)
 
 
 @contextmanager
