@@ -10,7 +10,10 @@ from bench.tables import long_flag
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-NAMES = ("benchmarks.md", "contact.md", "flag_benchmark.md", "gallery.md", "live.md", "training.md", "validation.md", "web.md")
+NAMES = tuple(
+    f"{name}.md"
+    for name in ("benchmarks", "contact", "flag_benchmark", "gallery", "live", "training", "validation", "web")
+)
 
 
 def _copy(folder):
