@@ -208,7 +208,7 @@ class ContactStage:
         held = Constraints(first, second, held.normal, held.gap, held.drive, held.friction, held.valid)
         with in_fixed_order(self.deterministic and flat.is_cuda):
             flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
-        with torch.no_grad():
+        with torch.no_grad(), in_fixed_order(self.deterministic and flat.is_cuda):
             real = torch.cat([lists.place, lists.place.new_zeros(1)])[used]
             flat_owner = self.scene[real[first]] * (self.count + 1) + owner  # the last one for pairs
             sums = taken.new_zeros(self.scenes * (self.count + 1), 3).index_add_(0, flat_owner, -impulse.double())
