@@ -6,6 +6,14 @@ import torch
 from torch import Tensor
 
 
+def picked(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of a tensor (N, ...) by integers of any shape, also of none, without making the host wait.
+
+    ``values[index]`` with a scalar on a GPU would read it on the host, which a CUDA graph cannot record.
+    """
+    return values.index_select(0, index.reshape(-1)).reshape((*index.shape, *values.shape[1:]))
+
+
 def trilinear(
     table: Tensor,
     place: Tensor,

@@ -13,7 +13,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.aero.carried import CarriedField
 from gaussian_swaying.aero.effects import Moment, WindEffect, placed
-from gaussian_swaying.aero.lookup import trilinear
+from gaussian_swaying.aero.lookup import picked, trilinear
 from gaussian_swaying.aero.wind_files import read_bts, read_grid
 from gaussian_swaying.geometry.frame import SimFrame
 
@@ -141,8 +141,9 @@ class RecordedWind(WindEffect):
         now = now.remainder(self.period) if self.repeat else now
         key = (torch.searchsorted(self.times, now.reshape(1), right=True)[0] - 1).clamp(0, last)
         after = (key + 1).remainder(last + 1) if self.repeat else (key + 1).clamp(max=last)
-        length = torch.where(after > key, self.times[after] - self.times[key], self.period - self.times[key])
-        share = ((now - self.times[key]) / length).clamp(0, 1).to(position)
+        begin, end = picked(self.times, key), picked(self.times, after)
+        length = torch.where(after > key, end - begin, self.period - begin)
+        share = ((now - begin) / length).clamp(0, 1).to(position)
         shift = (self.place + self.first) / self.step
         place = position / self.step.to(position.dtype) - shift.to(position.dtype)
         found = torch.lerp(trilinear(self.table, place, number=key), trilinear(self.table, place, number=after), share)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.aero.effects import Moment, WindEffect
+from gaussian_swaying.aero.lookup import picked
 from gaussian_swaying.aero.wind_files import read_anemometer
 from gaussian_swaying.geometry.frame import SimFrame
 
@@ -264,12 +265,13 @@ class WindField(nn.Module):
         if last == 0:
             return self.flows[0].expand(*time.shape, 3)
         key = (torch.searchsorted(self.times, time.contiguous(), right=True) - 1).clamp(0, last)
+        before = picked(self.flows, key)
         if self.interpolation == "step":
-            return self.flows[key]
-        after = (key + 1).clamp(max=last)
-        span = (self.times[after] - self.times[key]).clamp(min=1e-12)
-        share = ((time - self.times[key]) / span).clamp(0, 1)[..., None]
-        return torch.lerp(self.flows[key], self.flows[after], share)
+            return before
+        after, begin = (key + 1).clamp(max=last), picked(self.times, key)
+        span = (picked(self.times, after) - begin).clamp(min=1e-12)
+        share = ((time - begin) / span).clamp(0, 1)[..., None]
+        return torch.lerp(before, picked(self.flows, after), share)
 
     def carried(self, time: Tensor) -> Tensor:
         """How far the flow without modulations has carried the air since time zero [m].

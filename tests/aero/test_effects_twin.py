@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, PowerProfile
@@ -171,6 +172,26 @@ def test_other_effects_run_in_torch_between_the_kernels(kernel_device, name, tmp
     still = WindForce(load.aero, WindField([0.0] * 3).to(kernel_device), load.normal, load.area)
     bare = reference.rollout(state, DT, 3, still)
     assert float((bare.velocity - reference.rollout(state, DT, 3, load).velocity).abs().max()) > 1e-4
+
+
+class _NoReading(TorchDispatchMode):
+    """Refuses to read a number of a tensor on the host, which a CUDA graph cannot record."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        assert function is not torch.ops.aten._local_scalar_dense.default
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("interpolation", ["step", "linear"])
+@pytest.mark.parametrize("name", ["sphere", "cylinder", "ellipsoid", "recorded"])
+def test_the_host_reads_nothing_of_a_wind(name, interpolation, tmp_path):
+    """So all of it can be recorded."""
+    wind = WindField(schedule=TURNING, interpolation=interpolation, effects=[_obstacle(name, tmp_path)])
+    time, place = torch.tensor(0.003, dtype=torch.float64), torch.rand(20, 3)
+    expected = wind.at(time, place)
+    with _NoReading():
+        found = wind.at(time, place)
+    assert torch.equal(found, expected)
 
 
 def test_what_the_kernels_do_not_know_runs_in_torch():

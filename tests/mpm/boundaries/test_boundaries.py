@@ -238,7 +238,8 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
         nodes.dt.fill_(dt)
         graph.replay()
         now = dataclasses.replace(nodes, time=torch.full_like(nodes.time, time), dt=dt)
-        torch.testing.assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=1e-7)
+        # the substep is a tensor here and a number there, so velocities of 1 m/s are rounded in another order
+        torch.testing.assert_close(recorded, boundary(velocity, now), rtol=1e-6, atol=4 * torch.finfo(dtype).eps)
         seen.append(recorded.clone())
     assert not torch.equal(seen[0], velocity)
     if name not in ("release", "front"):  # released by the solver, not by the condition
