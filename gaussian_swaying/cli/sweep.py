@@ -30,9 +30,14 @@ def build_parser() -> argparse.ArgumentParser:
     add("sweep", help="YAML file with base, axes and, if needed, settings, draws and seed; or a shipped one by name")
     add("--output", help="folder for the results; outputs/sweeps/<name of the file> if left out")
     add("--resume", action="store_true", help="do what is missing in the folder; complete runs are never done again")
-    add("--workers", type=int, help="runs at a time, each in a process; one per core if left out")
+    add("--workers", type=int, help="runs at a time, each in a process; one per GPU or core if left out")
     add("--threads", type=int, help="threads of each run; cores / workers if left out")
-    add("--retries", type=int, default=1, help="how often a failed run is tried again")
+    add(
+        "--retries",
+        type=int,
+        default=1,
+        help="how often a failed run is tried again; three times as often if its process was killed",
+    )
     add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
     add("--picture", default="last", choices=("last", "middle"), help="frame of the contact sheet")
     add("--list", action="store_true", help="print the runs and end")

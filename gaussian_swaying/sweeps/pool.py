@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 from collections import deque
@@ -18,6 +19,7 @@ from gaussian_swaying.sweeps.record import failure, read_result
 from gaussian_swaying.sweeps.worker import Explain, Job, first_line, work
 
 POLL_S = 1.0
+KILLED = 3  # times as many retries for a run whose process was killed, as the reason may be outside of it
 PATIENCE_S = 300.0  # how long a worker may take to write what it has when the sweep is stopped
 
 
@@ -27,6 +29,7 @@ class _Worker:
 
     process: SpawnProcess
     connection: Connection
+    place: int  # among those that run at the same time
     job: Job | None = None
 
 
@@ -38,6 +41,7 @@ def run_jobs(
     retries: int = 1,
     explain: Explain = first_line,
     tick: Callable[[int], None] = lambda running: None,
+    gpus: Sequence[str] = (),
 ) -> None:
     """Do runs in worker processes. A failed run is tried again; one that fails too often never stops the rest.
 
@@ -48,15 +52,16 @@ def run_jobs(
         workers: Processes at a time.
         threads: Threads of torch in each.
         ended: Called with each run and its result, in the order in which they end.
-        retries: How often a failed run is tried again.
+        retries: How often a failed run is tried again; three times as often if its process was killed.
         explain: Makes a sentence of an error; a function of a module, as it is called in the workers.
         tick: Called about once a second with the number of runs that are being done.
+        gpus: The GPUs as in ``CUDA_VISIBLE_DEVICES``; the workers take them in turn.
     """
     waiting, pool = deque(jobs), list[_Worker]()
     try:
         while waiting or any(worker.job for worker in pool):
             running = sum(worker.job is not None for worker in pool)
-            for worker in _hire(pool, min(workers, running + len(waiting)), threads, explain):
+            for worker in _hire(pool, min(workers, running + len(waiting)), threads, explain, gpus):
                 if waiting:
                     _give(worker, waiting.popleft())
             busy = [worker for worker in pool if worker.job is not None]
@@ -68,7 +73,8 @@ def run_jobs(
                 if after != "ready":
                     _dismiss(worker)
                     pool.remove(worker)
-                if result["status"] != "complete" and job.attempt <= retries:
+                limit = retries * (KILLED if after == "killed" else 1)
+                if result["status"] != "complete" and job.attempt <= limit:
                     # from the checkpoint, unless that has been tried
                     waiting.append(job.again(resume=after == "killed" or job.attempt == 1))
                     continue
@@ -81,17 +87,34 @@ def run_jobs(
         _dismiss(worker)
 
 
-def _hire(pool: list[_Worker], count: int, threads: int, explain: Explain) -> list[_Worker]:
+def _hire(pool: list[_Worker], count: int, threads: int, explain: Explain, gpus: Sequence[str]) -> list[_Worker]:
     """The workers without a job, after starting those that are missing."""
     context = get_context("spawn")  # a fork would copy the threads and the GPU of this process
     while len(pool) < count:
+        place = next(place for place in itertools.count() if place not in {worker.place for worker in pool})
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, threads, explain), daemon=True)
-        with _environment(OMP_NUM_THREADS=str(threads), GOMP_SPINCOUNT=os.environ.get("GOMP_SPINCOUNT", "3000")):
+        with _environment(**variables(place, threads, gpus)):
             process.start()
         theirs.close()  # so that the end of the worker closes the connection
-        pool.append(_Worker(process, ours))
+        pool.append(_Worker(process, ours, place))
     return [worker for worker in pool if worker.job is None]
+
+
+def variables(place: int, threads: int, gpus: Sequence[str]) -> dict[str, str]:
+    """Variables of the environment of a worker.
+
+    Args:
+        place: Its number among the workers that run at the same time.
+        threads: Its threads.
+        gpus: As in :func:`run_jobs`.
+
+    Example:
+        >>> [variables(place, 2, ["0", "3"])["CUDA_VISIBLE_DEVICES"] for place in range(3)]
+        ['0', '3', '0']
+    """
+    found = {"OMP_NUM_THREADS": str(threads), "GOMP_SPINCOUNT": os.environ.get("GOMP_SPINCOUNT", "3000")}
+    return found | ({"CUDA_VISIBLE_DEVICES": gpus[place % len(gpus)]} if gpus else {})
 
 
 @contextmanager
@@ -162,4 +185,4 @@ def _stop(pool: list[_Worker]) -> None:
             worker.process.kill()
 
 
-__all__ = ["run_jobs"]
+__all__ = ["run_jobs", "variables"]

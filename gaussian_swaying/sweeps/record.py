@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gaussian_swaying._files import write_json, write_table
+from gaussian_swaying._files import remove_temporaries, write_json, write_table
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.runs.folder import hold_folder
 from gaussian_swaying.runs.lock import FolderLock
@@ -84,10 +84,11 @@ def open_folder(folder: Path, plan: Plan, resume: bool) -> FolderLock:
         ) from error
     lock = hold_folder(folder, "choose another with --output")
     try:
-        for name in (RUNS, RESULTS, LOGS):
-            (folder / name).mkdir(exist_ok=True)
         if not held:
             write_json(folder / SWEEP, new)
+        remove_temporaries(folder)  # of a sweep that was killed while writing
+        for name in (RUNS, RESULTS, LOGS):
+            (folder / name).mkdir(exist_ok=True)
     except BaseException:
         lock.release()
         raise

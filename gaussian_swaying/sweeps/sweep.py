@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 from gaussian_swaying._checks import check_choice
@@ -26,6 +27,18 @@ TABLE_EVERY_S = 5.0
 def cores() -> int:
     """Processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def gpus_for(device: str) -> list[str]:
+    """The GPUs for runs on a device, as in ``CUDA_VISIBLE_DEVICES``; none on a CPU.
+
+    Args:
+        device: ``auto``, ``cpu`` or ``cuda``.
+    """
+    if device == "cpu" or not torch.cuda.is_available():
+        return []
+    named = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
+    return named[: torch.cuda.device_count()] or [str(number) for number in range(torch.cuda.device_count())]
 
 
 def run_sweep(
@@ -51,9 +64,9 @@ def run_sweep(
         plan: From :func:`~gaussian_swaying.sweeps.plan.make_plan`.
         output: Folder of the sweep.
         resume: Continue the sweep in the folder; complete runs are never done again.
-        workers: Runs at a time, each in a process; one per core if None.
+        workers: Runs at a time, each in a process; one per GPU, or per core without one, if None.
         threads: Threads of each; cores / workers if None.
-        retries: How often a failed run is tried again.
+        retries: How often a failed run is tried again; three times as often if its process was killed.
         device: ``auto``, ``cpu`` or ``cuda``, for every run.
         picture: Frame of the contact sheet, ``last`` or ``middle``.
         explain: Makes a sentence of an error of a run; a function of a module.
@@ -73,7 +86,9 @@ def run_sweep(
     for name, count, least in (("workers", workers, 1), ("threads", threads, 1), ("retries", retries, 0)):
         if count is not None and count < least:
             raise ValueError(f"Expected `{name}` to be at least {least}, but got {count}.")
-    workers = workers or cores()
+    check_choice("device", device, ("auto", "cpu", "cuda"))
+    gpus = gpus_for(device)
+    workers = workers or len(gpus) or cores()
     threads = threads or max(1, cores() // workers)
     lock = open_folder(folder, plan, resume)
     try:
@@ -86,7 +101,7 @@ def run_sweep(
             if name not in found or found[name]["status"] != "complete"
         ]
         try:
-            run_jobs(jobs, workers, threads, keeper.ended, retries, explain, keeper.tick)
+            run_jobs(jobs, workers, threads, keeper.ended, retries, explain, keeper.tick, gpus)
         finally:
             keeper.close()
         write_contact_sheets(folder, picture)
@@ -102,7 +117,11 @@ class _Keeper:
         self.folder, self.plan, self.results, self.progress = folder, plan, results, progress
         self.unwritten: dict[str, dict[str, Any]] = {}
         done = sum(result["status"] == "complete" for result in results.values())
-        self._bar = tqdm(total=len(plan.runs), initial=done, unit="run", disable=not progress, file=sys.stderr)
+        self._terminal = sys.stderr.isatty()
+        pause = 0.1 if self._terminal else 10.0  # s; a log need not grow every second
+        self._bar = tqdm(
+            total=len(plan.runs), initial=done, unit="run", disable=not progress, file=sys.stderr, mininterval=pause
+        )
         self._written = time.monotonic()
         self.write()
 
@@ -125,7 +144,7 @@ class _Keeper:
         """Show what is going on."""
         counts = Counter(result["status"] for result in self.results.values())
         shown = [f"{running} running", *(f"{counts[name]} {name}" for name in ("failed", "diverged") if counts[name])]
-        self._bar.set_postfix_str(", ".join(shown))
+        self._bar.set_postfix_str(", ".join(shown), refresh=self._terminal)
 
     def write(self) -> None:
         """Write the results of failed runs, and the tables."""

@@ -54,6 +54,12 @@ def test_shipped_sweeps_are_valid(file, parser):
     assert len(plan.runs) > 1
 
 
+def test_the_sweep_of_the_page(tmp_path, parser):
+    (tmp_path / "page.yaml").write_text((ROOT / "docs/many.md").read_text().split("```yaml\n")[1].split("```")[0])
+    sweep = read_sweep(tmp_path / "page.yaml", lambda name: str(ROOT / "configs/sim" / f"{name}.yaml"))
+    assert len(make_plan(sweep, parser).runs) == 30
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from gaussian_swaying.cli.sweep import explain, main
+from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import worker
 from gaussian_swaying.sweeps.worker import Job, do
@@ -72,7 +73,7 @@ def _kill_workers(folder, times, seed, over):
 def _disturbed(file, folder, kills, seed):
     """A sweep in which workers are killed; how often, and its exit code."""
     codes, killed = [], []
-    options = ["--output", str(folder), "--workers", "2", "--retries", str(kills), "--device", "cpu"]
+    options = ["--output", str(folder), "--workers", "2", "--device", "cpu"]
     killer = threading.Thread(
         target=lambda: killed.append(_kill_workers(folder, kills, seed, lambda: bool(codes))), daemon=True
     )
@@ -243,6 +244,22 @@ def test_what_failed_is_told_in_one_sentence(tmp_path, monkeypatch, error, words
     assert "Traceback" in (tmp_path / "logs/00000.txt").read_text()
 
 
+def test_a_run_whose_process_is_killed_too_often_is_recorded(undisturbed, tmp_path, sweep_file, capsys):
+    file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
+    driver = _start(file, folder, "--device", "cpu", "--retries", "0")
+    _wait(lambda: _holders(folder))
+    os.kill(_holders(folder)[0], signal.SIGKILL)
+    _, error = driver.communicate(timeout=200)
+    assert driver.returncode == 2, error
+    (bad,) = [row for row in _rows(folder / "sweep.csv") if row["status"] != "complete"]
+    assert bad["status"] == "failed"
+    assert "SIGKILL" in bad["reason"]
+    assert "--workers" in bad["reason"]
+    assert f"run {bad['run']} failed" in error
+    assert main([str(file), "--output", str(folder), "--workers", "1", "--device", "cpu", "--resume"]) == 0
+    assert (folder / "sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
+
+
 # ---- refused
 
 
@@ -278,6 +295,14 @@ def test_folders_of_others_are_refused(tmp_path, sweep_file, capsys):
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["runs"]
     (tmp_path / "text").write_text("")
     _refused([file, "--output", tmp_path / "text"], capsys, "cannot be written", "--output")
+
+
+def test_one_sweep_at_a_time(undisturbed, tmp_path, sweep_file, capsys):
+    lock = FolderLock(undisturbed)
+    try:
+        _refused([sweep_file(tmp_path / "tiny.yaml"), "--output", undisturbed, "--resume"], capsys, "Another run")
+    finally:
+        lock.release()
 
 
 def test_a_damaged_result_is_refused(tmp_path, sweep_file, capsys):
