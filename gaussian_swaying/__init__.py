@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from gaussian_swaying.aero.carried import CarriedField, Turbulence
+    from gaussian_swaying.aero.effects import LogProfile, PowerProfile, WindEffect
     from gaussian_swaying.aero.force import AeroForce, aero_force
+    from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+    from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
+    from gaussian_swaying.aero.shelter import Shelter
     from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, UniformGust, WindField
     from gaussian_swaying.aero.wind_force import WindForce
     from gaussian_swaying.captures.capture import Capture, View, read_capture
@@ -27,18 +32,26 @@ if TYPE_CHECKING:
     from gaussian_swaying.gaussians.model import GaussianSurfaceModel
     from gaussian_swaying.gaussians.ply import read_ply, write_ply
     from gaussian_swaying.geometry.frame import SimFrame
+    from gaussian_swaying.geometry.keyed_path import KeyedPath
     from gaussian_swaying.geometry.regions import Box, Cylinder, Sphere
     from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance, frechet_distance
+    from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+    from gaussian_swaying.mpm.boundaries.block import BoxObstacle
     from gaussian_swaying.mpm.boundaries.boundary import Boundary
+    from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
     from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+    from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
     from gaussian_swaying.mpm.boundaries.handle import Handle
     from gaussian_swaying.mpm.boundaries.impulse import Impulse
+    from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
     from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
     from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
     from gaussian_swaying.mpm.boundaries.plane import Plane
     from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+    from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
     from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+    from gaussian_swaying.mpm.contact.surface import Contact, Surface
     from gaussian_swaying.mpm.forces import Force
     from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
     from gaussian_swaying.mpm.laws.fluid import Fluid
@@ -74,6 +87,25 @@ if TYPE_CHECKING:
     from gaussian_swaying.training.module import SplatTrainer
 
 _HOMES = {
+    "aero.shelter": ("Shelter",),
+    "aero.obstacles": (
+        "CylinderObstacle",
+        "EllipsoidObstacle",
+        "SphereObstacle",
+    ),
+    "aero.recorded": (
+        "FrozenWind",
+        "RecordedWind",
+    ),
+    "aero.carried": (
+        "CarriedField",
+        "Turbulence",
+    ),
+    "aero.effects": (
+        "LogProfile",
+        "PowerProfile",
+        "WindEffect",
+    ),
     "aero.force": (
         "AeroForce",
         "aero_force",
@@ -110,6 +142,7 @@ _HOMES = {
         "write_ply",
     ),
     "geometry.frame": ("SimFrame",),
+    "geometry.keyed_path": ("KeyedPath",),
     "geometry.regions": (
         "Box",
         "Cylinder",
@@ -123,15 +156,25 @@ _HOMES = {
         "FrechetVideoDistance",
         "frechet_distance",
     ),
+    "mpm.boundaries.ball": ("BallObstacle",),
+    "mpm.boundaries.block": ("BoxObstacle",),
     "mpm.boundaries.boundary": ("Boundary",),
+    "mpm.boundaries.capsule": ("CapsuleObstacle",),
     "mpm.boundaries.enclosing_box": ("EnclosingBox",),
+    "mpm.boundaries.half_space": ("HalfSpaceObstacle",),
     "mpm.boundaries.handle": ("Handle",),
     "mpm.boundaries.impulse": ("Impulse",),
+    "mpm.boundaries.mesh": ("MeshObstacle",),
     "mpm.boundaries.pinned_points": ("PinnedPoints",),
     "mpm.boundaries.pinned_region": ("PinnedRegion",),
     "mpm.boundaries.plane": ("Plane",),
     "mpm.boundaries.sequential_release": ("SequentialRelease",),
+    "mpm.boundaries.still_gaussians": ("StillGaussians",),
     "mpm.boundaries.velocity_box": ("VelocityBox",),
+    "mpm.contact.surface": (
+        "Contact",
+        "Surface",
+    ),
     "mpm.forces": ("Force",),
     "mpm.laws.fixed_corotated": ("FixedCorotated",),
     "mpm.laws.fluid": ("Fluid",),
@@ -199,19 +242,26 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "AeroForce",
+    "BallObstacle",
     "Boundary",
     "Box",
+    "BoxObstacle",
     "Camera",
     "CameraKey",
+    "CapsuleObstacle",
     "Capture",
     "CaptureCamera",
     "CaptureDataModule",
+    "CarriedField",
     "ChamferDistance",
     "ConstitutiveLaw",
+    "Contact",
     "Cylinder",
+    "CylinderObstacle",
     "DefaultDensification",
     "DiffuseShader",
     "Edit",
+    "EllipsoidObstacle",
     "EnclosingBox",
     "FixedCorotated",
     "FlowKey",
@@ -220,16 +270,20 @@ __all__ = [
     "Force",
     "Frame",
     "FrechetVideoDistance",
+    "FrozenWind",
     "GaussianCloud",
     "GaussianGust",
     "GaussianSurfaceModel",
     "GeneratedCapture",
     "GridSpec",
     "GsplatRenderer",
+    "HalfSpaceObstacle",
     "Handle",
     "Impulse",
     "InteriorFilling",
+    "KeyedPath",
     "KeyframedCamera",
+    "LogProfile",
     "LookAtCamera",
     "LossInputs",
     "LossTerm",
@@ -238,6 +292,7 @@ __all__ = [
     "MPMState",
     "Material",
     "MaterialPoints",
+    "MeshObstacle",
     "Metal",
     "NeoHookean",
     "Normalisation",
@@ -249,10 +304,13 @@ __all__ = [
     "Plane",
     "Plasticine",
     "PointCloud",
+    "PowerProfile",
+    "RecordedWind",
     "Recorder",
     "Sand",
     "Scene",
     "SequentialRelease",
+    "Shelter",
     "SimFrame",
     "SimulatedScene",
     "Simulation",
@@ -261,16 +319,21 @@ __all__ = [
     "Snow",
     "SpatialWind",
     "Sphere",
+    "SphereObstacle",
     "SplatTrainer",
     "SpringNetwork",
     "StVKHencky",
+    "StillGaussians",
+    "Surface",
     "TearingGauge",
     "TorchRenderer",
     "TotalLoss",
     "TransformsCamera",
+    "Turbulence",
     "UniformGust",
     "VelocityBox",
     "View",
+    "WindEffect",
     "WindField",
     "WindForce",
     "aero_force",

@@ -11,9 +11,12 @@
 ``python tools/bench.py surfaces``   tilts of trained normals; writes docs/results/surfaces_<device>.json
 ``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json
 ``python tools/bench.py pins``       how a held edge is modelled; writes docs/results/pins_<device>.json
+``python tools/bench.py contact``    cost of contact, and gaps; writes docs/results/contact_<device>.json
 ``python tools/bench.py gallery``    the paper's scenes; writes docs/results/gallery_<device>.json and pictures
 ``python tools/bench.py previews``   announced and taken times of runs; writes docs/results/previews_<device>.json
+``python tools/bench.py area``       areas that the wind can reach; writes docs/results/area_cpu.json
 ``python tools/bench.py web``        films for the web in a browser; writes docs/results/web_<device>.json
+``python tools/bench.py winds``      winds that differ from place to place; writes docs/results/winds_<device>.json
 ``python tools/bench.py pages``      fills the slots of docs/benchmarks.md, validation.md, training.md and so on
 ``python tools/bench.py pictures``   a strip of frames of a finished run
 ``python tools/bench.py film``       the README's moving picture from finished runs

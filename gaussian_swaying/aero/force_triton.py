@@ -54,12 +54,14 @@ def wind_force(F, velocity, patch, wind, numbers, OPTIONS: tl.constexpr):
     ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: projected law, lift in
     the plane of flow and normal, unit tangent, semi-implicit drag.
     """
+    return force_on_patch(F, velocity, patch, (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2)), numbers, OPTIONS)
+
+
+@triton.jit
+def force_on_patch(F, velocity, patch, air, numbers, OPTIONS: tl.constexpr):
+    """As :func:`wind_force`, with the velocity of the air as three numbers."""
     normal, area = deform_patch(F, (patch[0], patch[1], patch[2]), patch[3], tl.load(numbers + 4))
-    relative = (
-        tl.load(wind) - velocity[0],
-        tl.load(wind + 1) - velocity[1],
-        tl.load(wind + 2) - velocity[2],
-    )
+    relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     drag = tl.load(numbers)
     friction = tl.load(numbers + 1)
     lift = tl.load(numbers + 2)
@@ -109,14 +111,16 @@ def wind_on_groups(F, velocity, place, wind, numbers, OPTIONS: tl.constexpr):
     ``place``: first row in the table of ``PatchSums`` and number of vectors there. ``numbers`` and ``OPTIONS`` as in
     :func:`wind_force`, and the table after eight numbers.
     """
+    return force_on_group(F, velocity, place, (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2)), numbers, OPTIONS)
+
+
+@triton.jit
+def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
+    """As :func:`wind_on_groups`, with the velocity of the air as three numbers."""
     first = 8 + 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
-    relative = (
-        tl.load(wind) - velocity[0],
-        tl.load(wind + 1) - velocity[1],
-        tl.load(wind + 2) - velocity[2],
-    )
+    relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     drag = tl.load(numbers)
     friction = tl.load(numbers + 1)
     lift = tl.load(numbers + 2)

@@ -1,4 +1,4 @@
-"""The wind: a flow, steady or scheduled, and modulations that make it sway and gust.
+"""The wind: a flow, steady or scheduled, modulations that make it sway and gust, and effects that depend on the place.
 
 Everything is a pure function of time and seed. Random samples are drawn at fixed times from a counter-based generator,
 so they do not depend on the substep, on the device, or on where a run was resumed.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,6 +18,9 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._graphs import Recordable
+from gaussian_swaying.aero.effects import Moment, WindEffect
+from gaussian_swaying.aero.wind_files import read_anemometer
+from gaussian_swaying.geometry.frame import SimFrame
 
 
 def _signed(value: int) -> int:
@@ -184,14 +188,18 @@ class SpatialWind(Recordable, nn.Module, ABC):
 
 
 class WindField(nn.Module):
-    """Air velocity over time, the same everywhere in the scene.
+    """Air velocity over time; the same everywhere in the scene, unless it has effects.
 
     Args:
         flow: Steady air velocity [m/s], z up.
-        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time.
+        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time. Or
+            the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
+            interpolation.
         interpolation: Between entries of the schedule: ``step`` (hold) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.
+        effects: What differs from place to place, applied in order after the modulations: a profile, turbulence,
+            obstacles, shelter. See docs/wind.md.
 
     Example:
         >>> wind = WindField(flow=[2.0, 0.0, 0.0], modulations=[UniformGust(delta=0.0)])
@@ -202,13 +210,16 @@ class WindField(nn.Module):
     def __init__(
         self,
         flow: Sequence[float] = (0.0, 0.0, 0.0),
-        schedule: list[FlowKey] | None = None,
+        schedule: list[FlowKey] | str | None = None,
         interpolation: str = "step",
         modulations: Sequence[Modulation] = (),
         seed: int = 0,
+        effects: Sequence[WindEffect] = (),
     ) -> None:
         super().__init__()
         check_choice("interpolation", interpolation, ("step", "linear"))
+        if isinstance(schedule, str):
+            schedule, interpolation = list(map(FlowKey, *read_anemometer(schedule))), "linear"
         keys = schedule or [FlowKey(0.0, list(flow))]
         times = [float(key.time) for key in keys]
         if any(a >= b for a, b in pairwise(times)):
@@ -221,6 +232,31 @@ class WindField(nn.Module):
         self.flows: Tensor
         self.interpolation, self.seed = interpolation, int(seed)
         self.modulations = nn.ModuleList(modulations)
+        self.effects = nn.ModuleList(effects)
+        self._in_metres = False  # whether `in_frame` made it
+        moving = [row for row in flows if any(row)]
+        for effect in effects:
+            effect.along(torch.tensor(moving[0] if moving else [0.0] * 3, dtype=torch.float64))
+
+    @property
+    def uniform(self) -> bool:
+        """Whether it is the same everywhere."""
+        return len(self.effects) == 0
+
+    @property
+    def recordable(self) -> bool:
+        """Whether all of its parts can be recorded in a CUDA graph."""
+        return all(getattr(part, "recordable", False) for part in (*self.modulations, *self.effects))
+
+    def in_frame(self, frame: SimFrame) -> WindField:
+        """The same wind with its places converted from scene units to metres, z up; itself if it has none."""
+        if self.uniform or self._in_metres:
+            return self
+        other = copy(self)
+        other._in_metres = True
+        other._modules = dict(self._modules)
+        other.effects = nn.ModuleList(effect.in_frame(frame) for effect in self.effects)  # type: ignore[operator]
+        return other
 
     def mean_flow(self, time: Tensor) -> Tensor:
         """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""
@@ -235,8 +271,62 @@ class WindField(nn.Module):
         share = ((time - self.times[key]) / span).clamp(0, 1)[..., None]
         return torch.lerp(self.flows[key], self.flows[after], share)
 
+    def carried(self, time: Tensor) -> Tensor:
+        """How far the flow without modulations has carried the air since time zero [m].
+
+        Args:
+            time: Times [s], shape (...), float64.
+
+        Returns:
+            Shape (..., 3), float64.
+        """
+        if self.times.numel() == 1:
+            return time[..., None] * self.flows[0]
+        span = (self.times[1:] - self.times[:-1])[:, None]
+        mean = self.flows[:-1] if self.interpolation == "step" else 0.5 * (self.flows[:-1] + self.flows[1:])
+        sums = torch.cat([torch.zeros_like(self.flows[:1]), (span * mean).cumsum(0)])
+        both = torch.stack([torch.zeros_like(time), time])
+        last = self.times.numel() - 1
+        key = (torch.searchsorted(self.times, both, right=True) - 1).clamp(0, last)
+        past = (both - self.times[key])[..., None]
+        found = sums[key] + past * self.flows[key]
+        if self.interpolation == "linear":
+            after = (key + 1).clamp(max=last)
+            length = (self.times[after] - self.times[key]).clamp(min=1e-12)[..., None]
+            found = found + 0.5 * past.clamp(min=0) ** 2 / length * (self.flows[after] - self.flows[key])
+        return found[1] - found[0]
+
+    def at(self, time: Tensor, position: Tensor) -> Tensor:
+        """Air velocity at one time and given places [m/s].
+
+        Args:
+            time: Time [s], scalar float64 tensor.
+            position: Places [m], z up, shape (..., P, 3).
+
+        Returns:
+            Broadcastable to (..., P, 3).
+        """
+        return self.shaped(self(time), position, Moment(time, self.mean_flow(time), self.carried(time)))
+
+    def shaped(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+        """What the effects make of a velocity that is the same everywhere.
+
+        Args:
+            velocity: Velocity with modulations [m/s], shape (3,).
+            position: Places [m], z up, shape (..., P, 3).
+            moment: The time, and the flow.
+
+        Returns:
+            Broadcastable to (..., P, 3), in the dtype of ``position`` if there are effects.
+        """
+        if not self.uniform:
+            velocity = velocity.to(position)
+        for effect in self.effects:
+            velocity = effect(velocity, position, moment)
+        return velocity
+
     def forward(self, time: Tensor | float) -> Tensor:
-        """Air velocity at one or many times.
+        """Air velocity at one or many times, without the effects.
 
         Args:
             time: Time [s], shape (...), or a number.

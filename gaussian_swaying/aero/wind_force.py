@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record, tensors_in
+from gaussian_swaying.aero.effects import Moment
+from gaussian_swaying.aero.effects_twin import has_twin, packed, vectors
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
+from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.geometry.patches import compiles, deform_patch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
@@ -74,11 +78,12 @@ class WindForce(Force):
             )
         self._key: tuple[tuple[object, ...], ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
+        self._space: tuple[object, tuple[int, ...], Tensor] | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """The state without the CUDA graph, which cannot be copied."""
         kept = {name: value for name, value in vars(self).items() if name not in ("_now", "_dt", "_table")}
-        return kept | {"_key": (), "_graph": None}
+        return kept | {"_key": (), "_graph": None, "_space": None}
 
     @property
     def wind(self) -> nn.Module | tuple[nn.Module, ...]:
@@ -88,18 +93,13 @@ class WindForce(Force):
     @property
     def uniform(self) -> bool:
         """Whether the wind is the same everywhere in a scene."""
-        return all(isinstance(wind, WindField) for wind in self._fields)
+        return all(isinstance(wind, WindField) and wind.uniform for wind in self._fields)
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
         """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
         return all(
-            wind.recordable if isinstance(wind, SpatialWind) else type(wind) is WindField for wind in self._fields
-        ) and all(
-            getattr(part, "recordable", False)
-            for wind in self._fields
-            if isinstance(wind, WindField)
-            for part in wind.modulations
+            wind.recordable and (isinstance(wind, SpatialWind) or type(wind) is WindField) for wind in self._fields
         )
 
     @property
@@ -171,12 +171,9 @@ class WindForce(Force):
         if self.uniform:
             return self._winds(time, 0.0, 1)[0]
         if self._shared:
-            return self._fields[0](time, position)
-        parts = [
-            wind(time, place) if isinstance(wind, SpatialWind) else wind(time).to(place).expand_as(place)
-            for wind, place in zip(self._fields, position, strict=True)
-        ]
-        return torch.stack([part.expand_as(position[0]).to(position) for part in parts])
+            return _air(self._fields[0], time, position)
+        parts = [_air(wind, time, place) for wind, place in zip(self._fields, position, strict=True)]
+        return torch.stack([part.to(position).expand_as(position[0]) for part in parts])
 
     def samples(self, state: MPMState, dt: float, steps: int) -> Tensor:
         """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
@@ -206,24 +203,60 @@ class WindForce(Force):
         """:meth:`force` in the wind of ``state.time``."""
         return self.force(state, self.air(state.time, state.position))
 
+    def refresh(self, state: MPMState) -> None:
+        """Take in how the body stands now, for :class:`~gaussian_swaying.aero.shelter.Shelter`; once in a frame.
+
+        Args:
+            state: The state at the start of the frame.
+        """
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)) or state.position.ndim > 2:
+            return
+        shelters = [effect for effect in wind.effects if isinstance(effect, Shelter)]
+        if not shelters:
+            return
+        with torch.no_grad():
+            flow = wind.mean_flow(state.time)
+            axes = wind_axes(flow)
+            still = state.replace(velocity=torch.zeros_like(state.velocity))
+            force, _ = self.force(still, axes[0].to(still.velocity))  # in a wind of 1 m/s
+            area = (force * axes[0].to(force)).sum(-1).clamp(min=0) / max(0.5 * self.aero.air_density, 1e-30)
+            area = area * (flow.square().sum() > 0)
+            for shelter in shelters:
+                shelter.refresh(state.position, area, axes)
+
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
-        """See ``Force.during``: a uniform wind is computed for all substeps at once."""
-        if not self.uniform:
+        """See ``Force.during``: what does not depend on the place is computed for all substeps at once."""
+        if self.uniform:
+            winds = self.winds(time, dt, steps)
+            return lambda state, k: self.force(state, winds[k])
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)):
             return super().during(time, dt, steps)
-        winds = self.winds(time, dt, steps)
-        return lambda state, k: self.force(state, winds[k])
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        moments = list(map(Moment, times, wind.mean_flow(times), wind.carried(times)))
+        blown = _blow(wind, times)
+        return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
 
     @property
     def has_twin(self) -> bool:
-        """Whether the kernels can compute the force: only if the wind is uniform, and the lists are not too long."""
-        return self.uniform and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
+        """Whether the kernels can compute the force: they must know all effects, and the lists must not be too long."""
+        wind = self._fields[0]
+        known = self.uniform or (self._shared and isinstance(wind, WindField) and has_twin(wind))
+        return known and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
 
     def twin(self) -> ForceTwin:
-        """See ``Force.twin``; for a uniform wind only."""
+        """See ``Force.twin``."""
+        from gaussian_swaying.aero.effects_triton import shaped_wind_force, shaped_wind_on_groups
         from gaussian_swaying.aero.force_triton import wind_force, wind_on_groups
 
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
+        options: tuple[Any, ...] = (aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit)
+        functions, space = (wind_force, wind_on_groups), None
+        if not self.uniform:
+            kinds, space = self._packed()
+            functions, options = (shaped_wind_force, shaped_wind_on_groups), (*options, *kinds)
 
         def numbers() -> Tensor:
             half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
@@ -231,24 +264,53 @@ class WindForce(Force):
 
         if self.sums is not None:
             return ForceTwin(
-                function=wind_on_groups,
-                options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
+                function=functions[1],
+                options=options,
                 implicit=implicit,
                 sources=(self.sums.tensor, self.sums.vector),
                 values=self.sums.lists,
                 numbers=numbers,
-                vectors=self.winds,
+                vectors=self.winds if self.uniform else self._vectors,
                 table=self.sums.table,
+                space=space,
             )
         return ForceTwin(
-            function=wind_force,
-            options=(aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit),
+            function=functions[0],
+            options=options,
             implicit=implicit,
             sources=(self.normal, self.area),
             values=lambda: torch.cat([self.normal.expand(*self.area.shape, 3), self.area[..., None]], dim=-1),
             numbers=numbers,
-            vectors=self.winds,
+            vectors=self.winds if self.uniform else self._vectors,
+            space=space,
         )
+
+    def _packed(self) -> tuple[tuple[int, ...], Tensor]:
+        """What the kernels read of the effects, again where they changed, at the same address where possible."""
+        wind = self._fields[0]
+        assert isinstance(wind, WindField)
+        tensors = tensors_in([wind.effects])
+        key = (fingerprint(wind.effects), tuple(None if t.is_inference() else t._version for t in tensors))
+        if self._space is None or self._space[0] != key:
+            with torch.inference_mode(False), torch.no_grad():
+                kinds, space = packed(wind, self.area.device)
+                if self._space is not None and self._space[1] == kinds and len(self._space[2]) == len(space):
+                    space = self._space[2].copy_(space)
+                self._space = (key, kinds, space)
+        return self._space[1], self._space[2]
+
+    def _vectors(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """As :meth:`winds`, for a wind with effects; shape (steps, 7)."""
+        wind = self._fields[0]
+        assert isinstance(wind, WindField)
+        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        return vectors(wind, _blow(wind, times), times)
+
+
+def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
+    """Velocity of one wind at given places, broadcastable to them."""
+    found: Tensor = wind.at(time, position) if isinstance(wind, WindField) else wind(time, position)
+    return found
 
 
 def _blow(wind: nn.Module, times: Tensor) -> Tensor:

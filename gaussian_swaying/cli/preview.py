@@ -37,6 +37,7 @@ from gaussian_swaying.simulation.preview.doubts import doubts
 from gaussian_swaying.simulation.preview.photos import captured_from
 from gaussian_swaying.simulation.preview.picture import preview_picture
 from gaussian_swaying.simulation.preview.report import (
+    area_line,
     cost_lines,
     quality_lines,
     run_lines,
@@ -163,6 +164,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> Preview:
         "qualities": {name: {"dx_m": grids[name], "total_seconds": time} for name, time in others.items()},
     }
     report = [*splat_lines(options.scene, cloud, data), *suggestion_lines(found, simulation.scene.further)]
+    report.append(area_line(data["run"]))
     if simulation.scene.loose:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
         report.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")

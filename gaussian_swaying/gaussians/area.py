@@ -59,9 +59,10 @@ def coverage_area(
        :math:`g_i(x) = o_i \exp(-\lvert x - x_i \rvert^2 / (2 s_{i1} s_{i2}))`: a faint or tiny Gaussian among opaque
        ones gets little. The sum does not change.
 
-    Parallel sheets at least one neighbour spacing apart count separately; closer ones count as one. A Gaussian with
-    fewer than three neighbours in reach keeps its :func:`patch_area`. Computed in float64 on the CPU, so the result is
-    the same on every device; not differentiable.
+    Parallel sheets at least one neighbour spacing apart count separately; closer ones count as one. Layers behind the
+    skin of a captured object are sheets, too (see :func:`~gaussian_swaying.gaussians.openness.openness`). A Gaussian
+    with fewer than three neighbours in reach keeps its :func:`patch_area`. Computed in float64 on the CPU, so the
+    result is the same on every device; not differentiable.
 
     Args:
         means: Centres [scene units], shape (N, 3).

@@ -13,6 +13,7 @@ from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.patches import deform_all, smallest_axis_normal
@@ -117,19 +118,22 @@ class GaussianSurfaceModel(nn.Module):
         """Patch areas at rest [scene units^2], shape (N,).
 
         Args:
-            mode: "paper" for :func:`patch_area`, which is differentiable, or "coverage" for :func:`coverage_area`.
-            neighbours: Nearest centres that "coverage" considers.
+            mode: "paper" for :func:`patch_area`, which is differentiable, "coverage" for :func:`coverage_area`, or
+                "open" for the same times :func:`~gaussian_swaying.gaussians.openness.openness`.
+            neighbours: Nearest centres that "coverage" and "open" consider.
 
         Returns:
             Shape (N,).
 
         Raises:
-            ValueError: If ``mode`` is neither.
+            ValueError: If ``mode`` is none of these.
         """
-        check_choice("mode", mode, ("paper", "coverage"))
+        check_choice("mode", mode, ("paper", "coverage", "open"))
         if mode == "paper":
             return patch_area(self.scales)
-        return coverage_area(self.means, self.normals(), self.scales, self.opacity(), neighbours)
+        normals, opacity = self.normals(), self.opacity()
+        found = coverage_area(self.means, normals, self.scales, opacity, neighbours)
+        return found * openness(self.means, normals, self.scales, found, opacity) if mode == "open" else found
 
     def opacity(self) -> Tensor:
         """Opacities from 0 to 1, shape (N,)."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.boundaries.boundary import CLOCK, Boundary
+from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -43,16 +44,21 @@ class Body:
     Args:
         points: The material at rest.
         boundaries: Boundary conditions in metres, in order.
+        surface: The places that touch; None for the material points, which then touch obstacles only.
 
     Attributes:
         laws: The laws of the material, bound to its particles.
         held: What each boundary holds; None for one that holds no particles.
     """
 
-    def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary]) -> None:
-        self.points, self.boundaries = points, tuple(boundaries)
+    def __init__(self, points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None = None) -> None:
+        self.points, self.boundaries, self.surface = points, tuple(boundaries), surface
         self.laws = LawDispatch(points)
         self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
+
+    def mapped_surface(self, function: Callable[[Tensor], Tensor]) -> Surface | None:
+        """The surface with a function applied to its tensors, if there is one."""
+        return None if self.surface is None else self.surface.map(function)
 
     def tensors(self) -> list[Tensor]:
         """Tensors that a substep depends on, besides its state and forces; any of them may require a gradient."""

@@ -32,6 +32,9 @@ from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import bspline_weights
 
+POINTS = ("hinge", "clamp")
+"""Kinds of boundaries that hold points."""
+
 MOST_ROWS = 2000
 """Most rows of one scene: its inverse is dense."""
 
@@ -318,7 +321,7 @@ class PointHolds:
     ) -> None:
         self.boundaries = boundaries = body.boundaries
         position = body.points.position
-        self.moving = tuple(k for k, b in enumerate(boundaries) if kinds[k] != "nodes" and b.moves)
+        self.moving = tuple(k for k, b in enumerate(boundaries) if kinds[k] in POINTS and b.moves)
         device = position.device
         count, nodes = position.shape[-2], grid.node_count
         points = position.reshape(-1, count, 3).cpu().double()
@@ -329,7 +332,7 @@ class PointHolds:
             massive = inverse[s].detach() > 0
             parts = []
             for k, boundary in enumerate(boundaries):
-                if kinds[k] == "nodes":
+                if kinds[k] not in POINTS:
                     continue
                 own = body.held[k]
                 if isinstance(boundary, PinnedPoints):

@@ -15,6 +15,7 @@ from gaussian_swaying._checks import check_choice, check_positive, check_shape, 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
@@ -180,17 +181,16 @@ class MPMSolver(nn.Module):
         for boundary in self._framed or ():
             boundary._apply(fn)
         if self._bound is not None:
-            self._bind(self.points.map(fn))
+            self._bind(self.points.map(fn), self.bound.body.mapped_surface(fn))
         return self
 
     def _conditions(self) -> list[Boundary]:
         return [b for b in self.boundaries if isinstance(b, Boundary)]
 
-    def _bind(self, points: MaterialPoints) -> None:
+    def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         """Bind the material and compute everything that stays constant."""
-        conditions = self._conditions() if self._framed is None else self._framed
         self._bound = self._fused = None
-        bound = FORMULATIONS[self.formulation](Body(points, conditions), self.settings)
+        bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
         self._fused_obstacle = self._why_not_fused(bound)
         self._bound = bound
 
@@ -253,6 +253,7 @@ class MPMSolver(nn.Module):
         velocity: Tensor | None = None,
         margin: int = 4,
         frame: SimFrame | None = None,
+        surface: Surface | None = None,
     ) -> MPMState:
         """Take the material at rest and return the state at time zero.
 
@@ -261,6 +262,7 @@ class MPMSolver(nn.Module):
             velocity: Initial velocity [m/s], shape (..., P, 3); zero if None.
             margin: Cells around the object in the first grid of the ``updated`` formulation.
             frame: Transform from scene units to metres, for boundaries in scene units; None if they are in metres.
+            surface: The places that touch; None for the material points, which then touch obstacles only.
 
         Returns:
             The state, with the device and dtype of ``points``.
@@ -272,12 +274,10 @@ class MPMSolver(nn.Module):
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
-        self._framed = None
-        if frame is not None:
-            self._framed = tuple(b.in_frame(frame) for b in self._conditions())
+        self._framed = None if frame is None else tuple(b.in_frame(frame) for b in self._conditions())
         self._bound = None
         self.to(points.position.device)  # the solver moves to the device of its material
-        self._bind(points)
+        self._bind(points, surface)
         if velocity is None:
             velocity = torch.zeros_like(points.position)
         check_shape("velocity", velocity, points.count, 3)

@@ -13,7 +13,7 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.protocol import RenderOutput
 
-PASSES = ("color", "depth", "normal", "force")
+PASSES = ("color", "depth", "normal", "force", "wind")
 COVERED = 0.5
 """Smallest opacity of a pixel with a depth, a normal or a force."""
 MAX_STEPS = 65535

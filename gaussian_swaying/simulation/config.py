@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 from gaussian_swaying.simulation.description import describe
@@ -25,12 +26,13 @@ if TYPE_CHECKING:
 
 # imported so that a configuration can use their class names without the module
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
+OBSTACLES = (CylinderObstacle, EllipsoidObstacle, SphereObstacle)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset", "physgaussian")
 RUN_ONLY = ("config", "output", "device", "frames", "resume")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer")
-NULLABLE = ("normalisation",)
+NULLABLE = ("contact", "normalisation")
 # arguments that may change between a run and the one that resumes it
 NOT_COMPARED = ("device", "recorder", "renderer")
 

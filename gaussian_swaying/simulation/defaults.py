@@ -16,6 +16,7 @@ from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
@@ -103,9 +104,14 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud
     return solver
 
 
-def as_wind(wind: WindLike | None) -> WindField | SpatialWind:
-    """Return the given wind, a steady wind from three numbers [m/s], or still air for None."""
-    if isinstance(wind, WindField | SpatialWind):
+def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
+    """Return the given wind, a steady wind from three numbers [m/s], or still air for None.
+
+    Places of its effects are converted from scene units to metres.
+    """
+    if isinstance(wind, WindField):
+        return wind.in_frame(frame)
+    if isinstance(wind, SpatialWind):
         return wind
     return WindField([0.0, 0.0, 0.0] if wind is None else list(check_vector("wind", wind)))
 
@@ -136,6 +142,7 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
     "material": (Material,),
     "solver": (MPMSolver,),
+    "contact": (Contact,),
     "aero": (AeroForce,),
     "forces": (list, tuple),
     "shader": (Shader,),

@@ -24,6 +24,7 @@ from gaussian_swaying.simulation.meters import PeakMemory, WallClock
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.recording.checkpoint import check_state, log_lines, unreadable
 from gaussian_swaying.simulation.recording.recorder import frame_folder
+from gaussian_swaying.simulation.wind_picture import draw_wind
 
 if TYPE_CHECKING:
     from gaussian_swaying.simulation.simulation import Simulation
@@ -264,7 +265,7 @@ class Run:
             colours = painter.colors(gaussians, camera)
         images: dict[str, Tensor] = {}
         with walls("rendering"):
-            if {"color", "depth"} & set(recorder.renders):
+            if {"color", "depth", "wind"} & set(recorder.renders):
                 picture = painter.draw(gaussians, colours, camera)
                 images["color"] = picture.color
             if "depth" in recorder.renders:
@@ -276,6 +277,8 @@ class Run:
             if "force" in recorder.renders:
                 pressure = self.simulation.wind_pressure(state)
                 images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)
+            if "wind" in recorder.renders:
+                images["wind"] = draw_wind(self.simulation, state, camera, picture)
         with walls("writing"):
             for render in recorder.renders:
                 recorder.write_image(frame, images[render], frame_folder(render, name))
@@ -302,6 +305,7 @@ class Run:
             "filled_particles": scene.filled,
             "mass_kg": float(solver.points.mass.sum()),
             "patch_area_m2": float(scene.patches.area.sum()),
+            "hull_area_m2": scene.hull_area(),
             "formulation": solver.formulation,
             "dtype": str(state.position.dtype).removeprefix("torch."),
             "grid": {"dx_m": solver.dx, "resolution": list(state.grid.resolution)},

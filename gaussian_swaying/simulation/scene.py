@@ -17,19 +17,25 @@ from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling
 from gaussian_swaying.gaussians.grouping import loose_points
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
+from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.gaussians.subdivision import Subdivision, subdivide
+from gaussian_swaying.geometry.directions import hull_area
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.regions import Everything, Region
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.followers import Followers, GridFollowers, PointFollowers, on_material
 from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.sampling import grouped, sample_object, shared_wind
+from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
+from gaussian_swaying.simulation.touching import still_distance, surface_of
 
 __all__ = ["Material", "MaterialRegion", "Scene", "SimulatedScene"]
 
@@ -51,9 +57,12 @@ class Scene:
         longest_side: Longest side of the simulated part [m] (PhysGaussian normalises to 1). Cannot be combined with
             metres_per_unit.
         metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
-        area: Patch area: ``coverage`` (independent of how many Gaussians carry the surface), ``paper`` (pi s1 s2), or
-            ``equal`` (the same area for all, with the total of ``coverage``; for comparison with a wind that does not
-            use patches).
+        area: Patch area, for wind and mass: ``coverage`` (independent of how many Gaussians carry the surface),
+            ``open`` (the same, weighed by how open each patch is to the outside, see
+            :func:`~gaussian_swaying.gaussians.openness.openness`: layers behind the skin of a capture count for almost
+            nothing), ``paper`` (pi s1 s2), or ``equal`` (the same area for all, with the total of ``coverage``; for
+            comparison with a wind that does not use patches). Null for ``open`` with ``ply`` and ``coverage`` with
+            ``generator`` or ``wind_on: all``.
         filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
         wind_on: Which simulated Gaussians feel the wind: ``surface`` (those in contact with open air) or ``all`` (also
             those inside the solid that ``filling`` finds). Without ``filling``, all are on the surface.
@@ -94,7 +103,7 @@ class Scene:
         up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
         longest_side: float | None = None,
         metres_per_unit: float | None = None,
-        area: str = "coverage",
+        area: str | None = None,
         filling: InteriorFilling | None = None,
         wind_on: str = "surface",
         max_stretch: float | None = 2.0,
@@ -114,8 +123,13 @@ class Scene:
         check_choice("scene.faint", faint, ("carry", "static", "drop"))
         check_choice("scene.loose", loose, ("simulate", "carry"))
         check_choice("scene.wind_on", wind_on, ("surface", "all"))
-        check_choice("scene.area", area, ("coverage", "paper", "equal"))
         check_choice("scene.normals", normals, ("smallest_axis", "neighbours"))
+        if area is not None:
+            check_choice("scene.area", area, ("coverage", "open", "paper", "equal"))
+        if area == "open" and wind_on == "all":
+            raise ValueError(
+                'Expected `scene.wind_on` surface with `scene.area` "open": areas behind the surface feel no wind.'
+            )
         if not any(check_vector("scene.up", up)):
             raise ValueError("Expected `scene.up` to be a direction, for example [0, -1, 0], but got zero.")
         if not 0 <= opacity_threshold < 1:
@@ -141,6 +155,13 @@ class Scene:
         self.max_stretch = None if max_stretch is None else float(max_stretch)
         self.layers, self.particle_spacing, self.loose = layers, particle_spacing, loose
         self.points, self.points_per_cell, self.normals = points, int(points_per_cell), normals
+
+    @property
+    def area_kind(self) -> str:
+        """``area``, or what null stands for."""
+        if self.area is not None:
+            return self.area
+        return "open" if self.ply is not None and self.wind_on == "surface" else "coverage"
 
     def cloud(self) -> GaussianCloud:
         """Read the file or run the generator."""
@@ -191,6 +212,7 @@ class SimulatedScene(nn.Module):
         rest_facing: Normals at rest of the Gaussians that move, in the z-up frame, shape (M, 3).
         further: Number of extra points on large Gaussians.
         tracked: Number of places that :meth:`surface` returns.
+        surface_places: The places that touch obstacles and each other, or None.
         source: The .ply file; None for a scene made in code.
     """
 
@@ -259,8 +281,10 @@ class SimulatedScene(nn.Module):
         source = source if pieces is None else torch.cat([source, pieces.parent])
         outer = torch.ones(len(source), dtype=torch.bool) if filling is None else filling.on_surface
         areas = cloud.means.new_zeros(len(source))
-        for part in (outer, ~outer):  # inner points take no area from the surface
-            areas[part] = _areas(cloud.select(simulated), normals[simulated], source, pieces, part, scene.area)
+        kind = scene.area_kind
+        # inner points take no area from the surface
+        for part, mode in ((outer, kind), (~outer, "coverage" if kind == "open" else kind)):
+            areas[part] = _areas(cloud.select(simulated), normals[simulated], source, pieces, part, mode)
         body_area = self.frame.area_to_sim(areas).double()
         area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
         facing = self.frame.direction_to_sim(normals[simulated[source]].double())
@@ -280,6 +304,9 @@ class SimulatedScene(nn.Module):
         self.patches = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], self.points.count)
         self.max_stretch = scene.max_stretch
         self._kept: tuple[MaterialPoints, Tensor] | None = None
+        self._dx, self._near = dx, owner
+        self._samples: Samples | None = samples
+        self.surface_places: Surface | None = None
         carried = carried.nonzero()[:, 0]
         self.register_buffer("simulated", simulated)
         self.register_buffer("carried", carried)
@@ -321,12 +348,46 @@ class SimulatedScene(nn.Module):
     def _apply(self, fn, recurse: bool = True) -> SimulatedScene:  # type: ignore[no-untyped-def] # noqa: ANN001
         super()._apply(fn, recurse)
         self.points = self.points.map(fn)
+        if self.surface_places is not None:
+            self.surface_places = self.surface_places.map(fn)
         return self
+
+    def take_contact(self, contact: Contact | None, obstacles: Sequence[Obstacle]) -> None:
+        """Find the places that touch, and give obstacles of Gaussians those that stand still.
+
+        Args:
+            contact: How the surface touches itself; None if it does not.
+            obstacles: Obstacles of the solver.
+        """
+        samples, self._samples = self._samples, None
+        if samples is None or (contact is None and not obstacles):
+            return
+        self.surface_places = surface_of(samples, self._near, self.points, self._dx, contact)
+        for obstacle in obstacles:
+            if isinstance(obstacle, StillGaussians):
+                low, high = self._box(obstacle.margin)
+                still = torch.ones(len(self.model.means), dtype=torch.bool)
+                still[self.moving] = False
+                means = self.frame.point_to_sim(self.model.means.detach()[still].double())
+                shape = self.frame.covariance_to_sim(self.rest_covariances[still].double())
+                opacity = self.model.opacity().detach()[still]
+                obstacle.take(still_distance(means, shape, opacity, low, high, obstacle.cells, obstacle.level))
+
+    def _box(self, margin: float) -> tuple[Tensor, Tensor]:
+        """Corners [m] of a box around the points at rest, with a margin in lengths of its longest side."""
+        position = self.points.position.double()
+        low, high = position.amin(0), position.amax(0)
+        more = margin * float((high - low).amax())
+        return low - more, high + more
 
     @property
     def center(self) -> Tensor:
         """Centre of the simulated part at rest, scene units, shape (3,)."""
         return self.frame.origin
+
+    def hull_area(self) -> float:
+        """Area of the convex hull of the simulated Gaussians at rest [m²]; that of a flat sheet has two sides."""
+        return hull_area(self.model.means[self.simulated]) * self.frame.metres_per_unit**2
 
     def rest(self) -> DeformedGaussians:
         """The Gaussians at rest."""
@@ -429,7 +490,10 @@ def _areas(
     means, log_scales, opacity = cloud.means, cloud.scales, torch.sigmoid(cloud.opacities)
     if pieces is not None:
         means, log_scales, opacity = torch.cat([means, pieces.means]), pieces.log_scales, pieces.opacity
-    found = coverage_area(means[group], normals[source[group]], log_scales[group], opacity[group])
+    shape = means[group], normals[source[group]], log_scales[group]
+    found = coverage_area(*shape, opacity[group])
+    if mode == "open":
+        return found * openness(*shape, found, opacity[group])
     return found.mean().expand(len(found)) if mode == "equal" and len(found) else found
 
 

@@ -17,6 +17,8 @@ from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force, as_forces
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
@@ -86,6 +88,7 @@ class Simulation(nn.Module):
         wind: Air velocity over time; in Python also one that varies in space, or three numbers [m/s]. Still air if
             None.
         aero: Force of the wind on patches; :class:`AeroForce` with its defaults if None.
+        contact: How the material touches itself; null if it does not. Obstacles are boundaries of the solver.
         forces: Custom forces besides gravity and wind, each given by its class path.
         shader: Shading; null keeps the splat's colours.
         camera: Camera path; an orbit camera if null.
@@ -124,6 +127,7 @@ class Simulation(nn.Module):
         solver: MPMSolver | None = None,
         wind: WindLike | None = None,
         aero: AeroForce | None = None,
+        contact: Contact | None = None,
         forces: list[Force] = [],  # noqa: B006  (never changed; the schema of the config shows it)
         shader: Shader | None = None,
         camera: CameraPath | None = None,
@@ -160,9 +164,15 @@ class Simulation(nn.Module):
         model = SimulatedScene(
             settings, material, solver.dx, getattr(torch, dtype), cloud, solver.neighbours_fixed, apart
         )
+        if contact is not None and not solver.neighbours_fixed:
+            raise ValueError(
+                "`contact` needs `solver.formulation: total`: leave it out, as in `updated` material meets on the grid."
+            )
+        obstacles = [part for part in solver.boundaries if isinstance(part, Obstacle)]
+        model.take_contact(contact, obstacles)
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
-        self.wind = as_wind(wind)
+        self.wind = as_wind(wind, model.frame)
         self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in as_forces(forces))
         self.to(target)
         self.editor = SceneEditor(model, edits)
@@ -195,7 +205,7 @@ class Simulation(nn.Module):
                 check_positive(name, value)
                 value = float(value)
             else:
-                value = (as_wind(value) if name == "wind" else value or AeroForce()).to(self.device)
+                value = (as_wind(value, self.scene.frame) if name == "wind" else value or AeroForce()).to(self.device)
             self._given[name] = value
             self._changed.add(name)
         super().__setattr__(name, value)
@@ -362,12 +372,12 @@ class Simulation(nn.Module):
         for later in (moment for moment in editor.times if moment > 0):  # refuse impossible edits now
             self._edit(editor.due(0.0))
             self._edit(editor.due(later), flowed=True)
-            rehearsed = self.solver.init_state(self.scene.points, frame=frame)
+            rehearsed = self.solver.init_state(self.scene.points, frame=frame, surface=self.scene.surface_places)
             self.solver.fused()
             self.solver.substeps(rehearsed, self.frame_dt)
         editor.reset()
         self._edit(editor.due(0.0))
-        state = self.solver.init_state(self.scene.points, frame=frame)
+        state = self.solver.init_state(self.scene.points, frame=frame, surface=self.scene.surface_places)
         self._idle = None  # coefficients may have changed
         check_spacing(self.solver)
         self.solver.fused()  # errors of its kernels are raised here
@@ -405,7 +415,7 @@ class Simulation(nn.Module):
             return self._take(state, self._edit(edits, flowed=True))
         except Exception:  # nothing stays half changed
             self.editor.restore(before)
-            self.solver.init_state(self.scene.points, frame=self.scene.frame)
+            self.solver.init_state(self.scene.points, frame=self.scene.frame, surface=self.scene.surface_places)
             raise
 
     def _edit(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
@@ -418,7 +428,8 @@ class Simulation(nn.Module):
         """Bind the solver to the material of the scene; ``changed`` as from :meth:`_edit`."""
         if changed is None:
             return state
-        start = self.solver.init_state(self.scene.points, frame=self.scene.frame).internal
+        scene = self.scene
+        start = self.solver.init_state(scene.points, frame=scene.frame, surface=scene.surface_places).internal
         if start is not None and state.internal is not None:
             start = torch.where(changed, start, state.internal)
         state = state.replace(internal=start)
@@ -467,6 +478,8 @@ class Simulation(nn.Module):
         Returns:
             The frame. An error of it is raised by its ``finish``.
         """
+        if not self.idle:
+            self.wind_force.refresh(state)
         return Launched(self, state)
 
     def measured(

@@ -58,8 +58,8 @@ def surface_limits(
     for camera in cameras:
         ray = camera.position.double() - centre
         distance = float(ray.norm())
-        cosine = float(ray @ normal) / distance
-        if abs(cosine) < math.cos(math.radians(80.0)) or (one_side and cosine < 0):
+        facing = float(ray @ normal) / distance
+        if abs(facing) < math.cos(math.radians(80.0)) or (one_side and facing < 0):
             continue
         toward.append(ray / distance)
         scale.append(float(camera.intrinsics[0, 0]) / distance)

@@ -90,7 +90,9 @@ def take(
     if motion:
         solver, scene = simulation.solver, simulation.scene
         solver.settings = replace(solver.settings, **{name: getattr(parts["solver"], name) for name in motion})
-        solver.init_state(scene.points, frame=scene.frame)  # takes the settings; the state stays
+        solver.init_state(
+            scene.points, frame=scene.frame, surface=scene.surface_places
+        )  # takes the settings; the state stays
     return state if edit is None else simulation.edit(state, edit)
 
 

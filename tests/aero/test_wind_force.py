@@ -5,6 +5,8 @@ import copy
 import pytest
 import torch
 
+from gaussian_swaying.aero.carried import Turbulence
+from gaussian_swaying.aero.effects import PowerProfile
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
 from gaussian_swaying.aero.wind_force import WindForce
@@ -226,3 +228,53 @@ def test_a_wind_that_cannot_be_recorded_is_asked_each_time():
     for time in (0.0, 0.5, 2.0, 0.5):
         found = load.winds(torch.full((), time, dtype=torch.float64, device="cuda"), 1e-3, 4)
         assert found[0, 0] == (2.0 if time > 1 else 1.0)
+
+
+def _shaped():
+    effects = [PowerProfile([0.0, 0.0, -1.0], height=2.0), Turbulence(0.3, 0.2, cells=[16, 8, 8])]
+    return WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=4 * DT)], effects=effects)
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
+    """For all substeps at once or one by one; a batch takes winds with and without."""
+    shaped = _shaped()
+    wind = [shaped, GUSTS] if batch else shaped
+    _, state, load = _setting(batch=batch, wind=wind)
+    assert not load.uniform
+    assert not load.has_twin or not batch
+    assert load.recordable
+    found = load.air(state.time, state.position)
+    own = shaped.at(state.time, state.position[0] if batch else state.position)
+    torch.testing.assert_close(found[0] if batch else found, own)
+    if batch:
+        assert torch.equal(found[1], GUSTS(state.time).expand(20, 3))
+    assert float(own.std(0).min()) > 0.01
+    each = load.during(state.time, DT, 3)
+    for k in range(3):
+        later = state.replace(time=state.time + k * DT)
+        torch.testing.assert_close(each(later, k)[0], load(later)[0])
+
+
+def test_turbulence_does_not_depend_on_the_substep():
+    """The impulse of 0.2 s on patches that stand still, from substeps of 4, 2 and 1 ms.
+
+    The wind at a common time is the same, so that the sums differ only by their rule: of first order in the substep.
+    """
+    wind = WindField([2.0, 0.0, 0.0], effects=[Turbulence(0.5, 1.0, cells=[16] * 3)])
+    _, state, load = _setting(wind=wind)
+    state = state.replace(velocity=torch.zeros_like(state.velocity), time=torch.zeros_like(state.time))
+    found, kept = [], []
+    for dt in (4e-3, 2e-3, 1e-3):
+        steps = round(0.2 / dt)
+        each = load.during(state.time, dt, steps)
+        forces = torch.stack([each(state, k)[0] for k in range(steps)])
+        found.append(forces.sum(0) * dt)
+        kept.append(forces[:: round(4e-3 / dt)])
+    for forces in kept[1:]:
+        torch.testing.assert_close(forces, kept[0], rtol=0, atol=1e-12)
+    assert float(kept[0].std(0).max()) > 0.05 * float(kept[0].abs().max())  # it gusts
+    size = float(found[2].abs().max())
+    coarse, fine = (float((one - found[2]).abs().max()) / size for one in found[:2])
+    assert coarse < 0.02
+    assert fine < 0.6 * coarse  # a third, where no patch turns its other side to the wind meanwhile

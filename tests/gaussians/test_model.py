@@ -96,7 +96,7 @@ def test_model_methods_agree_with_the_functions(device, dtype):
     expected = coverage_area(cloud.means, model.normals(), cloud.scales, model.opacity())
     torch.testing.assert_close(model.areas("coverage"), expected)
     assert not torch.allclose(expected, patch_area(cloud.scales))
-    with pytest.raises(ValueError, match="Expected `mode` to be one of paper, coverage, but got 'disc'"):
+    with pytest.raises(ValueError, match="Expected `mode` to be one of paper, coverage, open, but got 'disc'"):
         model.areas("disc")
 
 

@@ -8,9 +8,12 @@ import torch
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.scenes import (
     AlocasiaScene,
+    FicusBehindWallScene,
     FicusScene,
+    FlagBehindPoleScene,
     FlagOnStandScene,
     LeavesScene,
+    PlantRowScene,
     SandScene,
     TelephoneScene,
     VaseScene,
@@ -207,3 +210,35 @@ def test_a_bad_spacing_is_refused(scene, value):
 def test_bad_arguments_are_refused(scene, name, value):
     with pytest.raises(ValueError, match=rf"generator\.{name}"):
         scene(**{name: value})
+
+
+def test_the_flag_behind_a_pole_stands_behind_it():
+    """The flag first, then its stand, then the thick pole, whose patches face away from its axis."""
+    scene = FlagBehindPoleScene(spacing=0.1, radius=0.1, distance=0.5)
+    cloud, flag = scene.generate(), FlagOnStandScene(spacing=0.1).generate()
+    assert torch.equal(cloud.means[: len(flag)], flag.means)
+    pole = cloud.means[len(flag) :]
+    assert float((torch.hypot(pole[:, 0] + 0.5, pole[:, 1]) - 0.1).amax()) < 1e-3
+    normals = cloud.normals[len(flag) :]
+    side = pole[:, 2] < 1.45 * 0.8 - 1e-3
+    spokes = torch.stack([pole[:, 0] + 0.5, pole[:, 1], torch.zeros(len(pole))], dim=-1)[side]
+    torch.testing.assert_close((normals[side] * spokes).sum(-1).abs(), spokes.norm(dim=-1), rtol=1e-3, atol=0)
+    with pytest.raises(ValueError, match=r"`generator.distance` of more than 0\.15 m"):
+        FlagBehindPoleScene(radius=0.1, distance=0.1)
+
+
+def test_plants_stand_in_a_row():
+    cloud = PlantRowScene(count=3, spacing=0.05, leaves=20).generate()
+    plants = cloud.means[cloud.means[:, 2] > 0.3]
+    assert {round(float(x) / 0.6) for x in plants[:, 0]} == {-1, 0, 1}
+    assert float(plants[:, 1].abs().max()) < 0.35
+    assert 1.0 < float(plants[:, 2].max()) < 1.4
+    assert float(plants[:, 0].mean().abs()) < 0.03
+
+
+def test_a_wall_stands_before_the_ficus():
+    cloud, tree = FicusBehindWallScene(spacing=0.1, leaves=50).generate(), FicusScene(spacing=0.1, leaves=50).generate()
+    assert torch.equal(cloud.means[: len(tree)], tree.means)
+    wall = cloud.means[len(tree) :]
+    torch.testing.assert_close(wall.amin(0), torch.tensor([-1.6, -1.2, 0.0]), rtol=0, atol=0.06)
+    torch.testing.assert_close(wall.amax(0), torch.tensor([-1.4, 1.2, 1.3]), rtol=0, atol=0.06)

@@ -27,12 +27,32 @@ PAPER = {
 }
 
 
+SHAPED = ("flag_behind_pole", "plant_row", "ficus_behind_wall")
+"""Scenes of docs/wind.md, which are not the paper's."""
+
+
 def files(name):
     return ["--config", str(CONFIGS / f"{name}.yaml"), "--config", str(CONFIGS / f"preview/{name}.yaml")]
 
 
+TOUCHING = {"cloth_over_ball", "cloth_over_table", "two_flags"}
+"""Scenes that are not the paper's: those of docs/contact.md."""
+
+
 def test_every_scene_has_its_preset():
-    assert {path.stem for path in (CONFIGS / "preview").glob("*.yaml")} == set(PAPER)
+    assert {path.stem for path in (CONFIGS / "preview").glob("*.yaml")} == {*PAPER, *SHAPED, *TOUCHING}
+
+
+@pytest.mark.parametrize("name", SHAPED)
+def test_the_presets_of_winds_with_a_shape_move(name):
+    """They are held, and the wind differs from place to place."""
+    parser = Simulation.parser()
+    simulation = Simulation.from_settings(parser, parser.parse_args([*files(name), "--device", "cpu"]))
+    state, health = simulation.advance(simulation.start())
+    assert simulation.solver.bound.held
+    assert 0 < health.displacement_mean < 0.1
+    air = simulation.wind_force.air(state.time, state.position)
+    assert float(air[:, 0].std()) > 0.05 * float(air[:, 0].mean().abs())
 
 
 @pytest.mark.parametrize("name", PAPER)

@@ -16,7 +16,7 @@ from gaussian_swaying.simulation.recording.layout import frame_folder, video_fil
 from gaussian_swaying.simulation.recording.recorder import Recorder
 
 SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5)
-ALL = ["color", "depth", "normal", "force"]
+ALL = ["color", "depth", "normal", "force", "wind"]
 
 
 def _cameras(simulation, **cameras):
@@ -25,7 +25,7 @@ def _cameras(simulation, **cameras):
 
 
 def test_names_of_folders_and_videos():
-    assert [frame_folder(r) for r in ALL] == ["frames", "depth", "normal", "force"]
+    assert [frame_folder(r) for r in ALL] == ["frames", "depth", "normal", "force", "wind"]
     assert frame_folder("color", "side") == "cameras/side/frames"
     assert video_file("frames") == "video.mp4"
     assert video_file("cameras/side/frames") == "cameras/side/video.mp4"
@@ -36,7 +36,7 @@ def test_files_of_a_run_with_two_cameras_and_all_renders(make_simulation, tmp_pa
     simulation = _cameras(make_simulation(), side=SIDE)
     summary = simulation.run(tmp_path / "run", 2, progress=False, recorder=Recorder(renders=ALL))
     for prefix, size in (("", (18, 32)), ("cameras/side/", (20, 24))):
-        for folder in ("frames", "depth", "normal", "force"):
+        for folder in ("frames", "depth", "normal", "force", "wind"):
             for frame in range(2):
                 picture = iio.imread(tmp_path / "run" / prefix / folder / f"{frame:05d}.png")
                 assert picture.shape == (*size, 3)

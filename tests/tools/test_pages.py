@@ -10,7 +10,17 @@ from bench.tables import long_flag
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
-NAMES = ("benchmarks.md", "flag_benchmark.md", "gallery.md", "live.md", "training.md", "validation.md", "web.md")
+NAMES = (
+    "benchmarks.md",
+    "contact.md",
+    "flag_benchmark.md",
+    "gallery.md",
+    "live.md",
+    "training.md",
+    "validation.md",
+    "web.md",
+    "wind.md",
+)
 
 
 def _copy(folder):

@@ -11,6 +11,8 @@ from typing import Any
 from bench import pages, record, show
 from bench.cases import (
     accuracy,
+    area,
+    contact,
     flags,
     gallery,
     gradients,
@@ -24,6 +26,7 @@ from bench.cases import (
     surfaces,
     training,
     web,
+    winds,
 )
 from bench.slots import SlotError
 
@@ -86,12 +89,18 @@ COMMANDS = {
                      _going_on("flags", flags.measure), flags.add_arguments),
     "pins": Command("Compare ways to hold an edge on flags made in code, with Blender's cloth.",
                     _going_on("pins", pins.measure), pins.add_arguments),
+    "contact": Command("Measure what contact costs, and how close surfaces come.",
+                       _going_on("contact", contact.measure), contact.add_arguments, page="contact.md"),
     "gallery": Command("Run the paper's scenes and make pictures of them.",
                        _going_on("gallery", gallery.measure), gallery.add_arguments),
     "previews": Command("Compare the times that previews announce with those of runs.",
                         _going_on("previews", previews.measure), previews.add_arguments),
+    "area": Command("Measure the areas of bodies with a known skin, of captures, and the time that they take.",
+                    area.run, area.add_arguments, device=False, page="validation.md"),
     "web": Command("Measure films for the web: size, error, and speed in headless Chromium.",
                    _going_on("web", web.measure), web.add_arguments, page="web.md"),
+    "winds": Command("Measure substeps in winds that differ from place to place, and a box of turbulence.",
+                     winds.run, winds.add_arguments, page="wind.md"),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),

@@ -11,6 +11,8 @@ from bench.cases import gallery  # noqa: F401  registers its slots
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     accuracy_plot,
+    area,
+    contact,
     flags,
     goals,
     gradients,
@@ -28,6 +30,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     surfaces,
     training,
     web,
+    winds,
 )
 from gaussian_swaying._files import write_text
 

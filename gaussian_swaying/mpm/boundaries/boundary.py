@@ -95,7 +95,7 @@ class Boundary(Recordable, nn.Module, ABC):
         return moved
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
-        """What it acts on: ``nodes``, in :meth:`forward`, or points of the material, as a ``hinge`` or a ``clamp``.
+        """What it acts on: ``nodes``, in :meth:`forward`; points, as a ``hinge`` or a ``clamp``; or the ``surface``.
 
         Args:
             neighbours_fixed: Whether the particles keep their neighbours, so that points can be held.

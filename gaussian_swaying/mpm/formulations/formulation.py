@@ -53,7 +53,8 @@ class Formulation(ABC):
             such a body cannot tear, flow or leave its grid, and its velocity does not count in the Courant number.
         viscous_power: Power of the largest squared stretch with which the viscous stress stiffens.
         held: As in the body, with the parts that are constant on this grid.
-        kinds: What each boundary holds: ``nodes``, or points as ``hinge`` or ``clamp`` (``Boundary.hold_kind``).
+        kinds: What each boundary acts on: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
+            (``Boundary.hold_kind``).
         needs_position: Whether a boundary uses the positions of nodes.
         needs_lattice: Whether a boundary uses the positions of lattice points.
     """

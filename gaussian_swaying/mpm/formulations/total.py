@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.body import Body, Held
+from gaussian_swaying.mpm.contact.stage import ContactStage
+from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
-from gaussian_swaying.mpm.point_holds import PointHolds
+from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
@@ -35,6 +37,7 @@ class Total(Formulation):
         node_inverse_mass: Its inverse [1/kg], 0 for a node without mass, shape (..., G).
         node_rest: Centre of the mass that each node carries, at rest [m], shape (..., G, 3), if a boundary needs node
             positions.
+        contact: Contact with obstacles and itself, or None.
 
     Raises:
         ValueError: If a law is plastic, a pin holds nothing or the grid is too large.
@@ -69,6 +72,7 @@ class Total(Formulation):
         )
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
+        self.contact = self._contact()
 
     @property
     def point_holds(self) -> PointHolds | None:
@@ -81,12 +85,21 @@ class Total(Formulation):
     def _point_windows(self) -> tuple[tuple[float, float], ...]:
         """The time windows of the boundaries that hold points [s]."""
         pairs = zip(self.body.boundaries, self.kinds, strict=True)
-        return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind != "nodes")
+        return tuple((boundary.holds_from, boundary.end) for boundary, kind in pairs if kind in POINTS)
 
     def _hold_points(self) -> PointHolds | None:
-        if all(kind == "nodes" for kind in self.kinds):
+        if not any(kind in POINTS for kind in self.kinds):
             return None
         return PointHolds(self.body, self.kinds, self.stencil.first, self.grid, self.node_inverse_mass)
+
+    def _contact(self) -> ContactStage | None:
+        body, surface = self.body, self.body.surface
+        if "surface" not in self.kinds and (surface is None or surface.contact is None):
+            return None
+        if surface is None:
+            surface = Surface.of_points(body.points)
+        inverse = self.node_inverse_mass
+        return ContactStage(surface, body.boundaries, self.kinds, self.grid, inverse, self.settings.deterministic)
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
@@ -157,9 +170,21 @@ class Total(Formulation):
             position = self.node_rest + scatter(self.stencil, shift[..., None, :]) * inverse_mass
         if self.needs_lattice:
             lattice = state.grid.node_positions(velocity) + displacement
+        pressed = None
+        if self.contact is not None:
+            self.contact.update(state, dt)
+            velocity, pressed = self.touch(velocity, displacement, state.time, dt)
         velocity, taken = self.hold(velocity, displacement, position, lattice, state.time, dt)
+        if pressed is not None:
+            taken = taken + pressed
         state = state.replace(time=state.time + dt, substep=dt, impulse=state.impulse + taken)
         return self.read_particles(state, displacement + dt * velocity, velocity)
+
+    def touch(self, velocity: Tensor, displacement: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
+        """Apply the impulses of contact; also the momentum that each boundary took, as :meth:`hold`."""
+        assert self.contact is not None
+        velocity, taken = self.contact.apply(velocity, displacement, time, dt)
+        return velocity, taken.reshape(*velocity.shape[:-2], -1, 3)
 
     def hold(
         self,

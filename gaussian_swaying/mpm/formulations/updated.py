@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.linalg import matmul3
+from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
-from gaussian_swaying.mpm.formulations.formulation import Formulation, held_share, not_finite, safe_inverse
+from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, not_finite, safe_inverse
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, scatter, scatter_momentum
@@ -31,6 +32,14 @@ class Updated(Formulation):
     name = "updated"
     neighbours_fixed = False
     viscous_power = 2
+
+    def __init__(self, body: Body, settings: Settings) -> None:
+        super().__init__(body, settings)
+        if body.surface is not None and body.surface.contact is not None:
+            raise ValueError(
+                "`contact` needs particles that keep their neighbours, which the updated formulation does not have: "
+                "leave out `contact`, as its material meets itself on the grid, or set `solver.formulation` to total."
+            )
 
     def twin(self) -> type[Fused]:
         """One kernel that ends a substep and starts the next, and one for the nodes."""

@@ -19,7 +19,17 @@ from torch import Tensor
 
 from gaussian_swaying._graphs import Repeater, fingerprint
 from gaussian_swaying.mpm.body import Body
-from gaussian_swaying.mpm.forces import MOST_STEPS, TWIN_NUMBERS, Force, ForceTwin, added, divide, split, tensors_of
+from gaussian_swaying.mpm.forces import (
+    MOST_STEPS,
+    TWIN_NUMBERS,
+    TWIN_VECTOR,
+    Force,
+    ForceTwin,
+    added,
+    divide,
+    split,
+    tensors_of,
+)
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws
 from gaussian_swaying.mpm.laws.triton.twin import shared, twin_of
@@ -83,8 +93,9 @@ class Fused(ABC):
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.schedule = torch.zeros(MAX_STEPS + 2, SCHEDULE, device=self.device)
-        self.vectors = torch.zeros(MAX_STEPS, self.scenes, 3, device=self.device)
+        self.vectors = torch.zeros(MAX_STEPS, self.scenes, TWIN_VECTOR, device=self.device)
         self.numbers = torch.zeros(TWIN_NUMBERS, device=self.device)
+        self.space = self.numbers
         self.load = torch.zeros(8, self.count, device=self.device)
         self.force_in = torch.zeros(0, 4, device=self.device)
         self.wave = shared(points.laws, "wave")
@@ -122,6 +133,11 @@ class Fused(ABC):
             if twin_of(law) is None:
                 return f"the law {type(law).__name__} has no Triton twin"
         return None
+
+    @property
+    def recordable(self) -> bool:
+        """Whether substeps can be recorded in a CUDA graph."""
+        return all(boundary.recordable for boundary in self.body.boundaries)
 
     def holds(self) -> bool:
         """Whether buffers and graphs are still valid: nothing that they were made from was replaced."""
@@ -161,14 +177,17 @@ class Fused(ABC):
             self.speed.zero_()
             fused, self.asked = divide(forces)
             twin = None if fused is None else fused.twin()
+            self.space = self.numbers
             if twin is not None:
                 self._take_values_of(twin)
+                self.space = self.numbers if twin.space is None else twin.space
             options: dict[str, Any] = {
                 "LAWS": self.laws,
                 "MULTI": len(self.law_table) > 1,
                 "VISCOUS": self.settings.stiffness_damping > 0,
                 "TWIN": None if twin is None else twin.function,
                 "OPTIONS": None if twin is None else twin.options,
+                "SPACE": twin is not None and twin.space is not None,
                 "FORCE": len(self.asked) > 0 or force is not None or drag is not None,
                 "IMPLICIT": drag is not None or (twin is not None and twin.implicit) or self._resists(state),
             }
@@ -211,7 +230,8 @@ class Fused(ABC):
                 numbers = twin.numbers()
                 self.numbers[: len(numbers)].copy_(numbers)
                 vectors = twin.vectors(self.time, self.dt, count)
-                self.vectors[:count].copy_(vectors.reshape(count, -1, 3).expand(-1, self.scenes, -1))
+                width = vectors.shape[-1]
+                self.vectors[:count, :, :width].copy_(vectors.reshape(count, -1, width).expand(-1, self.scenes, -1))
             if loaded:
                 self.load.zero_()
 
@@ -319,8 +339,8 @@ class Fused(ABC):
                 body(offset)
             self.first_step.add_(count)
 
-        recordable = all(boundary.recordable for boundary in self.body.boundaries)
-        self.repeater.run(steps, (key, self.numbers.data_ptr(), self._asked_key()), several, recordable)
+        places = (self.numbers.data_ptr(), self.space.data_ptr())
+        self.repeater.run(steps, (key, places, self._asked_key()), several, self.recordable)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
+from gaussian_swaying.mpm.triton.fused_contact import FusedContact
 
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
 _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
@@ -38,6 +39,11 @@ class FusedTotal(Fused):
     """
 
     fixed_order = True
+
+    @property
+    def recordable(self) -> bool:
+        """Whether substeps can be recorded: contact in a fixed order makes the host wait."""
+        return super().recordable and (self.touching is not None or self.bound.contact is None)
 
     def __init__(self, bound: Formulation) -> None:
         super().__init__(bound)
@@ -84,10 +90,13 @@ class FusedTotal(Fused):
         self.found = torch.zeros(self.room if self.count <= RECORDED else 0, device=self.device)
         self.taken_and_done = torch.zeros(self.impulse.numel() + self.scenes, dtype=torch.float64, device=self.device)
         pins = (PinnedRegion, PinnedPoints)
-        self.plain = all(type(b) in pins and b.start <= 0 and b.end == math.inf for b in body.boundaries)
+        held = all(type(b) in pins and b.start <= 0 and b.end == math.inf for b in body.boundaries)
+        self.plain = held and bound.contact is None
         self.position = bound.needs_position
         self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
+        fixed = self.settings.deterministic
+        self.touching = None if bound.contact is None or fixed else FusedContact(bound, self.fields)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
         self._partial: dict[tuple[int, int], Tensor] = {}
         width = 8 if self.position else 4
@@ -154,8 +163,8 @@ class FusedTotal(Fused):
         self.repeater.run(1, ("begin", *key), begin, part.key is not None)
         done = 0
         for mark in sorted({*part.looks, part.steps}):
-            self._repeat(mark - done, tuple(options.values()), lambda offset: self._substep(offset, options))
-            done = mark
+            while done < mark:
+                done += self._some(mark - done, options)
             if mark in part.looks:
                 self.repeater.run(1, "look", lambda _: self._look())
         if self.count > RECORDED:
@@ -164,6 +173,15 @@ class FusedTotal(Fused):
             return self._fields(found, self.taken_and_done.clone(), part)
         self.repeater.run(1, ("read", part.loaded, options["IMPLICIT"]), lambda _: self._read(self.found, part))
         return self._fields(self.found.clone(), self.taken_and_done.clone(), part)
+
+    def _some(self, steps: int, options: dict[str, Any]) -> int:
+        """Run up to some substeps, as many as the lists of what touches are good for; how many they were."""
+        key = tuple(options.values())
+        if self.touching is not None:
+            self.touching.look(self._look_at(), float(self.dt))
+            key, steps = (*key, *self.touching.key), min(steps, self.touching.every)
+        self._repeat(steps, key, lambda offset: self._substep(offset, options))
+        return steps
 
     def _look(self) -> None:
         _, ny, nz = self.grid.resolution
@@ -184,8 +202,9 @@ class FusedTotal(Fused):
             self.fraction, self.material, self.law, self.law_table, self.values, self.force_in, self.load, self.order,
             self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces,
             self.fields, partial,
-            self.schedule, self.vectors, self.scenes, self.numbers, self.first_step, offset,
-            ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
+            self.schedule, self.vectors, self.scenes, self.numbers, self.space, self.first_step, offset,
+            ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
+            self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
             **_REGISTERS.get(self.lanes, {}),
         )  # fmt: skip
@@ -206,7 +225,7 @@ class FusedTotal(Fused):
         if self.points is not None:
             self._hold_points(self.points, offset)
         if not self.plain:
-            self._constrain()
+            self._constrain(offset)
         if not self.plain or self.asked:
             self.time.add_(self.dt)
 
@@ -233,10 +252,13 @@ class FusedTotal(Fused):
             total += self.points.share @ self.residual[1, :, :3].double().reshape(self.scenes, -1, 3)
         return total.reshape(self.impulse.shape)
 
-    def _constrain(self) -> None:
+    def _constrain(self, offset: int) -> None:
         """Apply the boundary conditions that the kernels do not support, and update the displacements."""
         bound, inverse = self.bound, self.bound.node_inverse_mass
         shape = (*inverse.shape, 3)
+        if self.touching is not None:
+            taken = self.impulse.view(self.scenes, -1, 3)
+            self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt, taken)
         # nodes without mass keep no velocity from a boundary
         velocity = torch.where(inverse[..., None] > 0, self.velocity[:, :3].reshape(shape), 0.0)
         position = lattice = None
@@ -245,7 +267,13 @@ class FusedTotal(Fused):
         if self.lattice is not None:
             lattice = self.lattice + self.displacement[:, :3].reshape(shape)
         displacement = self.displacement[:, :3].reshape(shape)
+        pressed = None
+        if bound.contact is not None and self.touching is None:
+            bound.contact.update(self._look_at(), float(self.dt))
+            velocity, pressed = bound.touch(velocity, displacement, self.time, self.dt)
         velocity, taken = bound.hold(velocity, displacement, position, lattice, self.time, self.dt)
+        if pressed is not None:
+            taken = taken + pressed
         self.impulse.add_(taken)
         self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
         self.displacement.addcmul_(self.velocity, self.dt.float())
@@ -302,7 +330,8 @@ class FusedTotal(Fused):
         affine, F = (self._room(name, *shape, 3) for name in ("affine", "F"))
         self._read_into(position, velocity, affine, F, self.schedule, False, False)
         lost = self._room("lost", *shape[:-1], dtype=torch.bool)
-        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid)
+        nodes = self.displacement[:, :3].reshape(self.shapes["displacement"])
+        return MPMState(position, velocity, affine, F, F, lost, self.time, self.grid, nodes)
 
 
 def _padded(shape: torch.Size) -> int:

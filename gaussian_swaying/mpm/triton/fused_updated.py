@@ -214,9 +214,9 @@ class FusedUpdated(Fused):
         grid, settings = self.grid, self.settings
         kernels.updated_particles[(-(-self.count // 32),)](
             self.moving, self.order, self.load, self.count,
-            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.numbers, self.first_step,
-            offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx, 1 / grid.dx,
-            settings.stiffness_damping, self.particles,
+            self.momentum, self.velocity, self.schedule, self.vectors, self.scenes, self.numbers, self.space,
+            self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
+            1 / grid.dx, settings.stiffness_damping, self.particles,
             **options, PLASTIC=self.plastic, MLS=settings.mls, WIDTH=self.momentum.shape[1], GATHER=gather,
             SCATTER=scatter, num_warps=1,
         )  # fmt: skip

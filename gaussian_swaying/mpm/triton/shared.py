@@ -43,14 +43,19 @@ def axis_weights(f, inverse_dx):
 
 @triton.jit
 def twin_force(
-    TWIN: tl.constexpr, OPTIONS: tl.constexpr, F, velocity, index, mask, scene, values, count, vectors, scenes, step,
-    numbers,
+    TWIN: tl.constexpr, OPTIONS: tl.constexpr, SPACE: tl.constexpr, F, velocity, position, index, mask, scene, values,
+    count, vectors, scenes, step, numbers, space,
 ):  # fmt: skip
-    """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]."""
+    """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]; with SPACE, by their place."""
     first = load3(values, count, index, mask)
     last = tl.load(values + 3 * count + index, mask, 0.0)
-    vector = vectors + (step * scenes + scene) * 3
-    return TWIN(F, velocity, (first[0], first[1], first[2], last), vector, numbers, OPTIONS)
+    vector = vectors + (step * scenes + scene) * 8  # forces.TWIN_VECTOR
+    value = (first[0], first[1], first[2], last)
+    if SPACE:
+        force, resistance = TWIN(F, velocity, position, value, vector, numbers, space, OPTIONS)
+    else:
+        force, resistance = TWIN(F, velocity, value, vector, numbers, OPTIONS)
+    return force, resistance
 
 
 @triton.jit

@@ -80,10 +80,10 @@ def total_particles(
     fraction, material, law, law_table, values, force_in, load, order, count,
     cell_start, cell_node, cell_scene, cells,
     fields, partial,
-    schedule, vectors, scenes, numbers, first_step, step_offset,
-    sx, sy, inverse_dx, viscous_time,
-    LAWS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, FORCE: tl.constexpr,
-    IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
+    schedule, vectors, scenes, numbers, space, first_step, step_offset,
+    sx, sy, ox, oy, oz, scene_size, dx, inverse_dx, viscous_time,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr, SPACE: tl.constexpr,
+    FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, POSITION: tl.constexpr, WIDTH: tl.constexpr,
     CELLS: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
@@ -137,8 +137,18 @@ def total_particles(
         value = (zero, zero, zero)
         resistance = zero
         if TWIN is not None:
+            at = u
+            if SPACE:
+                within = node - scene * scene_size
+                bx = within // sx
+                by = (within - bx * sx) // sy
+                at = (
+                    (bx + ox + f[0]) * dx + u[0],
+                    (by + oy + f[1]) * dx + u[1],
+                    (within - bx * sx - by * sy + oz + f[2]) * dx + u[2],
+                )
             value, resistance = twin_force(
-                TWIN, OPTIONS, F, v, index, mask, scene, values, count, vectors, scenes, step, numbers
+                TWIN, OPTIONS, SPACE, F, v, at, index, mask, scene, values, count, vectors, scenes, step, numbers, space
             )
         if FORCE:
             where = tl.load(order + index, mask, 0)

@@ -114,11 +114,11 @@ def _locate(x, dx, o, n):
 @triton.jit(do_not_specialize=VARIES)
 def updated_particles(
     moving, order, load, count,
-    momentum, velocity, schedule, vectors, scenes, numbers, first_step, step_offset, law_table, force_in,
+    momentum, velocity, schedule, vectors, scenes, numbers, space, first_step, step_offset, law_table, force_in,
     ox, oy, oz, nx, ny, nz, dx, inverse_dx, viscous_time, scene_size,
     LAWS: tl.constexpr, PLASTIC: tl.constexpr, MULTI: tl.constexpr, TWIN: tl.constexpr, OPTIONS: tl.constexpr,
-    FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr, WIDTH: tl.constexpr,
-    GATHER: tl.constexpr, SCATTER: tl.constexpr,
+    SPACE: tl.constexpr, FORCE: tl.constexpr, IMPLICIT: tl.constexpr, VISCOUS: tl.constexpr, MLS: tl.constexpr,
+    WIDTH: tl.constexpr, GATHER: tl.constexpr, SCATTER: tl.constexpr,
 ):  # fmt: skip
     """``updated``: the end of substep ``step`` - 1 (GATHER) and the start of substep ``step`` (SCATTER).
 
@@ -192,8 +192,8 @@ def updated_particles(
     if SCATTER:
         if TWIN is not None:
             force, resistance = twin_force(
-                TWIN, OPTIONS, F_total, v, index, mask, scene, moving + 31 * count, count, vectors, scenes, step,
-                numbers,
+                TWIN, OPTIONS, SPACE, F_total, v, x, index, mask, scene, moving + 31 * count, count, vectors, scenes,
+                step, numbers, space,
             )  # fmt: skip
         if FORCE:
             force, resistance = add_given(force, resistance, force_in, where, mask)

@@ -62,6 +62,7 @@ def run_dict(simulation: Simulation) -> dict[str, Any]:
         "box_max": [float(v) for v in scene.bounds[1]],
         "mass_kg": float(scene.points.mass.sum()),
         "area_m2": float(scene.patches.area.sum()),
+        "hull_area_m2": scene.hull_area(),
         "filled": scene.filled,
         "points": scene.points.count,
         "further": scene.further,

@@ -59,13 +59,19 @@ def suggestion_lines(found: Suggestion, further: int) -> list[str]:
     return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
 
 
+def area_line(run: dict[str, Any]) -> str:
+    """The area in the wind, next to that of the convex hull, which is easily compared with the object itself."""
+    return f"  area            {run['area_m2']:.3g} m^2 in the wind; the convex hull has {run['hull_area_m2']:.3g} m^2"
+
+
 def run_lines(run: dict[str, Any]) -> list[str]:
     """What a given configuration simulates."""
     return [
         "",
         "this configuration",
-        f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg, "
-        f"{run['area_m2']:.3g} m^2; box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
+        f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg; "
+        f"box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
+        area_line(run),
         f"  follow them     {run['carried']:,} faint or loose ones",
         f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
         f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",

@@ -127,7 +127,7 @@ scene:
   opacity_threshold: {s.region.opacity_threshold:<11.6g}# fainter Gaussians follow their neighbours and weigh nothing
   faint: carry
   loose: carry                  # and so do specks that hang on nothing or by a thread
-  area: coverage
+  area: open                    # the outer skin; coverage also counts layers and leaves that others hide
   points: grid                  # as many as the grid can use, holes filled; the Gaussians follow its nodes
 
 {_material(s)}

@@ -19,6 +19,7 @@ FILES = [
 ]
 # names that a run writes; a folder that was not made by a run must not contain them
 OURS = [*FILES, "frames", "ply", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
+OURS += ["wind", "wind.mp4"]
 OURS += [*(name for name in SUFFIXES if name != "ply"), "depth.mp4", "normal.mp4", "force.mp4", "film.html"]
 
 
@@ -26,7 +27,7 @@ def frame_folder(render: str = "color", camera: str = "") -> str:
     """Folder of a render's frames inside that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
 
     Args:
-        render: One of ``color``, ``depth``, ``normal`` and ``force``.
+        render: One of ``color``, ``depth``, ``normal``, ``force`` and ``wind``.
         camera: Name of a further camera; empty for the main camera.
     """
     own = "frames" if render == "color" else render

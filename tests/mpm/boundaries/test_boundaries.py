@@ -10,21 +10,31 @@ from pkgutil import iter_modules
 import pytest
 import torch
 
+from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm import boundaries
+from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.block import BoxObstacle
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
+from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
+from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.solver import MPMSolver
 
 FORMULATIONS = ["total", "updated"]
+MOVING = KeyedPath([0.0, 0.2], [[0, 0, 0], [0.1, 0.05, 0]], [[0, 0, 0], [10, 20, 30]])
+MESH = str(Path(__file__).with_name("octahedron.obj"))
 CONDITIONS = {
     "pin": lambda r: PinnedRegion(r, end=0.5),
     "handle": lambda r: Handle(r, [0.1, 0.0, 0.0], [0.0, 0.0, 1.0], [0.1, 0.2, 0.3], end=0.5),
@@ -35,8 +45,26 @@ CONDITIONS = {
     "plane": lambda r: Plane([0.11, 0.12, 0.23], [0.0, 1.0, 1.5], "slip", 0.3, end=0.5),
     "box": lambda r: EnclosingBox([-0.13, 0.07, 0.13], [0.33, 0.43, 0.51], "separate", 0.3, end=0.5),
     "velocity": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5),
+    "ball": lambda r: BallObstacle([0.1, 0.2, 0.2], 0.15, 0.3, end=0.5),
+    "ball-moving": lambda r: BallObstacle([0.1, 0.2, 0.2], 0.15, 0.3, 0.01, MOVING, end=0.5),
+    "capsule": lambda r: CapsuleObstacle([0.01, 0.13, 0.2], [0.31, 0.3, 0.13], 0.11, 0.3, path=MOVING, end=0.5),
+    "block": lambda r: BoxObstacle([0.0, 0.1, 0.2], [0.3, 0.3, 0.4], [20, 0, 40], 0.3, path=MOVING, end=0.5),
+    "ground": lambda r: HalfSpaceObstacle([0.1, 0.2, 0.2], [0.0, 0.3, 1.0], 0.3, path=MOVING, end=0.5),
+    "mesh": lambda r: MeshObstacle(MESH, 12, [0.113, 0.207, 0.181], 0.3, path=MOVING, end=0.5),
     "velocity-travels": lambda r: VelocityBox(r, [0.1, 0.2, 0.3], end=0.5, travels=True),
 }
+
+
+def _still():
+    """A ball made of distances, as a simulation makes them of Gaussians."""
+    axis = torch.arange(8, dtype=torch.float64) * 0.1 - 0.33
+    nodes = torch.cartesian_prod(axis, axis, axis).reshape(8, 8, 8, 3)
+    obstacle = StillGaussians(friction=0.3, end=0.5)
+    obstacle.take(DistanceGrid((nodes - 0.03).norm(dim=-1) - 0.26, nodes[0, 0, 0], 0.1))
+    return obstacle
+
+
+METRES = {"still": lambda r: _still()}  # it is in metres, whatever the frame
 POINTS = {"points": lambda r: PinnedPoints([[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]], end=0.5)}  # they hold no nodes
 REGIONS = {
     "everything": Everything(),
@@ -47,10 +75,14 @@ REGIONS = {
     "not": Not(Cylinder([0.2, 0.2, 0.2], [0.0, 0.0, 1.0], 0.15, 0.3)),
 }
 # every condition, and the one that evaluates its region in each substep with each kind of region
-ACTING = CONDITIONS | {
-    f"velocity-{name}": lambda _, region=region: VelocityBox(region, [0.1, 0.2, 0.3], end=0.5)
-    for name, region in REGIONS.items()
-}
+ACTING = (
+    CONDITIONS
+    | METRES
+    | {
+        f"velocity-{name}": lambda _, region=region: VelocityBox(region, [0.1, 0.2, 0.3], end=0.5)
+        for name, region in REGIONS.items()
+    }
+)
 
 
 def _acting(name, device, dtype=torch.float64):
@@ -74,11 +106,11 @@ def _acting(name, device, dtype=torch.float64):
 
 def test_a_boundary_is_one_file():
     """Each file of the folder has one, except the shared files, and each is tested here."""
-    files = {found.name for found in iter_modules(boundaries.__path__)} - {"boundary", "particle_boundary"}
+    files = {found.name for found in iter_modules(boundaries.__path__)} - {"boundary", "particle_boundary", "obstacle"}
     found = boundaries.BOUNDARIES
     assert {kind.__module__.rsplit(".", 1)[1] for kind in found.values()} == files
     assert len(found) == len(files)
-    assert {type(make(Everything())) for make in (CONDITIONS | POINTS).values()} == set(found.values())
+    assert {type(make(Everything())) for make in (CONDITIONS | METRES | POINTS).values()} == set(found.values())
 
 
 def test_the_documented_boundaries_are_those_that_there_are():

@@ -1,0 +1,150 @@
+"""How the wind differs from place to place: effects that a ``WindField`` applies in order, after its modulations."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._graphs import Recordable
+from gaussian_swaying.geometry.frame import SimFrame
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What an effect knows of the wind at one time.
+
+    Attributes:
+        time: The time [s], scalar float64 tensor.
+        flow: Flow without modulations and effects [m/s], shape (3,), float64.
+        carried: How far that flow has carried the air since time zero [m], shape (3,), float64.
+    """
+
+    time: Tensor
+    flow: Tensor
+    carried: Tensor
+
+
+class WindEffect(Recordable, nn.Module, ABC):
+    """Base of what changes the wind from place to place.
+
+    A subclass has a ``forward``, and sets ``recordable = True`` if that can be recorded in a CUDA graph (see
+    ``Force``). Places are in metres, z up, from the centre of the object at rest; in a configuration they are in scene
+    units, and :meth:`in_frame` converts them.
+    """
+
+    @abstractmethod
+    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+        """Return the changed velocity.
+
+        Args:
+            velocity: Air velocity so far [m/s], broadcastable to (..., P, 3).
+            position: Places [m], z up, shape (..., P, 3).
+            moment: The time, and the undisturbed flow.
+
+        Returns:
+            Velocity [m/s], broadcastable to (..., P, 3).
+        """
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The same effect with its places converted from scene units to metres, z up; itself if it has none."""
+        return self
+
+    def along(self, flow: Tensor) -> None:
+        """Take the flow at the start [m/s], shape (3,), on the CPU; called once, when the wind is made."""
+
+
+def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:
+    """A point in scene units in metres, z up."""
+    found: list[float] = frame.point_to_sim(torch.tensor([list(point)], dtype=torch.float64))[0].tolist()
+    return found
+
+
+class Profile(WindEffect):
+    """Base of mean winds that grow with the height above the ground; gusts grow with them.
+
+    Args:
+        ground: A point on the ground, in scene units; only its height counts. In Python [m], z up.
+        height: Height above the ground at which the wind is that of the ``flow`` [m].
+    """
+
+    recordable = True
+
+    def __init__(self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0) -> None:
+        super().__init__()
+        check_positive("height", height)
+        self.ground, self.height = list(check_vector("ground", ground)), float(height)
+
+    @abstractmethod
+    def factor(self, above: Tensor) -> Tensor:
+        """Speed at heights above the ground [m], per speed at ``height``; the shape of ``above``."""
+
+    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+        """Scale the velocity by :meth:`factor`."""
+        return velocity * self.factor(position[..., 2:] - self.ground[2])
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """The ground in metres."""
+        other = copy(self)
+        other.ground = placed(frame, self.ground)
+        return other
+
+
+class LogProfile(Profile):
+    r"""The logarithmic profile of a neutral boundary layer over rough ground, zero below the roughness length.
+
+    .. math:: u(z) = u(h) \, \frac{\ln (z / z_0)}{\ln (h / z_0)}
+
+    Args:
+        ground: A point on the ground, in scene units; only its height counts.
+        height: Height above the ground at which the wind is that of the ``flow`` [m].
+        roughness: Roughness length z0 [m]: 0.001 for water, 0.01 for a lawn, 0.1 for a field with hedges, 1 for a town.
+
+    Example:
+        >>> profile = LogProfile(height=10.0, roughness=0.1)
+        >>> round(float(profile.factor(torch.tensor(1.0))), 3)
+        0.5
+    """
+
+    def __init__(
+        self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0, roughness: float = 0.01
+    ) -> None:
+        super().__init__(ground, height)
+        check_positive("roughness", roughness)
+        if not roughness < height:
+            raise ValueError(f"Expected `roughness` ({roughness} m) to be below `height` ({height} m): lower it.")
+        self.roughness = float(roughness)
+
+    def factor(self, above: Tensor) -> Tensor:
+        """See :class:`Profile`."""
+        return (above.clamp(min=self.roughness) / self.roughness).log() / math.log(self.height / self.roughness)
+
+
+class PowerProfile(Profile):
+    r"""The power law :math:`u(z) = u(h) (z / h)^a`, zero below the ground.
+
+    Args:
+        ground: A point on the ground, in scene units; only its height counts.
+        height: Height above the ground at which the wind is that of the ``flow`` [m].
+        exponent: a: about 0.1 over water, 0.14 over open land, 0.3 in towns.
+
+    Example:
+        >>> profile = PowerProfile(height=10.0, exponent=0.5)
+        >>> round(float(profile.factor(torch.tensor(2.5))), 3)
+        0.5
+    """
+
+    def __init__(self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0, exponent: float = 0.14) -> None:
+        super().__init__(ground, height)
+        check_positive("exponent", exponent)
+        self.exponent = float(exponent)
+
+    def factor(self, above: Tensor) -> Tensor:
+        """See :class:`Profile`."""
+        return (above.clamp(min=0.0) / self.height).pow(self.exponent)

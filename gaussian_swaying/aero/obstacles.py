@@ -1,0 +1,222 @@
+"""Bodies that do not move and that the wind flows round, as effects."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from copy import copy
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.aero.effects import Moment, WindEffect, placed
+from gaussian_swaying.aero.obstacle_flow import (
+    cylinder_flow,
+    ellipsoid_flow,
+    plane_wake,
+    round_wake,
+    sphere_flow,
+    vortex_street,
+)
+from gaussian_swaying.geometry.frame import SimFrame
+
+AnyObstacle = TypeVar("AnyObstacle", bound="Obstacle")
+
+
+class Obstacle(WindEffect):
+    """Base of bodies in the wind: potential flow round them, and a wake behind them.
+
+    The flow is that of the wind at each place, gusts included: right for gusts much longer than the body. The wake lies
+    in the direction of the mean flow.
+    """
+
+    recordable = True
+
+    def __init__(self, center: Sequence[float], drag: float) -> None:
+        super().__init__()
+        check_positive("drag", drag, allow_zero=True)
+        self.center, self.drag = list(check_vector("center", center)), float(drag)
+        self.register_buffer("middle", torch.tensor(self.center, dtype=torch.float64), persistent=False)
+        self.middle: Tensor
+
+    @abstractmethod
+    def around(self, velocity: Tensor, place: Tensor) -> Tensor:
+        """Potential flow at places from the centre [m], shape (..., P, 3)."""
+
+    @abstractmethod
+    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
+        """Share of the speed that is missing at places from the centre, (..., P), and what swirls, (..., P, 3)."""
+
+    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+        """See :class:`~gaussian_swaying.aero.effects.WindEffect`."""
+        place = position - self.middle.to(position.dtype)
+        found = self.around(velocity.to(position.dtype).expand_as(position), place)
+        if self.drag == 0:
+            return found
+        missing, swirl = self.wake(place, moment)
+        found = found * (1 - missing[..., None])
+        return found if swirl is None else found + swirl
+
+    def moved(self: AnyObstacle, frame: SimFrame) -> AnyObstacle:
+        """A copy with its centre in metres, z up."""
+        other = copy(self)
+        other._buffers = dict(self._buffers)
+        other.middle = torch.tensor(placed(frame, self.center), dtype=torch.float64, device=self.middle.device)
+        return other
+
+
+def _direction(moment: Moment, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vector of the mean flow, zero in still air, and its speed, in the dtype of the places."""
+    speed = torch.linalg.vector_norm(moment.flow)
+    return (moment.flow / speed.clamp(min=1e-12)).to(place.dtype), speed.to(place.dtype)
+
+
+class SphereObstacle(Obstacle):
+    """A sphere in the wind.
+
+    Args:
+        center: Its centre, in scene units.
+        radius: In scene units.
+        drag: Drag coefficient of its wake; 0.47 for a sphere in wind, 0 for no wake.
+
+    Example:
+        >>> ball = SphereObstacle([0.0, 0.0, 0.0], 0.5, drag=0.0)
+        >>> ball.around(torch.tensor([[2.0, 0.0, 0.0]]), torch.tensor([[0.0, 0.5, 0.0]]))
+        tensor([[3., 0., 0.]])
+    """
+
+    def __init__(self, center: Sequence[float], radius: float, drag: float = 0.47) -> None:
+        super().__init__(center, drag)
+        check_positive("radius", radius)
+        if not drag < 1:
+            raise ValueError(f"Expected `drag` of a sphere to be below 1, but got {drag}: a sphere has 0.47.")
+        self.radius = float(radius)
+
+    def around(self, velocity: Tensor, place: Tensor) -> Tensor:
+        """See :class:`Obstacle`."""
+        return sphere_flow(velocity, place, self.radius)
+
+    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
+        """See :class:`Obstacle`."""
+        direction, _ = _direction(moment, place)
+        behind = (place * direction).sum(-1)
+        aside = (place.square().sum(-1) - behind.square()).clamp(min=0).sqrt()
+        return round_wake(behind, aside, 2 * self.radius, self.drag), None
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """In metres."""
+        other = self.moved(frame)
+        other.radius = self.radius * frame.metres_per_unit
+        return other
+
+
+class CylinderObstacle(Obstacle):
+    """A long pole in the wind, with the street of vortices that makes a flag behind it flap.
+
+    Args:
+        center: A point on its axis, in scene units.
+        radius: In scene units.
+        axis: Direction of its axis.
+        drag: Drag coefficient of its wake; 1.2 for a pole in wind, 0 for no wake and no street.
+        street: Whether it sheds vortices.
+        strouhal: Their frequency times the width per speed of the flow: 0.2 for poles in wind.
+    """
+
+    def __init__(
+        self,
+        center: Sequence[float],
+        radius: float,
+        axis: Sequence[float] = (0.0, 0.0, 1.0),
+        drag: float = 1.2,
+        street: bool = True,
+        strouhal: float = 0.2,
+    ) -> None:
+        super().__init__(center, drag)
+        check_positive("radius", radius)
+        check_positive("strouhal", strouhal)
+        self.radius, self.street, self.strouhal = float(radius), bool(street), float(strouhal)
+        given = torch.tensor(check_vector("axis", axis), dtype=torch.float64)
+        if not float(given.norm()) > 0:
+            raise ValueError("Expected `axis` to have a direction, but it is zero.")
+        self.register_buffer("axis", given / given.norm(), persistent=False)
+        self.axis: Tensor
+
+    def around(self, velocity: Tensor, place: Tensor) -> Tensor:
+        """See :class:`Obstacle`."""
+        return cylinder_flow(velocity, place, self.axis.to(place.dtype), self.radius)
+
+    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
+        """See :class:`Obstacle`."""
+        axis = self.axis.to(place.dtype)
+        across = moment.flow - (moment.flow * self.axis).sum() * self.axis  # what flows along the pole meets nothing
+        speed = torch.linalg.vector_norm(across)
+        direction = (across / speed.clamp(min=1e-12)).to(place.dtype)
+        left = torch.linalg.cross(axis, direction)
+        behind, aside, width = (place * direction).sum(-1), (place * left).sum(-1), 2 * self.radius
+        missing = plane_wake(behind, aside, width, self.drag)
+        if not self.street:
+            return missing, None
+        turns = (moment.carried * (across / speed.clamp(min=1e-12))).sum() * (self.strouhal / width)
+        u, v = vortex_street(behind, aside, width, turns.remainder(1.0).to(place.dtype), self.strouhal).unbind(-1)
+        outside = behind.square() + aside.square() >= self.radius**2
+        swirl = (u[..., None] * direction + v[..., None] * left) * speed.to(place.dtype)
+        return missing, torch.where(outside[..., None], swirl, 0.0)
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """In metres, z up."""
+        other = self.moved(frame)
+        other.radius = self.radius * frame.metres_per_unit
+        other.axis = frame.direction_to_sim(self.axis)
+        return other
+
+
+class EllipsoidObstacle(Obstacle):
+    """An ellipsoid in the wind, such as a hill, a hedge or, if it is flat, a wall.
+
+    Args:
+        center: Its centre, in scene units.
+        radii: Its half axes along the axes of the scene, in scene units.
+        turn: Angle by which it is turned about the vertical [degrees].
+        drag: Drag coefficient of its wake, below 1; 0 for no wake.
+    """
+
+    def __init__(self, center: Sequence[float], radii: Sequence[float], turn: float = 0.0, drag: float = 0.9) -> None:
+        super().__init__(center, drag)
+        self.radii = list(check_vector("radii", radii))
+        for radius in self.radii:
+            check_positive("radii", radius)
+        if not drag < 1:
+            raise ValueError(f"Expected `drag` of an ellipsoid to be below 1, but got {drag}: a wall has 0.9.")
+        angle = torch.tensor(float(turn), dtype=torch.float64).deg2rad()
+        cos, sin, zero = angle.cos(), angle.sin(), torch.zeros((), dtype=torch.float64)
+        rows = [torch.stack([cos, sin, zero]), torch.stack([-sin, cos, zero]), torch.stack([zero, zero, zero + 1])]
+        self.register_buffer("axes", torch.stack(rows), persistent=False)
+        self.axes: Tensor
+
+    def around(self, velocity: Tensor, place: Tensor) -> Tensor:
+        """See :class:`Obstacle`."""
+        axes = self.axes.to(place.dtype)
+        return ellipsoid_flow(velocity @ axes.T, place @ axes.T, self.radii) @ axes
+
+    def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
+        """See :class:`Obstacle`: the Gaussian is as wide, and as high, as the body is across the flow."""
+        direction, _ = _direction(moment, place)
+        side = torch.stack([-direction[1], direction[0], torch.zeros_like(direction[0])])
+        side = side / torch.linalg.vector_norm(side).clamp(min=1e-12)
+        up = torch.linalg.cross(direction, side)
+        scaled = torch.stack([axis * size for axis, size in zip(self.axes.to(place.dtype), self.radii, strict=True)])
+        wide, high = (2 * torch.linalg.vector_norm(scaled @ part) for part in (side, up))
+        mean = (wide * high).clamp(min=1e-12).sqrt()
+        behind, left, above = ((place * part).sum(-1) for part in (direction, side, up))
+        narrow = [mean / size.clamp(min=1e-12) for size in (wide, high)]
+        aside = ((left * narrow[0]).square() + (above * narrow[1]).square()).sqrt()
+        return round_wake(behind / mean, aside / mean, 1.0, self.drag), None
+
+    def in_frame(self, frame: SimFrame) -> WindEffect:
+        """In metres, z up."""
+        other = self.moved(frame)
+        other.radii = [radius * frame.metres_per_unit for radius in self.radii]
+        other.axes = frame.direction_to_sim(self.axes)
+        return other

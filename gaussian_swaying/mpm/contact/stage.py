@@ -1,0 +1,277 @@
+"""The contact of a body in ``total``: which places may touch, and what a substep does about it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.contact.pairs import close_pairs
+from gaussian_swaying.mpm.contact.solve import Constraints, Rows, acting, pair_gaps, resolve, weighted
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.mpm.transfer import bspline_stencil
+
+LEAST_MARGIN = 0.5
+"""Least distance beyond contact within which pairs are listed [cells]."""
+
+ARM = 1.2
+"""How much farther a place may move than any material point."""
+
+TOLERANCE = 1e-4
+"""Violation of a constraint within a substep at which the impulses are good enough [cells]."""
+
+AHEAD = 3.0
+"""For how many substeps ahead points are followed before the lists are made again."""
+
+APART = 2.0
+"""Places closer than this at rest [cells] are neighbours: they share nodes, and a fold cannot be sharper."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lists:
+    """What may touch until the nodes have moved half the margin.
+
+    Attributes:
+        place: The places that occur, shape (A,).
+        walls: For each obstacle, the rows of the places near it, shape (N,).
+        first: Rows of the first place of each pair, shape (M,).
+        second: Rows of the second.
+        before: Positions of the material points when the lists were made [m], shape (P, 3).
+        time: That time [s].
+        margin: How much closer two things may have come [m].
+        fastest: Bound of the speed of the obstacles [m/s].
+    """
+
+    place: Tensor
+    walls: list[Tensor]
+    first: Tensor
+    second: Tensor
+    before: Tensor
+    time: float
+    margin: float
+    fastest: float
+
+
+@contextmanager
+def in_fixed_order(wanted: bool) -> Iterator[None]:
+    """Make PyTorch sum in a fixed order on a GPU, if wanted."""
+    before, warns = torch.are_deterministic_algorithms_enabled(), torch.is_deterministic_algorithms_warn_only_enabled()
+    if wanted:
+        torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        if wanted:
+            torch.use_deterministic_algorithms(before, warn_only=warns)
+
+
+class ContactStage:
+    """Contact of a body with obstacles and with itself, bound to its grid.
+
+    The lists of what may touch are a cache: a state decides alone what happens, whatever was stepped before.
+
+    Args:
+        surface: The places that touch.
+        boundaries: The boundaries of the body; those that are obstacles act here.
+        kinds: What each acts on (``Boundary.hold_kind``).
+        grid: The nodes.
+        inverse_mass: Their inverse mass [1/kg], 0 for a node without mass, shape (..., G).
+        deterministic: Whether sums on a GPU have a fixed order.
+
+    Raises:
+        ValueError: If a place has no material.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        boundaries: Sequence[Boundary],
+        kinds: Sequence[str],
+        grid: GridSpec,
+        inverse_mass: Tensor,
+        deterministic: bool = False,
+    ) -> None:
+        self.deterministic = deterministic
+        self.surface, self.contact, self.grid, self.dx = surface, surface.contact, grid, grid.dx
+        self.count = len(boundaries)
+        self.obstacles = [(k, b) for k, b in enumerate(boundaries) if kinds[k] == "surface" and isinstance(b, Obstacle)]
+        self.iterations = Contact.iterations if self.contact is None else self.contact.iterations
+        self.inverse_mass = inverse_mass.reshape(-1)
+        self.scenes = len(self.inverse_mass) // grid.node_count
+        each = len(surface.place) // self.scenes
+        read = surface.read.reshape(self.scenes, each, 3) if self.scenes > 1 else surface.read
+        snap = torch.finfo(read.dtype).eps ** 0.5
+        stencil = bspline_stencil(read, grid, False, snap)
+        if not bool(stencil.inside.all()):
+            raise ValueError("A place of the surface lies outside the material: give places on the simulated points.")
+        basis = stencil.basis  # (C, 4, 27)
+        arm = surface.place - surface.read
+        self.node = stencil.node.reshape(-1, 27)
+        self.slope = basis[:, 1:4]
+        self.weight = basis[:, 0] + (arm[:, :, None] * self.slope).sum(1)
+        self.scene = torch.arange(len(self.weight), device=read.device) // max(each, 1)
+        self.reach = self.apart = 0.0
+        if self.contact is not None:
+            widest, thickest = float(surface.radius.amax()), float(surface.thickness.amax())
+            self.reach = math.hypot(widest, thickest)
+            self.apart = max(APART * self.dx, 3 * thickest)
+        self.lists: Lists | None = None
+        self.made = 0
+        """How often the lists were made."""
+
+    # ---- lists
+
+    @torch.no_grad()
+    def update(self, state: MPMState, dt: float, ahead: float = AHEAD) -> None:
+        """Make the lists again if something may have come close since they were made; the host waits.
+
+        Args:
+            state: The state at the start of a substep.
+            dt: Substep [s].
+            ahead: For how many substeps points are followed ahead.
+        """
+        position, velocity = state.position.reshape(-1, 3), state.velocity.reshape(-1, 3)
+        known, now = self.lists, float(state.time)
+        if known is not None:
+            far = float((position + ahead * dt * velocity - known.before).square().sum(-1).amax()) ** 0.5
+            if 2 * ARM * far + known.fastest * abs(now + ahead * dt - known.time) < known.margin:
+                return
+        step = dt * float(velocity.square().sum(-1).amax()) ** 0.5
+        assert state.node_displacement is not None
+        moved = state.node_displacement.reshape(-1, 3)
+        if not math.isfinite(step):
+            return  # the run is about to end with an error that says why
+        with torch.inference_mode(False):
+            self.lists = self._make(position.clone(), moved, state.time, dt, step, ahead)
+        self.made += 1
+
+    def _make(self, before: Tensor, displacement: Tensor, time: Tensor, dt: float, step: float, ahead: float) -> Lists:
+        everything = Rows(self.node, self.weight, self.weight)
+        position = self.surface.place + everything.read(displacement)
+        farthest = [float((position - b.pose(time)[0].to(position)).norm(dim=-1).amax()) for _, b in self.obstacles]
+        fastest = max([0.0, *(b.fastest(far) for (_, b), far in zip(self.obstacles, farthest, strict=True))])
+        thickest = float(self.surface.thickness.amax())
+        margin = max(LEAST_MARGIN * self.dx, thickest, 4 * (1 + ahead) * ARM * step + 4 * fastest * dt)
+        none = torch.zeros(0, dtype=torch.long, device=position.device)
+        first = second = none
+        if self.contact is not None:
+            first, second = close_pairs(position, self.reach + margin, self.surface.place, self.apart)
+        near = []
+        for _, obstacle in self.obstacles:
+            distance = obstacle.touch(position, time, dt)[0] - 0.5 * self.surface.thickness
+            near.append((distance < margin).nonzero()[:, 0])
+        place = torch.cat([first, second, *near]).unique()
+        rank = torch.zeros(len(position), dtype=torch.long, device=position.device)
+        rank[place] = torch.arange(len(place), device=position.device)
+        return Lists(
+            place, [rank[index] for index in near], rank[first], rank[second], before, float(time), margin, fastest
+        )
+
+    # ---- a substep
+
+    def apply(self, velocity: Tensor, displacement: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
+        """The velocity of the nodes after the impulses of all contacts.
+
+        Args:
+            velocity: Node velocity after all forces [m/s], shape (..., G, 3).
+            displacement: Node displacement at the start of the substep [m], shape (..., G, 3).
+            time: Time at the start of the substep [s], scalar float64 tensor.
+            dt: Substep [s].
+
+        Returns:
+            The velocity, and the momentum that each boundary took from the body [N s], shape (scenes, boundaries, 3),
+            float64.
+        """
+        lists = self.lists
+        taken = torch.zeros(self.scenes, self.count, 3, dtype=torch.float64, device=velocity.device)
+        if lists is None or len(lists.place) == 0:
+            return velocity, taken
+        flat = velocity.reshape(-1, 3)
+        rows = self._rows(lists.place)
+        held, owner = self._constraints(lists, rows, displacement.reshape(-1, 3), time, dt)
+        index = acting(rows, held, flat, dt, self.dx).nonzero()[:, 0]
+        if len(index) == 0:
+            return velocity, taken
+        held, owner = held.select(index), owner[index]
+        used, places = torch.unique(torch.cat([held.first, held.second]), return_inverse=True)
+        if len(used) and int(used[-1]) < len(lists.place):  # the last row stands for obstacles
+            used = torch.cat([used, used.new_tensor([len(lists.place)])])
+        first, second = places.reshape(2, -1)
+        rows = Rows(rows.node[used], rows.weight[used], rows.inverse[used])
+        held = Constraints(first, second, held.normal, held.gap, held.drive, held.friction, held.valid)
+        with in_fixed_order(self.deterministic and flat.is_cuda):
+            flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
+        with torch.no_grad():
+            real = torch.cat([lists.place, lists.place.new_zeros(1)])[used]
+            flat_owner = self.scene[real[first]] * (self.count + 1) + owner  # the last one for pairs
+            sums = taken.new_zeros(self.scenes * (self.count + 1), 3).index_add_(0, flat_owner, -impulse.double())
+            taken = sums.reshape(self.scenes, -1, 3)[:, :-1]
+        return flat.reshape(velocity.shape), taken
+
+    def _rows(self, place: Tensor) -> Rows:
+        """Some places, and the one that stands for obstacles."""
+        node, weight = self.node[place], self.weight[place]
+        node = torch.cat([node, node.new_zeros(1, 27)])
+        weight = torch.cat([weight, weight.new_zeros(1, 27)])
+        return Rows(node, weight, weight * self.inverse_mass[node])
+
+    def _constraints(
+        self, lists: Lists, rows: Rows, displacement: Tensor, time: Tensor, dt: float | Tensor
+    ) -> tuple[Constraints, Tensor]:
+        """All listed constraints as they are now, and the boundary of each; the number of boundaries for a pair."""
+        surface = self.surface
+        position = surface.place[lists.place] + rows.read(displacement)[:-1]
+        thickness = surface.thickness[lists.place]
+        obstacle_row = len(lists.place)
+        parts: list[tuple[Tensor, ...]] = []
+        for (k, obstacle), near in zip(self.obstacles, lists.walls, strict=True):
+            gap, normal, drive = obstacle.touch(position[near], time, dt)
+            valid = obstacle.active(time).expand(len(near))
+            friction = gap.new_full((len(near),), obstacle.friction)
+            owner = torch.full_like(near, k)
+            parts.append(
+                (
+                    near,
+                    torch.full_like(near, obstacle_row),
+                    normal,
+                    gap - 0.5 * thickness[near],
+                    drive,
+                    friction,
+                    valid,
+                    owner,
+                )
+            )
+        if self.contact is not None and len(lists.first):
+            first, second = lists.first, lists.second
+            normals, radius = self.normals(lists.place, displacement), surface.radius[lists.place]
+            normal, gap, above = pair_gaps(
+                position[first] - position[second],
+                (normals[first], normals[second]),
+                (radius[first], radius[second]),
+                0.5 * (thickness[first] + thickness[second]),
+            )
+            friction = gap.new_full((len(first),), self.contact.friction)
+            owner = torch.full_like(first, self.count)
+            parts.append((first, second, normal, gap, torch.zeros_like(normal), friction, above, owner))
+        *fields, owner = (torch.cat(column) for column in zip(*parts, strict=True))
+        return Constraints(*fields), owner
+
+    def positions(self, displacement: Tensor) -> Tensor:
+        """Where the places are now [m], shape (C, 3), from the node displacement (..., G, 3)."""
+        return self.surface.place + Rows(self.node, self.weight, self.weight).read(displacement.reshape(-1, 3))
+
+    def normals(self, place: Tensor, displacement: Tensor) -> Tensor:
+        """Unit normals of some places (A,) now, shape (A, 3), from the node displacement (G, 3)."""
+        node, slope = self.node[place], self.slope[place].unbind(1)
+        gradient = torch.stack([weighted(displacement, node, part) for part in slope], dim=1)  # [axis, component]
+        F = gradient.mT + torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        a, b, c = F.unbind(-1)
+        cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
+        return torch.nn.functional.normalize((cofactor * self.surface.normal[place][:, None]).sum(-1), dim=-1)

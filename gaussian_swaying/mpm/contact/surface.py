@@ -1,0 +1,105 @@
+"""What touches: places of the surface of a body, and how they do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_positive, check_shape
+from gaussian_swaying.mpm.state import MaterialPoints
+
+
+@dataclass
+class Contact:
+    """Contact of the material with itself: between the layers of a sheet, and between objects.
+
+    Args:
+        thickness: Distance that two surfaces keep [m]; null for the thickness of the material at each place. Obstacles
+            are kept at half of it.
+        friction: Coulomb coefficient.
+        iterations: Most iterations for the impulses of a substep. A few are enough, but for piles of many layers.
+
+    Raises:
+        ValueError: If a number is out of range.
+    """
+
+    thickness: float | None = None
+    friction: float = 0.3
+    iterations: int = 100
+
+    def __post_init__(self) -> None:
+        if self.thickness is not None:
+            check_positive("contact.thickness", self.thickness)
+        check_positive("contact.friction", self.friction, allow_zero=True)
+        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
+            raise ValueError(
+                f"Expected `contact.iterations` to be a whole number of at least 1, but got {self.iterations}."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Places of the surface that touch obstacles and each other: discs around them cover it.
+
+    Attributes:
+        place: Rest positions [m], shape (C, 3).
+        normal: Unit normals at rest, of either sign, shape (C, 3).
+        radius: Radii of the discs [m], shape (C,).
+        thickness: Distance that two surfaces keep [m], shape (C,).
+        read: Where in the material each is read [m], shape (C, 3): the place itself, or one close to it if some of its
+            nodes have no mass.
+        contact: How the surface touches itself; None if only obstacles count.
+    """
+
+    place: Tensor
+    normal: Tensor
+    radius: Tensor
+    thickness: Tensor
+    read: Tensor
+    contact: Contact | None = None
+
+    def __post_init__(self) -> None:
+        check_shape("place", self.place, "C", 3)
+        for name in ("normal", "read"):
+            check_shape(name, getattr(self, name), len(self.place), 3)
+        for name in ("radius", "thickness"):
+            check_shape(name, getattr(self, name), len(self.place))
+
+    @classmethod
+    def of_points(
+        cls,
+        points: MaterialPoints,
+        normal: Tensor | None = None,
+        spacing: float = 0.0,
+        thickness: float = 0.0,
+        contact: Contact | None = None,
+    ) -> Surface:
+        """The material points as a surface.
+
+        Args:
+            points: The material.
+            normal: Normals of the sheet at its points, shape (P, 3); needed for contact with itself.
+            spacing: Distance of neighbouring points [m]; discs reach 0.75 of it.
+            thickness: Distance that two surfaces keep [m], unless ``contact`` has one.
+            contact: How the surface touches itself.
+
+        Raises:
+            ValueError: If there is a contact but no normal or no spacing.
+        """
+        place = points.position.detach().reshape(-1, 3)
+        if contact is not None and (normal is None or spacing <= 0 or points.position.dim() > 2):
+            raise ValueError(
+                "Contact of a surface with itself needs one scene, and `normal` and `spacing` of its points."
+            )
+        h = thickness if contact is None or contact.thickness is None else contact.thickness
+        full = place.new_full((len(place),), 1.0)
+        facing = torch.zeros_like(place) if normal is None else normal.to(place)
+        return cls(place, facing, 0.75 * spacing * full, h * full, place, contact)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Surface:
+        """Apply a function to every tensor."""
+        place, normal, read = (function(field) for field in (self.place, self.normal, self.read))
+        return Surface(place, normal, function(self.radius), function(self.thickness), read, self.contact)

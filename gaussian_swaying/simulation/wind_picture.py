@@ -1,0 +1,146 @@
+"""The wind in pictures: streaks of air that drift with it, over the picture of the object."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.colormap import colormap
+from gaussian_swaying.rendering.passes import mean_depth
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.simulation.preview.ticks import project
+
+if TYPE_CHECKING:
+    from gaussian_swaying.simulation.simulation import Simulation
+
+ACROSS = 26
+"""Streaks along the longer side of the picture."""
+
+STEPS = 12
+"""Straight pieces of a streak."""
+
+
+def streaks(simulation: Simulation, state: MPMState, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pieces of the lines along which the air flows at one moment, near a plane through the object.
+
+    The plane holds the direction of the flow, and is upright or level, whichever the camera sees better. They start at
+    the points of a lattice that drifts with the mean flow, so that they move from frame to frame as the air does, and
+    are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
+
+    Args:
+        simulation: The simulation.
+        state: The state.
+        camera: The camera, in scene units.
+
+    Returns:
+        Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
+    """
+    scene, frame, wind = simulation.scene, simulation.scene.frame, simulation.wind
+    device, double = state.position.device, torch.float64
+    centre = frame.point_to_sim(scene.center.to(device).double()[None])[0]
+    eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
+    view = centre - eye
+    distance = view.norm()
+    mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else simulation.flows().double().mean(0)
+    carried = wind.carried(state.time) if isinstance(wind, WindField) else mean * state.time
+    right, up = _plane(mean, view / distance)
+    high = 1.15 * float(distance) * camera.height / float(camera.intrinsics[1, 1])
+    wide = high * camera.width / camera.height
+    gap = wide / ACROSS
+    rows, columns = math.ceil(high / gap), ACROSS + 2
+    axes = (torch.arange(count, dtype=double, device=device) for count in (rows, columns))
+    j, i = torch.meshgrid(*axes, indexing="ij")
+    jitter = torch.rand(2, rows, columns, generator=torch.Generator().manual_seed(0), dtype=double).to(device) - 0.5
+    x = (i + 0.5 + 0.8 * jitter[0]) * gap + (carried * right).sum()
+    y = (j + 0.5 + 0.8 * jitter[1]) * gap + (carried * up).sum()
+    x, y = x.remainder(columns * gap) - 0.5 * columns * gap, y.remainder(rows * gap) - 0.5 * rows * gap
+    place = (centre + x[..., None] * right + y[..., None] * up).reshape(-1, 3)
+    speed = float(mean.norm())
+    seconds = 0.125 * wide / max(speed, 1e-6) if speed > 0 else 1.0
+    places, speeds = [], []
+    for _ in range(STEPS + 1):
+        air = simulation.wind_force.air(state.time, place.to(state.position.dtype))
+        air = air.double().expand_as(place)
+        places.append(place)
+        speeds.append(torch.linalg.vector_norm(air, dim=-1))
+        half = place + 0.5 * seconds / STEPS * air  # midpoint rule
+        middle = simulation.wind_force.air(state.time, half.to(state.position.dtype)).double().expand_as(place)
+        place = place + seconds / STEPS * middle
+    points = torch.stack(places, 1)
+    return frame.point_to_scene(points.reshape(-1, 3)).view_as(points), torch.stack(speeds, 1)
+
+
+def _plane(flow: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+    """Two directions of the plane in which air is drawn, from the flow [m/s] and the view, each of shape (3,)."""
+    z = torch.tensor([0.0, 0.0, 1.0], device=flow.device, dtype=flow.dtype)
+    x = torch.tensor([1.0, 0.0, 0.0], device=flow.device, dtype=flow.dtype)
+    along = flow / flow.norm() if float(flow.norm()) > 0 else x
+    level = torch.linalg.cross(z if float(along[2].abs()) < 0.9 else x, along)
+    level = level / level.norm()
+    upright = torch.linalg.cross(along, level)
+    if max(float((side * ahead).sum().abs()) for side in (level, upright)) < 0.35:  # along the view: a plane across it
+        level = torch.linalg.cross(z, ahead)
+        return level / level.norm(), torch.linalg.cross(ahead, level / level.norm())
+    return (
+        (along, upright)
+        if float((level * ahead).sum().abs()) > float((upright * ahead).sum().abs())
+        else (along, level)
+    )
+
+
+def draw_wind(
+    simulation: Simulation, state: MPMState, camera: Camera, picture: RenderOutput, largest: float | None = None
+) -> Tensor:
+    """The picture of the object, paler, with streaks of air over it, from violet in still air to yellow.
+
+    A streak is hidden where the object is in front of it, and fades towards its tail.
+
+    Args:
+        simulation: The simulation.
+        state: The state.
+        camera: The camera, on the device of the Gaussians.
+        picture: What the camera sees.
+        largest: End of the colour scale [m/s]; 1.5 times the mean flow if None.
+
+    Returns:
+        Shape (H, W, 3), on the CPU.
+    """
+    from PIL import Image, ImageDraw
+
+    places, speeds = (part.cpu() for part in streaks(simulation, state, camera))
+    flow = float(torch.linalg.vector_norm(simulation.flows(), dim=-1).amax())
+    largest = largest or 1.5 * flow or float(speeds.amax()) or 1.0
+    pixel, depth = project(places.reshape(-1, 3), camera)
+    pixel, depth = pixel.view(*speeds.shape, 2), depth.view_as(speeds)
+    seen = mean_depth(picture).to(depth)
+    row, column = (pixel[..., k].nan_to_num(-1).clamp(-1, 1e6).floor().long() for k in (1, 0))
+    shown = (depth > 1e-3) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+    front = seen[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+    hidden = (front > 0) & (front < depth)
+    colours = (255 * colormap(speeds / largest)).round().int().tolist()
+    ratio = 2  # drawn larger and reduced, so that the lines are smooth
+    size = (camera.width * ratio, camera.height * ratio)
+    layer = Image.new("RGBA", size)
+    draw = ImageDraw.Draw(layer)
+    thick = max(3, round(0.009 * camera.height * ratio))
+    points, visible = (ratio * pixel).tolist(), (shown & ~hidden).tolist()
+    for streak, colour, known in zip(points, colours, visible, strict=True):
+        for k in range(STEPS):
+            if known[k] and known[k + 1]:
+                share = (k + 1) / STEPS
+                ends, width = [tuple(streak[k]), tuple(streak[k + 1])], max(1, round(thick * (0.35 + 0.65 * share)))
+                draw.line(ends, fill=(*colour[k], int(40 + 215 * share)), width=width)
+        if known[STEPS]:
+            (x, y), r = streak[STEPS], 0.75 * thick
+            draw.ellipse([x - r, y - r, x + r, y + r], fill=(*colour[STEPS], 255))
+    over = layer.resize((camera.width, camera.height), Image.Resampling.LANCZOS)
+    pixels = torch.frombuffer(bytearray(over.tobytes()), dtype=torch.uint8).view(camera.height, camera.width, 4) / 255
+    under = 0.75 * picture.color.detach().cpu().float().clamp(0, 1) + 0.25
+    alpha = pixels[..., 3:]
+    return under * (1 - alpha) + pixels[..., :3] * alpha

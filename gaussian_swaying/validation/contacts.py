@@ -1,0 +1,87 @@
+"""Measures of contact: gaps between surfaces, and edges of a sheet that cross its triangles."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.mpm.contact.pairs import close_pairs
+from gaussian_swaying.mpm.contact.solve import pair_gaps
+from gaussian_swaying.mpm.contact.stage import ContactStage
+from gaussian_swaying.mpm.state import MPMState
+
+_CHUNK = 20_000_000
+
+
+def gaps(stage: ContactStage, state: MPMState) -> Tensor:
+    """Distances of all surfaces that lie above each other and were no neighbours at rest, in units of the thickness.
+
+    Args:
+        stage: The contact of a body.
+        state: Its state.
+
+    Returns:
+        One for each pair of places whose discs lie above each other, shape (M,); none farther than the reach of a disc.
+    """
+    surface, moved = stage.surface, state.node_displacement
+    assert moved is not None
+    position = stage.positions(moved)
+    first, second = close_pairs(position, stage.reach, surface.place, stage.apart)
+    everything = torch.arange(len(position), device=position.device)
+    normals = stage.normals(everything, moved.reshape(-1, 3))
+    thickness = 0.5 * (surface.thickness[first] + surface.thickness[second])
+    _, gap, above = pair_gaps(
+        position[first] - position[second],
+        (normals[first], normals[second]),
+        (surface.radius[first], surface.radius[second]),
+        thickness,
+    )
+    return (gap / thickness + 1)[above]
+
+
+def sheet_triangles(nx: int, ny: int, first: int = 0) -> Tensor:
+    """Triangles of a sheet of nx times ny points in rows, the first of them numbered ``first``; shape (T, 3)."""
+    number = first + torch.arange(nx * ny).reshape(nx, ny)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    corners = [torch.stack([a, b, d], -1), torch.stack([a, d, c], -1)]
+    return torch.cat([part.reshape(-1, 3) for part in corners])
+
+
+@torch.no_grad()
+def crossings(place: Tensor, triangles: Tensor) -> int:
+    """How many pairs of an edge and a triangle, without a common corner, cross each other.
+
+    An edge crosses a triangle if its ends lie on different sides of its plane, and the line through it passes all three
+    sides of the triangle in the same direction: signs of volumes of tetrahedra.
+
+    Args:
+        place: Corners [m], shape (P, 3).
+        triangles: Their numbers, shape (T, 3).
+
+    Returns:
+        The number; zero if no part of the surface passes through another.
+    """
+    place, triangles = place.double().cpu(), triangles.cpu()
+    sides = torch.cat([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    edges = sides.sort(-1)[0].unique(dim=0)
+    corners = place[triangles]
+    low, high = corners.amin(1), corners.amax(1)
+    found, step = 0, max(1, _CHUNK // len(triangles))
+    for first in range(0, len(edges), step):
+        ends = place[edges[first : first + step]]
+        below, above = ends.amin(1), ends.amax(1)
+        near = ((below[:, None] <= high) & (above[:, None] >= low)).all(-1)
+        own = (edges[first : first + step, None, :, None] == triangles[:, None, :]).flatten(2).any(-1)
+        edge, face = (near & ~own).nonzero(as_tuple=True)
+        p, q = ends[edge].unbind(1)
+        a, b, c = corners[face].unbind(1)
+        side = [_volume(a, b, c, p), _volume(a, b, c, q)]
+        turn = [_volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)]
+        same = ((turn[0] > 0) & (turn[1] > 0) & (turn[2] > 0)) | ((turn[0] < 0) & (turn[1] < 0) & (turn[2] < 0))
+        found += int((same & (side[0] * side[1] < 0)).sum())
+    return found
+
+
+def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """Six times the signed volume of tetrahedra."""
+    return (torch.linalg.cross(b - a, c - a, dim=-1) * (d - a)).sum(-1)

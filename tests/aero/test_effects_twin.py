@@ -1,0 +1,183 @@
+"""A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU."""
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.aero.carried import CarriedField, Turbulence
+from gaussian_swaying.aero.effects import LogProfile, PowerProfile
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.recorded import RecordedWind
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import FlowKey, UniformGust, WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+try:
+    from gaussian_swaying.mpm.triton import fused
+except ImportError:
+    fused = None
+
+DX, DT = 0.1, 1e-3
+TOLERANCE = 2e-5
+"""Relative to the largest value of a field, as in tests/mpm/test_fused.py."""
+
+
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def kernel_device(request):
+    """Where the kernels run."""
+    if request.param == "cuda":
+        pytest.importorskip("triton")
+        return torch.device("cuda")
+    if fused is None:
+        pytest.skip("needs triton, which is available on Linux only")
+    if not fused.INTERPRETED:
+        pytest.skip("on this machine the kernels are compiled")
+    return torch.device("cpu")
+
+
+def _field(wraps):
+    table = 2 * torch.randn(6, 5, 4, 3, generator=torch.Generator().manual_seed(3))
+    return CarriedField(
+        table, [0.05, 0.07, 0.06], origin=[0.1, 0.0, 0.1], anchor=[0.1, 0.2, 0.05], wraps=wraps, scale=2
+    )
+
+
+GUSTS = [UniformGust(0.5, interval=2 * DT)]
+TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]
+
+
+def _wind(name):
+    """A wind of its own for every test, as it is moved to a device."""
+    low = {"ground": [0.0, 0.0, 0.05], "height": 0.2}
+    effects = {
+        "log": [LogProfile(**low, roughness=0.02)],
+        "power": [PowerProfile(**low, exponent=0.3)],
+        "turbulence": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)],
+        "all": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), LogProfile(**low, roughness=0.02)],
+        "sheltered": [Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03), Shelter(cells=8, strength=20.0)],
+        "half": [PowerProfile(**low), _field((True, False, False))],
+        "held": [_field((False, True, False))],
+    }
+    return WindField(schedule=TURNING, interpolation="linear", modulations=GUSTS, effects=effects[name])
+
+
+def _bodies(device, formulation, wind, batch=(), groups=False, transfer="triton", **aero):
+    draw = torch.Generator().manual_seed(0)
+    position = 0.06 + 0.18 * torch.rand(*batch, 24, 3, generator=draw)
+    normal = torch.nn.functional.normalize(torch.randn(*batch, 24, 3, generator=draw), dim=-1).to(device)
+    area = (0.02 * torch.rand(*batch, 24, generator=draw)).to(device)
+    velocity = torch.randn(*batch, 24, 3, generator=draw).to(device)
+    points = MaterialPoints.create(
+        position.to(device), volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3
+    )
+    patches = (normal, area)
+    if groups:  # two patches on each particle
+        owner = torch.arange(24, device=device).repeat(2)
+        patches = (Patches(torch.cat([normal, normal.roll(1, 0)]), area.repeat(2), owner, 24),)
+    solver = MPMSolver(dx=DX, formulation=formulation, transfer=transfer)
+    load = WindForce(AeroForce(C_D=1.0, **aero).to(device), wind.to(device), *patches)
+    return solver, solver.init_state(points, velocity), load
+
+
+def _same(found, expected):
+    for name in ("position", "velocity", "F_total"):
+        a, b = getattr(found, name), getattr(expected, name)
+        torch.testing.assert_close(a, b, rtol=0, atol=TOLERANCE * float(b.abs().max()))
+    torch.testing.assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+@pytest.mark.parametrize("name", ["log", "power", "turbulence", "all", "sheltered", "half", "held"])
+def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
+    solver, state, load = _bodies(kernel_device, formulation, _wind(name))
+    assert load.has_twin
+    reference, _, _ = _bodies(kernel_device, formulation, _wind(name), transfer="torch")
+    load.refresh(state)
+    found, expected = solver.rollout(state, DT, 6, load), reference.rollout(state, DT, 6, load)
+    _same(found, expected)
+    load.wind.effects = torch.nn.ModuleList()
+    bare = reference.rollout(state, DT, 6, load)
+    assert float((bare.velocity - expected.velocity).abs().max()) > 1e-2 * float(expected.velocity.abs().max())
+
+
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_the_kernels_blow_on_groups_of_patches_and_batches(kernel_device, formulation):
+    for options in ({"groups": True}, {"batch": (2,)}):
+        solver, state, load = _bodies(kernel_device, formulation, _wind("all"), **options, drag_step="semi_implicit")
+        reference, _, _ = _bodies(kernel_device, formulation, _wind("all"), transfer="torch", **options)
+        assert load.has_twin
+        assert (load.sums is not None) == ("groups" in options)
+        _same(solver.rollout(state, DT, 4, load), reference.rollout(state, DT, 4, load))
+
+
+def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
+    """A table changed in place, another flow, and rollouts that are replayed from graphs on a GPU."""
+    solver, state, load = _bodies(kernel_device, "total", _wind("half"))
+    reference, _, _ = _bodies(kernel_device, "total", _wind("half"), transfer="torch")
+    ends = []
+    for change in range(4):
+        if change == 2:
+            load.wind.effects[1].table.mul_(-3.0)
+        if change == 3:
+            load.wind.flows = load.wind.flows.flip(0)
+        where = load.twin().space.data_ptr()
+        ends.append(solver.rollout(state, DT, 5, load))
+        _same(ends[-1], reference.rollout(state, DT, 5, load))
+        assert load.twin().space.data_ptr() == where
+    torch.testing.assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
+    for one, other in ((1, 2), (2, 3)):
+        assert float((ends[one].velocity - ends[other].velocity).abs().max()) > 1e-3
+
+
+def test_the_last_place_of_a_table_that_repeats(kernel_device):
+    """Places just below zero round up to the length of the table in float32."""
+    table = torch.arange(4.0).repeat_interleave(12).reshape(4, 2, 2, 3)
+    wind = WindField([0.0, 0.0, 0.0], effects=[CarriedField(table, [1.0] * 3, anchor=[-1e-9, 0.0, 0.0])])
+    solver, state, load = _bodies(kernel_device, "total", wind)
+    reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
+    _same(solver.rollout(state, DT, 2, load), reference.rollout(state, DT, 2, load))
+
+
+def _obstacle(name, tmp_path):
+    middle = [0.1, 0.15, 0.1]
+    if name == "recorded":
+        axis = np.linspace(-0.2, 0.5, 5)
+        velocity = np.random.default_rng(0).normal(size=(4, 5, 5, 5, 3))
+        np.savez(tmp_path / "w.npz", time=DT * np.arange(4.0), x=axis, y=axis, z=axis, velocity=velocity)
+        return RecordedWind(tmp_path / "w.npz", repeat=True)
+    return {
+        "sphere": lambda: SphereObstacle(middle, 0.05),
+        "cylinder": lambda: CylinderObstacle(middle, 0.05, axis=[0.0, 1.0, 1.0]),
+        "ellipsoid": lambda: EllipsoidObstacle(middle, [0.03, 0.08, 0.05], turn=20.0),
+    }[name]()
+
+
+@pytest.mark.parametrize("name", ["sphere", "cylinder", "ellipsoid", "recorded"])
+def test_other_effects_run_in_torch_between_the_kernels(kernel_device, name, tmp_path):
+    """On a GPU inside the recorded graphs: the third rollout is replayed, at another time."""
+    wind = WindField(schedule=TURNING, interpolation="linear", effects=[_obstacle(name, tmp_path)])
+    solver, state, load = _bodies(kernel_device, "total", wind)
+    reference, _, _ = _bodies(kernel_device, "total", wind, transfer="torch")
+    assert not load.has_twin
+    assert load.recordable
+    for _ in range(3):
+        found, expected = solver.rollout(state, DT, 3, load), reference.rollout(state, DT, 3, load)
+        _same(found, expected)
+        state = expected
+    still = WindForce(load.aero, WindField([0.0] * 3).to(kernel_device), load.normal, load.area)
+    bare = reference.rollout(state, DT, 3, still)
+    assert float((bare.velocity - reference.rollout(state, DT, 3, load).velocity).abs().max()) > 1e-4
+
+
+def test_what_the_kernels_do_not_know_runs_in_torch():
+    class Doubled(LogProfile):
+        def factor(self, above):
+            return 2 * super().factor(above)
+
+    for effects in ([Doubled()], [_field((True,) * 3), _field((True,) * 3)]):
+        wind = WindField([1.0, 0.0, 0.0], effects=effects)
+        assert not _bodies("cpu", "total", wind, transfer="torch")[2].has_twin

@@ -1,0 +1,219 @@
+"""Flow round bodies: no divergence, no rotation, nothing through the surface, and closed forms at special places."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.effects import Moment
+from gaussian_swaying.aero.obstacle_flow import (
+    STREET_SPEED,
+    carlson_rd,
+    cylinder_flow,
+    ellipsoid_flow,
+    plane_wake,
+    round_wake,
+    sphere_flow,
+    vortex_street,
+)
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.geometry.frame import SimFrame
+
+DOUBLE = torch.float64
+FLOW = torch.tensor([2.0, -0.7, 0.4], dtype=DOUBLE)
+AXIS = torch.nn.functional.normalize(torch.tensor([0.3, 0.1, 1.0], dtype=DOUBLE), dim=0)
+RADII = (0.7, 1.3, 0.4)
+FLOWS = {
+    "sphere": lambda x: sphere_flow(FLOW, x, 0.8),
+    "cylinder": lambda x: cylinder_flow(FLOW, x, AXIS, 0.8),
+    "ellipsoid": lambda x: ellipsoid_flow(FLOW, x, RADII),
+}
+
+
+def _directions(count=40):
+    draw = torch.randn(count, 3, dtype=DOUBLE, generator=torch.Generator().manual_seed(0))
+    return torch.nn.functional.normalize(draw, dim=-1)
+
+
+def _surface(name):
+    """Points of a surface just outside of it, and its normals."""
+    direction = _directions()
+    if name == "ellipsoid":
+        x = direction * torch.tensor(RADII, dtype=DOUBLE)
+        return x * (1 + 1e-15), torch.nn.functional.normalize(direction / torch.tensor(RADII, dtype=DOUBLE), dim=-1)
+    if name == "cylinder":
+        direction = torch.nn.functional.normalize(direction - (direction @ AXIS)[:, None] * AXIS, dim=-1)
+        return 0.8 * direction * (1 + 1e-15) + 3 * AXIS, direction
+    return 0.8 * direction * (1 + 1e-15), direction
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_nothing_flows_through_the_surface(name):
+    place, normal = _surface(name)
+    place = place + 1e-13 * normal
+    found = FLOWS[name](place)
+    assert float(found.norm(dim=-1).max()) > 1.0  # it is outside
+    assert float((found * normal).sum(-1).abs().max()) < 1e-11
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_the_flow_has_neither_divergence_nor_rotation(name):
+    place = 1.5 * _directions() * torch.linspace(1, 3, 40, dtype=DOUBLE)[:, None]
+    slope = torch.func.vmap(torch.func.jacrev(lambda x: FLOWS[name](x[None])[0]))(place)
+    assert float(slope.abs().max()) > 0.1
+    assert float(torch.einsum("nii->n", slope).abs().max()) < 1e-12
+    assert float((slope - slope.mT).abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_far_away_and_inside(name):
+    far = 1e4 * (_directions() + torch.tensor([2.0, 0.0, 0.0]))
+    torch.testing.assert_close(FLOWS[name](far), FLOW.expand(40, 3), rtol=0, atol=1e-6)
+    assert float(FLOWS[name](0.1 * _directions()).abs().max()) == 0.0
+
+
+def test_closed_forms():
+    """Lamb: 1.5 times the flow at the side of a sphere, twice it at that of a cylinder, at rest in front."""
+    x, y = torch.eye(3, dtype=DOUBLE)[:2]
+    torch.testing.assert_close(sphere_flow(x, 1.0 * y, 1.0), 1.5 * x)
+    torch.testing.assert_close(sphere_flow(x, -1.0 * x, 1.0), 0 * x)
+    torch.testing.assert_close(sphere_flow(x, -2.0 * x, 1.0), (1 - 1 / 8) * x)
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
+    torch.testing.assert_close(cylinder_flow(x + z, 1.0 * y, z, 1.0), 2 * x + z)
+    torch.testing.assert_close(cylinder_flow(x + z, -2.0 * x, z, 1.0), 0.75 * x + z)
+
+
+def test_ellipsoids_become_spheres_and_cylinders():
+    place = 1.2 * _directions()
+    torch.testing.assert_close(
+        ellipsoid_flow(FLOW, place, (0.8,) * 3), sphere_flow(FLOW, place, 0.8), rtol=0, atol=1e-13
+    )
+    z = torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE)
+    long = ellipsoid_flow(FLOW, place, (0.8, 0.8, 8e5))
+    torch.testing.assert_close(long, cylinder_flow(FLOW, place, z, 0.8), rtol=0, atol=1e-9)
+
+
+def test_the_side_of_a_spheroid():
+    """Lamb 104: virtual mass of a prolate spheroid along its axis; the flow at its side is 1 + k times the wind."""
+    e = math.sqrt(1 - 0.25)
+    alpha = 2 * (1 - e * e) / e**3 * (0.5 * math.log((1 + e) / (1 - e)) - e)
+    k = alpha / (2 - alpha)
+    found = ellipsoid_flow(
+        torch.tensor([1.0, 0, 0]).double(), torch.tensor([[0.0, 0.5 + 1e-13, 0.0]]).double(), (1, 0.5, 0.5)
+    )
+    assert found[0].tolist() == pytest.approx([1 + k, 0.0, 0.0], abs=1e-11)
+
+
+def test_carlsons_integral():
+    """Values of the paper, and scaling."""
+    x, y, z = (torch.tensor(v, dtype=DOUBLE) for v in (1e-300, 2.0, 1.0))
+    assert float(carlson_rd(x, y, z)) == pytest.approx(1.7972103521033883, rel=1e-12)
+    x, y, z = (torch.tensor(v, dtype=DOUBLE) for v in (2.0, 3.0, 4.0))
+    assert float(carlson_rd(x, y, z)) == pytest.approx(0.16510527294261053, rel=1e-13)
+    torch.testing.assert_close(carlson_rd(4 * x, 4 * y, 4 * z), carlson_rd(x, y, z) / 8)
+
+
+def test_wakes_take_the_momentum_of_the_drag():
+    """The integral of u (U - u) is half of C_D times the width, or the disc, wherever the wake is developed."""
+    y = torch.linspace(-40, 40, 400001, dtype=DOUBLE)
+    for behind in (10.0, 40.0, 100.0):
+        share = plane_wake(torch.full_like(y, behind), y, 0.5, 1.2)
+        assert float(torch.trapezoid(share * (1 - share), y)) == pytest.approx(0.5 * 1.2 * 0.5, rel=1e-6)
+        r = y[200000:]
+        share = round_wake(torch.full_like(r, behind), r, 0.5, 0.47)
+        lost = float(torch.trapezoid(2 * math.pi * r * share * (1 - share), r))
+        assert lost == pytest.approx(0.5 * 0.47 * math.pi * 0.25**2, rel=1e-6)
+    for wake in (lambda x: plane_wake(x, 0 * x, 0.5, 1.2), lambda x: round_wake(x, 0 * x, 0.5, 0.47)):
+        share = wake(torch.linspace(-3, 60, 500, dtype=DOUBLE))
+        assert float(share[:20].abs().max()) == 0.0
+        assert 0.3 < float(share.max()) < 1
+        assert bool((share[100:].diff() < 0).all())
+
+
+def test_a_street_has_its_strouhal_number_and_no_mean():
+    """The lift side of a pole of 0.1 m in 5 m/s sees vortices of each side at 0.2 x 5 / 0.1 = 10 per second."""
+    pole = CylinderObstacle([0.0, 0.0, 0.0], 0.05, strouhal=0.2)
+    wind = WindField([3.0, 4.0, 0.0], effects=[pole])
+    direction = torch.tensor([0.6, 0.8, 0.0], dtype=DOUBLE)
+    left = torch.tensor([-0.8, 0.6, 0.0], dtype=DOUBLE)
+    place = (0.6 * direction)[None]
+    times = torch.arange(2000, dtype=DOUBLE) / 500
+    series = torch.stack([wind.at(t, place)[0] for t in times])
+    across = series @ left
+    power = torch.fft.rfft(across).abs()
+    assert float(torch.fft.rfftfreq(2000, 1 / 500)[int(power[1:].argmax()) + 1]) == pytest.approx(10.0, abs=0.26)
+    assert float(across.mean().abs()) < 1e-3 * float(across.std())
+    assert 0.3 < float(across.std()) < 2.5  # a tenth to a half of the wind
+    along = (series @ direction).mean()
+    calm = CylinderObstacle([0.0, 0.0, 0.0], 0.05, street=False)
+    still = WindField([3.0, 4.0, 0.0], effects=[calm]).at(times[0], place)[0] @ direction
+    assert float(along) == pytest.approx(float(still), abs=0.02)
+
+
+def test_a_street_drifts_and_has_no_divergence_where_it_does_not_fade():
+    def found(x, turns=0.0):
+        return vortex_street(x[0], x[1], 1e-3, torch.tensor(turns, dtype=DOUBLE), 0.2) * torch.exp(x[0] / 0.03)
+
+    for x in (torch.tensor([0.0213, 3e-4], dtype=DOUBLE), torch.tensor([0.0224, -2e-3], dtype=DOUBLE)):
+        slope = torch.func.jacrev(found)(x)
+        assert float(slope[0, 0] + slope[1, 1]) == pytest.approx(0.0, abs=1e-9 * float(slope.abs().max()))
+        length = STREET_SPEED * 1e-3 / 0.2
+        torch.testing.assert_close(found(x + torch.tensor([0.3 * length, 0.0]), 0.3), found(x))
+
+
+@pytest.mark.parametrize("turn", [0.0, 30.0])
+def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
+    """Scaled by two, turned by a quarter about x and moved."""
+    rotation = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], dtype=DOUBLE)
+    frame = SimFrame(torch.tensor([1.0, 2.0, 3.0], dtype=DOUBLE), rotation, 2.0)
+    scene = torch.tensor([[1.9, 2.6, 3.2], [0.4, 1.2, 2.4]], dtype=DOUBLE)
+    flow = torch.tensor([1.0, 0.3, -0.2], dtype=DOUBLE)
+    here, there = Moment(flow[0], flow, flow), Moment(flow[0], flow @ rotation.T, 2 * flow @ rotation.T)
+    for obstacle in (
+        SphereObstacle([1.0, 2.5, 3.0], 0.4),
+        CylinderObstacle([1.0, 2.5, 3.0], 0.4, axis=[0.0, 1.0, 1.0]),
+        EllipsoidObstacle([1.0, 2.5, 3.0], [0.2, 0.5, 0.4], turn=turn, drag=0.0),
+    ):
+        expected = obstacle(flow, scene, here)
+        moved = obstacle.in_frame(frame)
+        found = moved(flow @ rotation.T, frame.point_to_sim(scene), there) @ rotation
+        torch.testing.assert_close(found, expected)
+        assert float((expected - flow).abs().max()) > 0.05
+        assert torch.equal(obstacle.middle, torch.tensor([1.0, 2.5, 3.0], dtype=DOUBLE))
+
+
+def test_a_wall_shelters_what_is_behind_it():
+    wall = EllipsoidObstacle([0.0, 0.0, 0.0], [0.1, 1.0, 0.8], drag=0.9)
+    wind = WindField([4.0, 0.0, 0.0], effects=[wall])
+    place = torch.tensor([[-5.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 4.0, 0.0], [0.0, 1.1, 0.0]])
+    front, behind, aside, edge = wind.at(torch.zeros((), dtype=DOUBLE), place)[:, 0].tolist()
+    assert front == pytest.approx(4.0, rel=0.05)
+    assert behind < 2.2
+    assert aside == pytest.approx(4.0, rel=0.1)
+    assert edge > 5.0
+
+
+def test_still_air_stays_still():
+    for obstacle in (
+        SphereObstacle([0.0] * 3, 0.5),
+        CylinderObstacle([0.0] * 3, 0.5),
+        EllipsoidObstacle([0.0] * 3, [1, 1, 2]),
+    ):
+        wind = WindField([0.0, 0.0, 0.0], effects=[obstacle])
+        found = wind.at(torch.tensor(1.0, dtype=DOUBLE), 2 * _directions())
+        assert torch.equal(found, torch.zeros_like(found))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: SphereObstacle([0.0] * 3, -1.0), "`radius` to be positive"),
+        (lambda: SphereObstacle([0.0] * 3, 1.0, drag=1.2), "`drag` of a sphere to be below 1"),
+        (lambda: CylinderObstacle([0.0] * 3, 1.0, axis=[0.0] * 3), "`axis` to have a direction"),
+        (lambda: EllipsoidObstacle([0.0] * 3, [1.0, 2.0]), "`radii` to have 3 numbers"),
+    ],
+)
+def test_impossible_obstacles_are_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()

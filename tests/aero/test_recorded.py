@@ -1,0 +1,232 @@
+"""Winds from files: what is read, and that a file that does not fit is refused with a sentence."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.aero.effects import Moment
+from gaussian_swaying.aero.recorded import FrozenWind, RecordedWind
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_files import read_anemometer, read_bts, read_grid
+from gaussian_swaying.geometry.frame import SimFrame
+
+DOUBLE = torch.float64
+
+
+def _at(time):
+    return torch.tensor(time, dtype=DOUBLE)
+
+
+def _linear(t, x, y, z):
+    """Linear in time and place, so that interpolation is exact."""
+    return np.stack([t + 2 * x + 0 * y + 0 * z, y - x + 0 * z, 3 * z - t + 0 * x * y], axis=-1)
+
+
+AXES = {
+    "time": np.array([5.0, 6.0, 8.0]),
+    "x": np.linspace(-1, 2, 4),
+    "y": np.linspace(0, 1, 3),
+    "z": np.array([0, 2.0]),
+}
+
+
+def _npz(path, **changes):
+    t, x, y, z = np.meshgrid(*AXES.values(), indexing="ij")
+    np.savez(path, **(AXES | {"velocity": _linear(t, x, y, z)} | changes))
+    return path
+
+
+def test_a_recorded_wind_is_exact_where_it_is_linear(tmp_path):
+    wind = WindField(effects=[RecordedWind(_npz(tmp_path / "w.npz"), origin=[10.0, 0.0, 0.0])])
+    place = torch.tensor([[10.3, 0.2, 1.7], [9.1, 0.9, 0.1]], dtype=DOUBLE)
+    for time in (0.0, 0.4, 1.0, 2.5, 3.0):
+        x, y, z = (place - torch.tensor([10.0, 0.0, 0.0])).unbind(-1)
+        expected = _linear(5 + time, x.numpy(), y.numpy(), z.numpy())
+        np.testing.assert_allclose(wind.at(_at(time), place).numpy(), expected, atol=2e-6)  # the table is float32
+    held = wind.at(_at(100.0), place)
+    torch.testing.assert_close(held, wind.at(_at(3.0), place))
+    outside = wind.at(_at(1.0), torch.tensor([[50.0, -7.0, 9.0]], dtype=DOUBLE))
+    np.testing.assert_allclose(outside[0].numpy(), _linear(6.0, 2.0, 0.0, 2.0), atol=2e-6)
+
+
+def test_a_recorded_wind_repeats(tmp_path):
+    """After the last time the first follows, after a mean step."""
+    effect = RecordedWind(_npz(tmp_path / "w.npz"), repeat=True, start=6.0)
+    wind = WindField(effects=[effect])
+    place = torch.tensor([[0.3, 0.2, 1.7]], dtype=DOUBLE)
+    assert effect.period == pytest.approx(4.5)
+    torch.testing.assert_close(wind.at(_at(0.7 + 4.5), place), wind.at(_at(0.7), place))
+    between = wind.at(_at(2.75), place)  # 8.75: in the middle of the last step
+    torch.testing.assert_close(between, 0.5 * (wind.at(_at(2.0), place) + wind.at(_at(3.5), place)))
+
+
+def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path):
+    frame = SimFrame(torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 2.0)
+    moved = RecordedWind(_npz(tmp_path / "w.npz"), origin=[2.0, 0.5, 0.0]).in_frame(frame)
+    moment = Moment(_at(0.0), _at([0.0] * 3), _at([0.0] * 3))
+    found = moved(torch.zeros(3), torch.tensor([[2.5, 1.2, 0.4]], dtype=DOUBLE), moment)
+    np.testing.assert_allclose(found[0].numpy(), _linear(5.0, 0.5, 0.2, 0.4), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"x": np.array([0.0, 1.0, 2.0, 4.0])}, "`x` in .* to rise in equal steps"),
+        ({"x": np.linspace(2, -1, 4)}, "`x` in .* to rise in equal steps"),
+        ({"time": np.array([1.0, 0.0, 2.0])}, "`time` in .* to rise"),
+        ({"y": np.linspace(0, 1, 4)}, r"shape \(3, 4, 3, 2, 3\), but its axes .* need \(3, 4, 4, 2, 3\)"),
+        ({"velocity": np.full((3, 4, 3, 2, 3), np.nan)}, "216 velocities"),
+        ({"units": "knots"}, "`velocity` in .* is in 'knots', not in m/s"),
+    ],
+)
+def test_a_grid_that_does_not_fit_is_refused(tmp_path, changes, words):
+    with pytest.raises(ValueError, match=words):
+        read_grid(_npz(tmp_path / "w.npz", **changes))
+
+
+def test_other_files_are_refused(tmp_path):
+    (tmp_path / "w.txt").write_text("wind")
+    with pytest.raises(ValueError, match=r"give a \.npz, \.nc or \.bts file"):
+        read_grid(tmp_path / "w.txt")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        read_grid(tmp_path / "none.npz")
+    np.savez(tmp_path / "empty.npz", x=np.zeros(2))
+    with pytest.raises(ValueError, match="has no array `y`"):
+        read_grid(tmp_path / "empty.npz")
+    with pytest.raises(ValueError, match="changes over time: use RecordedWind"):
+        FrozenWind(_npz(tmp_path / "w.npz"))
+
+
+@pytest.mark.parametrize("engine", ["netCDF4", "scipy.io"])
+def test_netcdf(tmp_path, engine, monkeypatch):
+    """One variable for each component, with its axes in another order and with units."""
+    module = pytest.importorskip(engine)
+    t, x, y, z = np.meshgrid(*AXES.values(), indexing="ij")
+    velocity = _linear(t, x, y, z)
+
+    def write(path, units):
+        if engine == "netCDF4":
+            file = module.Dataset(path, "w")
+        else:
+            monkeypatch.setitem(__import__("sys").modules, "netCDF4", None)
+            file = module.netcdf_file(path, "w")
+        for name, axis in AXES.items():
+            file.createDimension(name, len(axis))
+            variable = file.createVariable(name, "f8", (name,))
+            variable[:] = axis
+            variable.units = "seconds since 2020-01-01" if name == "time" else units
+        for number, name in enumerate("uvw"):
+            variable = file.createVariable(name, "f8", ("time", "z", "y", "x"))
+            variable[:] = velocity[..., number].transpose(0, 3, 2, 1)
+            variable.units = "m s-1"
+        file.close()
+        return path
+
+    found = read_grid(write(tmp_path / "w.nc", "m"))
+    np.testing.assert_allclose(found.velocity, velocity, rtol=1e-6)
+    np.testing.assert_allclose(found.times, AXES["time"])
+    with pytest.raises(ValueError, match=r"`x` in .* is in .km., not in m"):
+        read_grid(write(tmp_path / "km.nc", "km"))
+
+
+def test_without_a_reader_netcdf_names_the_extra(tmp_path, monkeypatch):
+    for name in ("netCDF4", "scipy.io"):
+        monkeypatch.setitem(__import__("sys").modules, name, None)
+    (tmp_path / "w.nc").write_bytes(b"CDF")
+    with pytest.raises(ValueError, match=r"install gaussian-swaying\[netcdf\]"):
+        read_grid(tmp_path / "w.nc")
+
+
+def test_a_box_of_hipersim(tmp_path):
+    mann = pytest.importorskip("hipersim.mann_turbulence", reason="needs hipersim")
+    pytest.importorskip("netCDF4")
+    box = mann.MannTurbulenceField.generate(Nxyz=(16, 8, 4), dxyz=(2.0, 3.0, 4.0), double_xyz=(False,) * 3)
+    box.to_netcdf(str(tmp_path), "box.nc")
+    effect = FrozenWind(tmp_path / "box.nc", scale=0.5)
+    wind = WindField([0.0, 5.0, 0.0], effects=[effect])  # its x axis is our y, its y is our -x
+    middle = 0.5 * 7 * 3.0
+    place = torch.tensor([[middle - 2 * 3.0, 4 * 2.0, 3 * 4.0]], dtype=DOUBLE)
+    u, v, w = box.uvw[:, 4, 2, 3]
+    found = wind.at(_at(0.0), place)[0]
+    np.testing.assert_allclose(found.numpy(), [-0.5 * v, 5 + 0.5 * u, 0.5 * w], atol=1e-5)
+
+
+def _bts(path, kind=8, cut=0, **changes):
+    """A file of TurbSim with 4 times, 3 points across and 2 up."""
+    nt, ny, nz = 4, 3, 2
+    values = {"dz": 2.0, "dy": 1.0, "dt": 0.5, "speed": 8.0, "hub": 10.0, "bottom": 9.0} | changes
+    velocity = np.random.default_rng(0).normal([8.0, 0.0, 0.0], 1.0, (nt, ny, nz, 3))
+    slope, shift = np.array([2000.0, 4000.0, 4000.0]), np.array([-16000.0, 10.0, -20.0])
+    raw = np.rint(velocity * slope + shift).astype("<i2")
+    words = b"made by a test"
+    head = struct.pack("<h4i6f", kind, nz, ny, 1, nt, *values.values())
+    head += np.stack([slope, shift], 1).astype("<f4").tobytes() + struct.pack("<i", len(words)) + words
+    body = b"".join(raw[t].transpose(1, 0, 2).tobytes() + bytes(6) for t in range(nt))
+    data = head + body
+    path.write_bytes(data[: len(data) - cut])
+    return path, velocity
+
+
+def test_a_file_of_turbsim(tmp_path):
+    path, velocity = _bts(tmp_path / "w.bts")
+    found = read_bts(path)
+    np.testing.assert_allclose(found.velocity, velocity, atol=0.51 / 2000)
+    assert (found.dt, found.speed, found.hub, found.bottom, found.periodic) == (0.5, 8.0, 10.0, 9.0, True)
+    assert found.spacing == (1.0, 2.0)
+
+
+def test_planes_of_turbsim_pass_one_after_the_other(tmp_path):
+    path, velocity = _bts(tmp_path / "w.bts")
+    wind = WindField([0.0, -8.0, 0.0], effects=[FrozenWind(path, origin=[1.0, 2.0, 3.0])])
+    for time in range(6):
+        # one metre to the left of the flow, -y, is +x; 11 m above the ground
+        found = wind.at(_at(0.5 * time), torch.tensor([[2.0, 2.0, 14.0]], dtype=DOUBLE))[0]
+        u, v, w = velocity[time % 4, 2, 1]
+        np.testing.assert_allclose(found.numpy(), [v, -u, w], atol=1e-3)
+
+
+def test_turbsim_checks_its_wind(tmp_path):
+    path, _ = _bts(tmp_path / "w.bts")
+    with pytest.raises(ValueError, match=r"is 8 m/s, but `wind.flow` has 6 m/s: set it to 8 m/s"):
+        WindField([6.0, 0.0, 0.0], effects=[FrozenWind(path)])
+    for changes, words in (({"cut": 2}, "is damaged"), ({"dt": 0.0}, "is damaged"), ({"kind": 3}, "not a full-field")):
+        path, _ = _bts(tmp_path / "bad.bts", **changes)
+        with pytest.raises(ValueError, match=words):
+            read_bts(path)
+
+
+def _csv(path, text):
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_an_anemometer(tmp_path):
+    path = _csv(tmp_path / "a.csv", "time [s],u [m/s],v (m/s),note\n0,1,2,a\n\n2.0,3,-2,b\n")
+    wind = WindField(schedule=path)
+    torch.testing.assert_close(wind(1.0), torch.tensor([2.0, 0.0, 0.0], dtype=DOUBLE))
+    torch.testing.assert_close(wind(9.0), torch.tensor([3.0, -2.0, 0.0], dtype=DOUBLE))
+    times, flows = read_anemometer(_csv(tmp_path / "b.csv", "Direction [deg],Speed,time\n270,4,0\n360,2,1\n45,1,2\n"))
+    assert times == [0.0, 1.0, 2.0]
+    root = math.sqrt(0.5)  # from the west, north and north-east
+    np.testing.assert_allclose(flows, [[4, 0, 0], [0, -2, 0], [-root, -root, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,u [km/h],v\n0,1,2\n", r"`u` in .* is in 'km/h', not in m/s"),
+        ("time [ms],u,v\n0,1,2\n", r"`time` in .* is in 'ms', not in s"),
+        ("u,v\n1,2\n", r"has no column `time \[s\]`"),
+        ("time,speed\n1,2\n", r"has no column `direction \[deg\]`"),
+        ("time,u,v\n0,1,2\n1,,2\n", "Line 3 of .* has no number"),
+        ("time,u,v\n0,1,nan\n", "Line 2 of .* has no number"),
+        ("time,u,v\n", "has no measurements"),
+        ("time,u,v\n1,1,1\n0,1,1\n", "times of `schedule` to increase"),
+    ],
+)
+def test_an_anemometer_that_does_not_fit_is_refused(tmp_path, text, words):
+    with pytest.raises(ValueError, match=words):
+        WindField(schedule=_csv(tmp_path / "a.csv", text))

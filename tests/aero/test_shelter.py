@@ -1,0 +1,123 @@
+"""The wind inside a body against the exponential law."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.effects import Moment
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.shelter import Shelter, deposited, extinction, wind_axes
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+DOUBLE = torch.float64
+
+
+def _slab(depth, drag, direction, cells=32):
+    """A slab of leaves that all face the wind, 1 m deep and 0.8 m wide, of an optical depth; and its particles."""
+    side = 40
+    axis = (torch.arange(side, dtype=DOUBLE) + 0.5) / side
+    place = torch.cartesian_prod(axis, axis, axis) * torch.tensor([1.0, 0.8, 0.8])
+    axes = wind_axes(direction)
+    place = place @ axes
+    area = 2 * depth / drag * 0.64 / len(place)  # exp(-depth) behind: a half of C_D A per cross section
+    points = MaterialPoints.create(place, volume=1e-6, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    solver = MPMSolver(dx=0.2, transfer="torch")
+    wind = WindField((5 * direction).tolist(), effects=[Shelter(cells)])
+    normal = axes[0].expand(len(place), 3)
+    aero = AeroForce(C_D=drag, C_F=0.0, C_L=0.0, law="projected")
+    load = WindForce(aero, wind, normal, torch.full((len(place),), area, dtype=DOUBLE))
+    state = solver.init_state(points, torch.ones_like(place))  # however it moves
+    load.refresh(state)
+    return load, state, axes
+
+
+@pytest.mark.parametrize("depth", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, -0.64, 0.48]])
+def test_a_slab_of_leaves_follows_the_exponential_law(depth, direction):
+    """Within 3 % of the undisturbed wind, two cells or more from its sides, and exactly behind it."""
+    load, state, axes = _slab(depth, 1.3, torch.tensor(direction, dtype=DOUBLE))
+    along = torch.linspace(-0.3, 1.3, 33, dtype=DOUBLE)
+    line = torch.stack([along, torch.full_like(along, 0.37), torch.full_like(along, 0.43)], dim=-1) @ axes
+    air = load.wind.at(state.time, line)
+    torch.testing.assert_close(air - (air @ axes[0])[:, None] * axes[0], torch.zeros_like(air), rtol=0, atol=1e-12)
+    share = (air @ axes[0]) / 5
+    expected = torch.exp(-depth * along.clamp(0, 1))
+    assert float((share - expected).abs().max()) < 0.03
+    assert float(share[:6].min()) == pytest.approx(1.0, abs=1e-12)
+    assert float(share[-1]) == pytest.approx(math.exp(-depth), rel=0.03)
+
+
+def test_the_drag_area_is_that_of_the_force():
+    """Leaves edge-on take nothing with the projected law, and the wake of twice the leaves is the square."""
+    direction = torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE)
+    load, state, _ = _slab(0.7, 1.0, direction)
+    behind = torch.tensor([[1.2, 0.4, 0.4]], dtype=DOUBLE)
+    once = float(load.wind.at(state.time, behind)[0, 0]) / 5
+    load.wind.effects[0].strength = 2.0
+    load.refresh(state)
+    assert float(load.wind.at(state.time, behind)[0, 0]) / 5 == pytest.approx(once**2, rel=1e-6)
+    load.normal = torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE).expand_as(load.normal)
+    load.refresh(state)
+    torch.testing.assert_close(load.wind.at(state.time, behind)[0, 0], torch.tensor(5.0, dtype=DOUBLE))
+
+
+def test_the_wake_follows_the_body_and_the_wind():
+    load, state, _ = _slab(1.0, 1.0, torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE))
+    behind, beside = ([[1.2, 0.4, 0.4]], [[0.5, 1.2, 0.4]])
+    moved = state.replace(position=state.position + torch.tensor([0.0, 0.0, 5.0]))
+    load.refresh(moved)
+    assert float(load.wind.at(state.time, torch.tensor(behind, dtype=DOUBLE))[0].norm()) == pytest.approx(5.0)
+    load.wind.flows = torch.tensor([[0.0, 5.0, 0.0]], dtype=DOUBLE)
+    load.normal = torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE).expand_as(load.normal)
+    load.refresh(state)
+    assert float(load.wind.at(state.time, torch.tensor(behind, dtype=DOUBLE))[0].norm()) == pytest.approx(5.0)
+    assert float(load.wind.at(state.time, torch.tensor(beside, dtype=DOUBLE))[0].norm()) < 3.2
+    load.wind.flows = torch.zeros(1, 3, dtype=DOUBLE)
+    load.refresh(state)
+    assert float((load.wind.effects[0].table - 1).abs().max()) == 0.0
+
+
+def test_deposits_are_shared_and_do_not_depend_on_the_order():
+    draw = torch.Generator().manual_seed(0)
+    place = 5 * torch.rand(5000, 3, generator=draw)
+    amount = torch.rand(5000, generator=draw)
+    found = deposited(place, amount, 6)
+    assert float(found.double().sum()) == pytest.approx(float(amount.double().sum()), rel=1e-5)
+    order = torch.randperm(5000, generator=draw)
+    assert torch.equal(found, deposited(place[order], amount[order], 6))
+    single = deposited(torch.tensor([[1.25, 2.0, 4.0]]), torch.tensor([8.0]), 6)
+    assert single[1, 2, 4] == 6.0
+    assert single[2, 2, 4] == 2.0
+    assert float(deposited(place, torch.zeros(5000), 6).abs().max()) == 0.0
+
+
+def test_extinction_is_the_trapezoidal_sum():
+    density = torch.tensor([1.0, 3.0, 0.0, 2.0], dtype=DOUBLE).reshape(4, 1, 1)
+    depth = 0.5 * torch.tensor([0.5, 2.5, 4.0, 5.0], dtype=DOUBLE)  # spacing 1
+    torch.testing.assert_close(extinction(density, torch.tensor(1.0)).flatten(), torch.exp(-depth))
+
+
+def test_axes_of_a_wind():
+    for flow in ([0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, -2.0, 0.3]):
+        flow = torch.tensor(flow, dtype=DOUBLE)
+        axes = wind_axes(flow)
+        torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=DOUBLE))
+        if float(flow.norm()) > 0:
+            torch.testing.assert_close(axes[0], flow / flow.norm())
+
+
+@pytest.mark.parametrize("cells", [3, 300, 8.0, True])
+def test_impossible_grids_are_refused(cells):
+    with pytest.raises(ValueError, match="`cells` to be a whole number from 4 to 256"):
+        Shelter(cells)
+
+
+def test_a_shelter_that_was_not_refreshed_changes_nothing():
+    velocity = torch.tensor([[1.0, 2.0, 3.0]])
+    still = torch.zeros(3, dtype=DOUBLE)
+    found = Shelter(4)(velocity, torch.rand(5, 3), Moment(still[0], still, still))
+    torch.testing.assert_close(found, velocity.expand(5, 3))

@@ -1,0 +1,56 @@
+"""Lines over all directions, and the area of a convex hull from the shadows that it throws."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.directions import axes_across, hull_area, spread_lines
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+
+
+def test_lines_are_spread_evenly():
+    """The second moment of directions is a third of the identity; a spiral of n points has it up to about 1 / n."""
+    lines = spread_lines(100)
+    torch.testing.assert_close(lines.norm(dim=-1), torch.ones(100, dtype=torch.float64))
+    torch.testing.assert_close(lines.mT @ lines / 100, torch.eye(3, dtype=torch.float64) / 3, rtol=0, atol=0.01)
+    assert float(lines[:, 2].min()) > 0
+
+
+def test_axes_across_make_a_right_handed_frame():
+    lines = torch.cat([spread_lines(50), torch.eye(3, dtype=torch.float64)])
+    first, second = axes_across(lines)
+    frame = torch.stack([first, second, lines], dim=-1)
+    torch.testing.assert_close(frame.mT @ frame, torch.eye(3, dtype=torch.float64).expand(53, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(frame), torch.ones(53, dtype=torch.float64))
+
+
+def test_hull_of_a_box_a_ball_and_a_sheet():
+    """Exact up to the outline with 128 sides and 100 directions: a percent."""
+    rotation, scale = quat_to_rotation(torch.nn.functional.normalize(torch.randn(4, dtype=torch.float64), dim=0)), 30.0
+    box = torch.rand(5000, 3, dtype=torch.float64)
+    corners = torch.cartesian_prod(*(torch.tensor([0.0, 1.0], dtype=torch.float64),) * 3)
+    sides = torch.tensor([1.0, 0.5, 0.2], dtype=torch.float64)
+    found = hull_area(torch.cat([box, corners]) * sides @ rotation.mT * scale + 100)
+    assert found == pytest.approx(2 * (0.5 + 0.2 + 0.1) * scale**2, rel=0.01)
+    ball = torch.nn.functional.normalize(torch.randn(20_000, 3, dtype=torch.float64), dim=-1)
+    assert hull_area(ball) == pytest.approx(4 * math.pi, rel=0.01)
+    assert hull_area(corners * torch.tensor([1.0, 1.0, 0.0])) == pytest.approx(2.0, rel=0.01)
+
+
+def test_hull_of_a_body_with_holes_is_that_of_its_corners():
+    ring = torch.nn.functional.normalize(torch.randn(5000, 3, dtype=torch.float64)[:, :2], dim=-1)
+    flat = torch.nn.functional.pad(ring, (0, 1))
+    assert hull_area(flat) == pytest.approx(2 * math.pi, rel=0.01)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_hull_of_few_points_has_no_area(count):
+    assert hull_area(torch.rand(count, 3)) == 0.0
+
+
+def test_hull_rejects_bad_points():
+    with pytest.raises(ValueError, match=r"Expected `points` of shape .* but got"):
+        hull_area(torch.zeros(5, 2))
+    with pytest.raises(ValueError, match="Expected `points` to be finite"):
+        hull_area(torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [math.nan, 1.0, 0.0]]))

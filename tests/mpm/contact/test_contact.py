@@ -1,0 +1,280 @@
+"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
+from gaussian_swaying.mpm.contact.pairs import close_pairs
+from gaussian_swaying.mpm.contact.solve import Constraints, Rows, pair_gaps, resolve
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.validation.contacts import crossings, gaps, sheet_triangles
+
+THICKNESS = 0.01
+GROUND = [0.0, 0.0, -0.005], [0.0, 0.0, 1.0]
+
+
+def _two(sheet, speed, angle=0.0, dtype=torch.float64):
+    """A sheet that flies onto a larger one, and the triangles of both."""
+    below, above = sheet(16, 16, dtype=dtype), sheet(10, 10, (0.053, 0.047, 0.13), dtype=dtype)
+    points = MaterialPoints.join([below, above])
+    velocity = torch.zeros_like(points.position)
+    velocity[below.count :] = speed * torch.tensor([angle, 0.0, -1.0], dtype=dtype)
+    return points, velocity, torch.cat([sheet_triangles(16, 16), sheet_triangles(10, 10, below.count)])
+
+
+@pytest.mark.parametrize("speed", [2.0, 50.0])
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_sheets_that_collide_do_not_pass_each_other(sheet, scene, march, speed, friction):
+    """At 50 m/s a substep would carry them five thicknesses. Momentum stays to round-off, energy does not grow."""
+    points, velocity, triangles = _two(sheet, speed, 0.3)
+    solver, state = scene(points, Contact(friction=friction), velocity=velocity, gravity=(0, 0, 0))
+    before, momentum = solver.energies(state), solver.momenta(state)["linear"]
+    shares = []
+    for later in march(solver, state, 0.6 / speed, frame=0.02 / speed):
+        assert crossings(later.position, triangles) == 0
+        shares.append(gaps(solver.bound.contact, later))
+        energy = solver.energies(later)
+        assert float(energy["kinetic"] + energy["elastic"]) < (1 + 1e-3) * float(before["kinetic"])
+    found = torch.cat(shares)
+    assert len(found) > 500  # they touched
+    assert float((found < 0.5).double().mean()) <= 1e-3
+    after = solver.momenta(later)["linear"]
+    torch.testing.assert_close(after, momentum, rtol=0, atol=1e-14 * speed)
+    if friction == 0:  # without friction nothing but the tilt of the sheets pulls sideways
+        assert float(later.velocity[points.count - 100 :, 0].mean()) > 0.7 * 0.3 * speed
+
+
+def test_without_contact_they_do_pass(sheet, scene, march):
+    """The same collision without contact: the test above can fail."""
+    points, velocity, triangles = _two(sheet, 2.0)
+    solver, state = scene(points, None, velocity=velocity, gravity=(0, 0, 0))
+    assert solver.bound.contact is None  # off costs nothing
+    crossed = [crossings(later.position, triangles) for later in march(solver, state, 0.09)]
+    assert float(state.position[-100:, 2].mean()) > 0 > float(march(solver, state, 0.09)[-1].position[-100:, 2].mean())
+    assert crossed[0] == 0
+
+
+def test_a_strip_that_falls_folds_and_does_not_cross_itself(sheet, scene, march):
+    """Upright on the ground, with a slight bend, it buckles into layers of one sheet."""
+    points = sheet(40, 8, axes=(2, 1), youngs_modulus=5e3)
+    solver, state = scene(
+        points,
+        Contact(),
+        [HalfSpaceObstacle(*GROUND)],
+        velocity=torch.stack([torch.sin(9 * points.position[:, 2]), 0 * points.mass, 0 * points.mass], -1) * 0.3,
+        normal=(1.0, 0.0, 0.0),
+        stiffness_damping=1e-3,
+    )
+    triangles, found = sheet_triangles(40, 8), []
+    for later in march(solver, state, 0.8, frame=0.02):
+        found.append(gaps(solver.bound.contact, later))
+        assert crossings(later.position, triangles) == 0
+    found = torch.cat(found)
+    assert len(found) > 500
+    assert float((found < 0.5).double().mean()) <= 1e-3
+
+
+def _pile(sheet, scene, layers, gap, gravity, per_side=8, **settings):
+    """Layers on the ground, above each other; at rest they are far apart, so that they share no nodes."""
+    apart = 0.2
+    parts = [sheet(per_side, per_side, (0.003 * (k % 3), 0.002 * (k % 2), apart * k)) for k in range(layers)]
+    solver, state = scene(
+        MaterialPoints.join(parts),
+        Contact(),
+        [HalfSpaceObstacle(*GROUND)],
+        gravity=(0, 0, -gravity),
+        **settings,
+    )
+    nodes = state.grid.node_positions(state.position)
+    layer = ((nodes[:, 2] + apart / 2) / apart).floor().clamp(0, layers - 1)
+    moved = torch.zeros_like(nodes)
+    moved[:, 2] = layer * (gap - apart)
+    return solver, solver.bound.read_particles(state, moved, torch.zeros_like(moved))
+
+
+def test_fifty_layers_pressed_together_stay_in_order(sheet, scene, march):
+    """They fall on each other with twice the weight; every layer stays above the one below it, everywhere."""
+    solver, state = _pile(sheet, scene, 50, 1.1 * THICKNESS, 20.0, per_side=6)
+    for later in march(solver, state, 0.15, frame=0.03):
+        height = later.position[:, 2].reshape(50, -1)
+        assert float((height[1:] - height[:-1]).min()) > 0.3 * THICKNESS
+        assert float((gaps(solver.bound.contact, later) < 0.5).double().mean()) <= 1e-3
+
+
+def _rest(sheet, scene, march, seconds):
+    """How the energy of a pile of eight layers changes after it has settled for half a second."""
+    solver, state = _pile(sheet, scene, 8, THICKNESS, 9.8, per_side=5, stiffness_damping=1e-3)
+    settled = march(solver, state, 0.5, frame=0.1)[-1]
+    later = march(solver, settled, seconds, frame=0.1)
+    first = solver.energies(settled)
+    weight = float(solver.points.mass.sum() * 9.8)
+    for end in later:
+        energy = solver.energies(end)
+        assert float(energy["kinetic"]) < 0.02 * weight * THICKNESS  # a few times g dt
+    change = float(energy["potential"] + energy["elastic"] - first["potential"] - first["elastic"])
+    height = settled.position[:, 2].reshape(8, -1).mean(1), end.position[:, 2].reshape(8, -1).mean(1)
+    return change / (weight * THICKNESS), float((height[1] - height[0]).abs().max())
+
+
+def test_a_pile_at_rest_stays_at_rest(sheet, scene, march):
+    """No layer moves by more than 2 % of the thickness; energy grows by no more than 2 % of weight times thickness."""
+    change, moved = _rest(sheet, scene, march, 0.5)
+    assert change < 0.02
+    assert moved < 0.02 * THICKNESS
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_a_pile_rests_for_a_minute(sheet, scene, march):
+    change, moved = _rest(sheet, scene, march, 60.0)
+    assert change < 0.02
+    assert moved < 0.02 * THICKNESS
+
+
+def test_the_lists_do_not_change_the_result(sheet, scene, march):
+    """They are a cache: a solver that has just been made continues from a state as the one that made it."""
+    points, velocity, _ = _two(sheet, 2.0, 0.3)
+    solver, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
+    middle = march(solver, state, 0.07)[-1]
+    known = march(solver, middle, 0.02)[-1]
+    other = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))[0]
+    again = march(other, middle, 0.02)[-1]
+    assert solver.bound.contact.made > other.bound.contact.made > 0
+    torch.testing.assert_close(again.position, known.position, rtol=0, atol=1e-10)
+
+
+def test_gradients_flow_through_a_contact(sheet, scene, march):
+    """Of a few substeps in contact, against a difference in a random direction; no contact begins or ends in them."""
+    points, velocity, _ = _two(sheet, 2.0, 0.3)
+    solver, state = scene(points, Contact(iterations=3), velocity=velocity, gravity=(0, 0, 0))
+    touching = march(solver, state, 0.062, frame=0.002)[-1]
+    ways = [torch.randn_like(touching.node_displacement) for _ in range(2)]
+
+    def result(scale):
+        start = touching.replace(
+            node_displacement=touching.node_displacement + 1e-4 * scale * ways[0],
+            node_velocity=touching.node_velocity + 1e-2 * scale * ways[1],
+        )
+        start = solver.bound.read_particles(start, start.node_displacement, start.node_velocity)
+        end = solver.rollout(start, 1e-4, 3)
+        return (end.velocity * weights).sum()
+
+    weights = torch.randn_like(touching.velocity)
+    at = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(result(at), at)
+    with torch.no_grad():
+        expected = (result(at + 1e-6) - result(at - 1e-6)) / 2e-6
+        free = scene(points, None, velocity=velocity, gravity=(0, 0, 0))[0]
+        apart = free.rollout(touching, 1e-4, 3).velocity
+        assert float((apart - solver.rollout(touching, 1e-4, 3).velocity).abs().max()) > 1e-3  # they touch
+    assert abs(float(slope) - float(expected)) < 1e-5 * abs(float(expected))
+
+
+# ---- the parts
+
+
+def test_close_pairs_are_those_of_brute_force():
+    place = torch.rand(700, 3, dtype=torch.float64) * torch.tensor([1.0, 0.5, 0.2])
+    rest = torch.rand(700, 3, dtype=torch.float64)
+    first, second = close_pairs(place, 0.07, rest, 0.2)
+    near = (torch.cdist(place, place) < 0.07) & (torch.cdist(rest, rest) >= 0.2)
+    expected = near.triu(1).nonzero()
+    assert len(first) > 100
+    assert torch.equal(torch.stack([first, second], -1), expected)
+
+
+def test_close_pairs_in_chunks(monkeypatch):
+    place = torch.rand(500, 3)
+    whole = close_pairs(place, 0.2, 9 * place, 0.0)
+    monkeypatch.setattr("gaussian_swaying.mpm.contact.pairs._CHUNK", 300)
+    parts = close_pairs(place, 0.2, 9 * place, 0.0)
+    assert torch.equal(whole[0], parts[0])
+    assert torch.equal(whole[1], parts[1])
+
+
+def test_close_pairs_of_points_in_one_place_are_refused(monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.mpm.contact.pairs.MOST_PAIRS", 1000)
+    with pytest.raises(ValueError, match="the material has collapsed"):
+        close_pairs(torch.zeros(100, 3), 0.1, torch.rand(100, 3), 0.0)
+    with pytest.raises(FloatingPointError, match="NaN or infinite"):
+        close_pairs(torch.full((3, 3), torch.nan), 0.1, torch.rand(3, 3), 0.0)
+
+
+def test_gaps_of_discs():
+    """Parallel discs: the distance along the normal. An edge above a face: the face's normal, whatever the signs."""
+    up, side = torch.tensor([0.0, 0, 1]), torch.tensor([1.0, 0, 0])
+    arm = torch.tensor([[0.2, 0.1, 0.5], [0.0, 0.1, -0.5], [2.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    first, second = torch.stack([up, side, up, up]), torch.stack([-up, -up, up, up])
+    radius, thickness = torch.full((4,), 0.6), torch.full((4,), 0.1)
+    normal, gap, above = pair_gaps(arm, (first, second), (radius, radius), thickness)
+    torch.testing.assert_close(normal[:2], torch.stack([up, -up]))
+    torch.testing.assert_close(gap[:2], torch.tensor([0.4, 0.4]))
+    assert above.tolist() == [True, True, False, True]
+    assert bool(torch.isfinite(normal).all())  # also for places that coincide
+
+
+def test_lone_and_joint_impulses_are_exact():
+    """A lone place is stopped in one iteration with its own mass, and so is a whole row of them."""
+    nodes = torch.zeros(5, 27, dtype=torch.long)
+    nodes[:4] = torch.arange(4)[:, None]
+    weight = torch.zeros(5, 27, dtype=torch.float64)
+    weight[:4, 0] = 1.0
+    mass = torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
+    rows = Rows(nodes, weight, weight / mass[nodes.clamp(max=3)])
+    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    velocity = torch.tensor([[0.3, 0.0, -1.0]], dtype=torch.float64).repeat(4, 1)
+    for count in (1, 4):
+        held = Constraints(
+            torch.arange(count),
+            torch.full((count,), 4),
+            up.repeat(count, 1),
+            torch.zeros(count, dtype=torch.float64),
+            torch.zeros(count, 3, dtype=torch.float64),
+            torch.full((count,), 0.1, dtype=torch.float64),
+            torch.ones(count, dtype=torch.bool),
+        )
+        after, impulse = resolve(velocity, rows, held, 1e-3, 0.1, 1)
+        torch.testing.assert_close(impulse[:, 2], mass[:count])
+        torch.testing.assert_close(impulse[:, 0], -0.1 * mass[:count])  # sliding: Coulomb's bound
+        torch.testing.assert_close(after[:count, 2], torch.zeros(count, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Contact(thickness=0.0), "`contact.thickness`"),
+        (lambda: Contact(friction=-0.1), "`contact.friction`"),
+        (lambda: Contact(iterations=0), "`contact.iterations`"),
+    ],
+)
+def test_bad_settings_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_contact_needs_normals_and_fixed_neighbours(sheet):
+    points = sheet(4, 4)
+    with pytest.raises(ValueError, match="`normal` and `spacing`"):
+        Surface.of_points(points, contact=Contact())
+    surface = Surface.of_points(points, torch.ones(16, 3), 0.02, 0.01, Contact())
+    with pytest.raises(ValueError, match="leave out `contact`"):
+        MPMSolver(dx=0.05, formulation="updated").init_state(points, surface=surface)
+    astray = replace(surface, read=surface.read + 9.0)
+    with pytest.raises(ValueError, match="outside the material"):
+        MPMSolver(dx=0.05).init_state(points, surface=astray)
+
+
+def test_pins_are_stronger_than_contact(sheet, scene, march):
+    """A sheet held at its corners catches another one; the corners do not move."""
+    points, velocity, _ = _two(sheet, 2.0)
+    corners = [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.3, 0.3, 0.0]]
+    solver, state = scene(points, Contact(), [PinnedPoints(corners)], velocity=velocity)
+    end = march(solver, state, 0.12)[-1]
+    held = torch.tensor([0, 15, 15 * 16, 255])
+    torch.testing.assert_close(end.position[held], points.position[held], rtol=0, atol=1e-9)
+    assert float(end.position[256:, 2].mean()) > float(end.position[:256, 2].min())

@@ -1,0 +1,131 @@
+"""Contact and obstacles in the front door and in a configuration."""
+
+import warnings
+
+import pytest
+import torch
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
+from gaussian_swaying.mpm.contact.surface import Contact
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.scenes.cloths import ClothScene
+from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.touching import still_distance
+
+
+def _ball(contact=None, boundaries=None, **more):
+    """A small cloth above the ball of radius 0.3 m."""
+    scene = Scene(
+        generator=ClothScene("ball", 0.6, 0.03), region=Box([None, None, 0.67], [None, None, 0.69]), metres_per_unit=1.0
+    )
+    given = [BallObstacle([0, 0, 0.35], 0.3)] if boundaries is None else boundaries
+    solver = MPMSolver(dx=0.06, boundaries=given, **more)
+    return Simulation(scene, Material(E=5e3, density=50.0, thickness=0.02), solver, contact=contact, device="cpu")
+
+
+def test_a_cloth_falls_onto_a_ball_and_stays_outside():
+    """In scene units, and the places of the surface are Gaussians: they keep half the thickness."""
+    simulation = _ball(Contact())
+    *_, frame = simulation.frames(10)
+    means = frame.gaussians.means[simulation.scene.simulated]
+    away = (means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) - 0.3
+    assert float(away.min()) > 0.005
+    assert float(away.min()) < 0.02  # it has arrived
+    assert float(means[:, 2].min()) < 0.6  # and hangs down beside it
+
+
+def test_without_obstacles_and_contact_nothing_is_prepared():
+    simulation = _ball(boundaries=[])
+    assert simulation.scene.surface_places is None
+    simulation.start()
+    assert simulation.solver.bound.contact is None
+
+
+def test_gaussians_that_stand_still_are_an_obstacle():
+    """The ball of the splat stops the cloth as the exact one does, to the width of a cell of the distance grid."""
+    simulation = _ball(boundaries=[StillGaussians(cells=48, margin=0.5)])
+    *_, frame = simulation.frames(8)
+    means = frame.gaussians.means[simulation.scene.simulated]
+    away = (means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) - 0.3
+    cell = 1.2 / 48
+    assert -0.5 * cell < float(away.min()) - 0.01 < 1.5 * cell
+
+
+def test_the_distance_from_gaussians_is_that_of_the_ball_that_they_cover():
+    cloud = ClothScene("ball", 0.6, 0.03).generate()
+    ball = cloud.select((cloud.means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) < 0.31)
+    from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+
+    model = GaussianSurfaceModel.from_cloud(ball, requires_grad=False)
+    corner = torch.tensor([0.5, 0.5, 0.5], dtype=torch.float64)
+    centre = torch.tensor([0.0, 0.0, 0.35], dtype=torch.float64)
+    given = (ball.means.double(), model.covariance().double(), model.opacity(), centre - corner, centre + corner)
+    found = still_distance(*given, 50, 0.5)
+    direction = torch.nn.functional.normalize(torch.randn(400, 3, dtype=torch.float64), dim=-1)
+    distance, normal = found.at(centre + 0.34 * direction)
+    assert float((distance - 0.04).abs().max()) < found.spacing  # the Gaussians themselves are some millimetres thick
+    assert float((normal * direction).sum(-1).min()) > 0.9
+    with pytest.raises(ValueError, match=r"nowhere denser than 0\.5"):
+        still_distance(*given[:3], centre + 9, centre + 10, 20, 0.5)
+
+
+def test_gaussians_that_stand_still_need_a_scene():
+    solver = MPMSolver(dx=0.06, boundaries=[StillGaussians()])
+    simulation = _ball(boundaries=[])
+    state = solver.init_state(simulation.scene.points)
+    with pytest.raises(RuntimeError, match="give them to a Simulation"):
+        solver.step(state, 1e-3)
+
+
+def _two_sheets(gap):
+    """Two level sheets above each other."""
+    one = FlagScene(0.4, 0.4, 0.02, ripple=0.0).generate()
+    shift = torch.tensor([0.0, gap, 0.0])
+    fields = ("means", "quats", "scales", "opacities", "sh")
+    both = {name: torch.cat([getattr(one, name)] * 2) for name in fields}
+    both["means"] = torch.cat([one.means, one.means + shift])
+    return GivenScene(GaussianCloud(**both))
+
+
+@pytest.mark.parametrize(("gap", "warned"), [(0.012, True), (0.05, False)])
+def test_surfaces_that_start_too_close_are_warned_of(gap, warned):
+    scene = Scene(generator=_two_sheets(gap), metres_per_unit=1.0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Simulation(scene, Material(thickness=0.02), MPMSolver(dx=0.04), contact=Contact(), device="cpu")
+    assert any("start closer than 0.02 m" in str(w.message) for w in caught) == warned
+
+
+def test_a_configuration_turns_contact_on(tmp_path):
+    text = """
+scene:
+  generator: {class_path: ClothScene, init_args: {setting: ball, side: 0.4, spacing: 0.04}}
+  region: {class_path: Box, init_args: {min: [null, null, 0.67], max: [null, null, 0.69]}}
+  metres_per_unit: 1.0
+contact: {thickness: 0.007, friction: 0.1}
+solver:
+  dx: 0.1
+  boundaries:
+    - class_path: BallObstacle
+      init_args: {center: [0, 0, 0.35], radius: 0.3, path: {times: [0, 1], moves: [[0, 0, 0], [0, 0, 1]]}}
+"""
+    file = tmp_path / "cloth.yaml"
+    file.write_text(text)
+    simulation = Simulation.from_yaml(file, device="cpu")
+    surface = simulation.scene.surface_places
+    assert surface is not None
+    assert surface.contact == Contact(thickness=0.007, friction=0.1)
+    assert float(surface.thickness.amax()) == pytest.approx(0.007)
+    assert simulation.solver.boundaries[0].path.speed == 1.0
+    file.write_text(text.replace("0.007", "-1"))
+    with pytest.raises(ValueError, match=r"contact\.thickness"):
+        Simulation.from_yaml(file, device="cpu")
+    file.write_text(text.replace("solver:", "solver:\n  formulation: updated"))
+    with pytest.raises(ValueError, match=r"`contact` needs `solver\.formulation: total`"):
+        Simulation.from_yaml(file, device="cpu")

@@ -1,0 +1,120 @@
+"""``scene.area: open``: what wind and mass of a capture are, and how it is turned off."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.compact import read_gaussians
+from gaussian_swaying.gaussians.filling import InteriorFilling
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.rotations import rotation_to_quat
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.preview.as_data import run_dict
+from gaussian_swaying.simulation.preview.report import run_lines
+from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.simulation.preview.suggest import suggest
+from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.validation.bodies import cluttered_sphere
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A sphere of radius 1 with clutter inside, as a file."""
+    body = cluttered_sphere(6000)
+    helper = torch.nn.functional.one_hot(body.normals.abs().argmin(-1), 3).double()
+    first = torch.nn.functional.normalize(torch.linalg.cross(helper, body.normals), dim=-1)
+    axes = torch.stack([first, torch.linalg.cross(body.normals, first), body.normals], dim=-1)
+    cloud = GaussianCloud(
+        means=body.means.float(),
+        quats=rotation_to_quat(axes).float(),
+        scales=body.log_scales.float(),
+        opacities=torch.logit(body.opacity).float(),
+        sh=torch.zeros(len(body.means), 1, 3),
+        normals=None,
+    )
+    path = tmp_path_factory.mktemp("capture") / "sphere.ply"
+    write_ply(path, cloud)
+    return path
+
+
+def simulated(dx=0.2, material=None, **settings):
+    """The scene in metres."""
+    return SimulatedScene(Scene(metres_per_unit=0.5, **settings), material or Material(), dx)
+
+
+@pytest.mark.parametrize("points", ["grid", "gaussian"])
+def test_wind_and_mass_of_a_capture_are_those_of_its_skin(points, capture):
+    material = Material(density=200.0, thickness=0.01)
+    found = simulated(ply=capture, points=points, material=material)
+    skin = 4 * math.pi * 0.5**2
+    assert float(found.patches.area.sum()) == pytest.approx(skin, rel=0.05)
+    assert float(found.points.mass.sum()) == pytest.approx(200.0 * 0.01 * skin, rel=0.05)
+    assert float(found.points.mass.min()) > 0
+    layers = simulated(ply=capture, points=points, material=material, area="coverage")
+    assert float(layers.patches.area.sum()) > 3 * skin
+    assert found.hull_area() == pytest.approx(skin, rel=0.01)
+
+
+def test_null_is_open_for_files_only(capture):
+    flag = FlagScene(spacing=0.1)
+    assert Scene(ply=capture).area_kind == "open"
+    assert Scene(generator=flag).area_kind == "coverage"
+    assert Scene(ply=capture, generator=flag).area_kind == "open"
+    assert Scene(ply=capture, wind_on="all").area_kind == "coverage"
+    assert Scene(ply=capture, area="coverage").area_kind == "coverage"
+    assert Scene(generator=flag, area="open").area_kind == "open"
+
+
+@pytest.mark.parametrize(("name", "kind"), [("hanging_object", "open"), ("vase", "open"), ("ficus", "coverage")])
+def test_shipped_configurations_with_a_capture(name, kind, capture):
+    """Objects with a skin take the default; the plants keep the leaves that others hide."""
+    parser = Simulation.parser()
+    settings = parser.parse_args(["--config", str(CONFIGS / f"{name}.yaml"), "--scene.ply", str(capture)])
+    assert parser.instantiate(settings).scene.area_kind == kind
+
+
+def test_flag_keeps_its_area():
+    flags = [simulated(generator=FlagScene(spacing=0.05), area=area, dx=0.1) for area in ("open", "coverage")]
+    torch.testing.assert_close(flags[0].patches.area, flags[1].patches.area)
+    torch.testing.assert_close(flags[0].points.mass, flags[1].points.mass)
+
+
+def test_filled_solid_takes_its_mass_from_its_volume(capture):
+    filling = InteriorFilling(spacing=0.05)
+    found = [simulated(ply=capture, filling=filling, area=area, dx=0.1) for area in ("open", "coverage")]
+    torch.testing.assert_close(found[0].points.mass.sum(), found[1].points.mass.sum(), rtol=0.02, atol=0)
+    assert float(found[0].patches.area.sum()) < float(found[1].patches.area.sum())
+
+
+def test_open_area_with_wind_on_all_is_refused(capture):
+    with pytest.raises(ValueError, match=r"Expected `scene\.wind_on` surface with `scene\.area`"):
+        Scene(ply=capture, area="open", wind_on="all")
+
+
+def test_preview_tells_area_and_hull(capture):
+    simulation = Simulation(Scene(ply=capture, metres_per_unit=0.5))
+    run = run_dict(simulation)
+    assert run["area_m2"] == pytest.approx(math.pi, rel=0.05)
+    assert run["hull_area_m2"] == pytest.approx(math.pi, rel=0.01)
+    line = f"  area            {run['area_m2']:.3g} m^2 in the wind; the convex hull has {run['hull_area_m2']:.3g} m^2"
+    assert line in run_lines(run)
+
+
+def test_starter_of_a_capture_is_open(capture):
+    found = suggest(read_gaussians(capture), quality="draft")
+    for text in (starter_yaml(found, capture), draft_yaml(found, capture)):
+        assert yaml.safe_load(text)["scene"]["area"] == "open"
+
+
+def test_summary_has_area_and_hull(tmp_path, capture):
+    simulation = Simulation(Scene(ply=capture, metres_per_unit=0.5))
+    summary = simulation.run(tmp_path, 1, progress=False)
+    assert summary["patch_area_m2"] == pytest.approx(math.pi, rel=0.05)
+    assert summary["hull_area_m2"] == pytest.approx(math.pi, rel=0.01)

@@ -1,0 +1,89 @@
+"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML."""
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.carried import Turbulence
+from gaussian_swaying.aero.effects import LogProfile
+from gaussian_swaying.aero.obstacles import SphereObstacle
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.simulation import Simulation
+
+
+def _wind():
+    gusts = Turbulence(0.3, 0.5, cells=[16, 8, 8])
+    return WindField([4.0, 1.0, 0.0], effects=[LogProfile([0, 0, -0.5], height=2.0), gusts, Shelter(8)])
+
+
+def test_places_are_converted_once(make_simulation):
+    """Scene units to metres from the object's centre; what was given stays as it was."""
+    simulation = make_simulation(scene={"metres_per_unit": 2.0})
+    given = WindField([4.0, 0.0, 0.0], effects=[SphereObstacle([1.0, 2.0, 3.0], 0.5), LogProfile([0.0, 0.0, -1.0])])
+    simulation.wind = given
+    frame = simulation.scene.frame
+    expected = 2.0 * (torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) - frame.origin)
+    for _ in range(2):
+        sphere, profile = simulation.wind.effects
+        torch.testing.assert_close(sphere.middle, expected)
+        assert sphere.radius == 1.0
+        assert profile.ground[2] == pytest.approx(2.0 * (-1.0 - float(frame.origin[2])))
+        simulation.wind = simulation.wind
+    assert given.effects[0].radius == 0.5
+
+
+def test_shelter_is_refreshed_in_every_frame(make_simulation):
+    simulation = make_simulation()
+    simulation.wind = WindField([4.0, 0.0, 0.0], effects=[Shelter(8)])
+    tables, state = [], simulation.start()
+    for _ in range(3):
+        state, _ = simulation.advance(state)
+        tables.append(simulation.wind.effects[0].table.clone())
+    assert float(tables[0].min()) < 0.99
+    assert not torch.equal(tables[0], tables[2])
+
+
+def test_a_run_in_such_a_wind_resumes_bit_for_bit(make_simulation, tmp_path):
+    recorder = Recorder(images=False, video=False)
+    whole, parts = make_simulation(), make_simulation()
+    for simulation in (whole, parts):
+        simulation.wind = _wind()
+    whole.run(tmp_path / "whole", 6, progress=False, recorder=recorder)
+    parts.run(tmp_path / "parts", 3, progress=False, recorder=recorder)
+    later = make_simulation()
+    later.wind = _wind()
+    later.run(tmp_path / "parts", 6, resume=True, progress=False, recorder=Recorder(images=False, video=False))
+    ends = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["state"] for name in ("whole", "parts")]
+    assert torch.equal(ends[0]["position"], ends[1]["position"])
+
+
+def test_every_effect_can_be_named_in_a_configuration(tmp_path):
+    """By its class name alone; effects are listed with their arguments."""
+    effects = [
+        "{class_path: LogProfile, init_args: {height: 3.0}}",
+        "{class_path: PowerProfile}",
+        "{class_path: Turbulence, init_args: {cells: [8, 8, 8]}}",
+        "{class_path: SphereObstacle, init_args: {center: [0, 0, 0], radius: 1.0}}",
+        "{class_path: CylinderObstacle, init_args: {center: [0, 0, 0], radius: 1.0, street: false}}",
+        "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1, 2, 3]}}",
+        "{class_path: Shelter}",
+    ]
+    text = "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.1}}}\nsolver: {dx: 0.25}\n"
+    text += "wind:\n  flow: [1, 0, 0]\n  effects:\n" + "".join(f"  - {effect}\n" for effect in effects)
+    (tmp_path / "wind.yaml").write_text(text)
+    simulation = Simulation.from_yaml(tmp_path / "wind.yaml", device="cpu")
+    assert [type(effect).__name__ for effect in simulation.wind.effects] == [
+        effect.split(": ")[1].split(",")[0].rstrip("}") for effect in effects
+    ]
+    state, _ = simulation.advance(simulation.start())
+    assert bool(torch.isfinite(state.position).all())
+
+
+def test_a_typo_in_an_effect_is_an_error(tmp_path):
+    text = (
+        "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.1}}}\nsolver: {dx: 0.25}\nwind: {effects: "
+    )
+    (tmp_path / "wind.yaml").write_text(text + "[{class_path: LogProfile, init_args: {heigth: 3.0}}]}\n")
+    with pytest.raises(ValueError, match="heigth"):
+        Simulation.from_yaml(tmp_path / "wind.yaml", device="cpu")

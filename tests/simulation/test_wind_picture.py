@@ -1,0 +1,58 @@
+"""The wind in pictures."""
+
+import imageio.v3 as iio
+import pytest
+import torch
+
+from gaussian_swaying.aero.obstacles import SphereObstacle
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.wind_picture import STEPS, draw_wind, streaks
+
+
+def test_streaks_follow_the_wind(make_simulation):
+    """In a uniform wind they are straight, of one length, in its direction, and drift with it."""
+    simulation = make_simulation()
+    simulation.wind = WindField([3.0, 0.0, 4.0])
+    state = simulation.start()
+    camera = simulation.painter.camera_at(0)
+    places, speeds = streaks(simulation, state, camera)
+    assert places.shape[1:] == (STEPS + 1, 3)
+    torch.testing.assert_close(speeds, torch.full_like(speeds, 5.0))
+    way = places[:, -1] - places[:, 0]
+    torch.testing.assert_close(
+        way / way.norm(dim=-1, keepdim=True), torch.tensor([0.6, 0.0, 0.8]).double().expand_as(way)
+    )
+    torch.testing.assert_close(way.norm(dim=-1), way.norm(dim=-1)[:1].expand(len(way)))
+    short = 0.02 * float(way[0].norm()) / 5.0
+    moved, _ = streaks(simulation, state.replace(time=state.time + short), camera)
+    drift = moved[:, 0] - places[:, 0]
+    kept = drift.norm(dim=-1) < 10 * short * 5.0  # the others came in again at the other side
+    assert float(kept.float().mean()) > 0.9
+    torch.testing.assert_close(drift[kept], (short * torch.tensor([3.0, 0.0, 4.0])).double().expand_as(drift[kept]))
+
+
+def test_the_object_hides_what_is_behind_it(make_simulation):
+    """Air is drawn over the background, and the picture without air is the pale one of the object."""
+    simulation = make_simulation()
+    state = simulation.start()
+    camera, picture = simulation.painter.camera_at(0), simulation.painter.render(state, 0)
+    found = draw_wind(simulation, state, camera, picture)
+    pale = 0.75 * picture.color.clamp(0, 1) + 0.25
+    assert found.shape == picture.color.shape
+    assert float((found - pale).abs().amax(-1).gt(0.05).float().mean()) > 0.02
+    simulation.wind = WindField([0.0, 0.0, 0.0])
+    still = draw_wind(simulation, state, camera, picture)
+    assert bool(torch.isfinite(still).all())
+
+
+@pytest.mark.parametrize("flow", [[5.0, 0.0, 0.0], [0.0, 0.0, -5.0], [0.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
+def test_a_run_draws_the_wind(make_simulation, tmp_path, flow):
+    """For flows along and across the view, with an obstacle."""
+    simulation = make_simulation()
+    simulation.wind = WindField(flow, effects=[SphereObstacle([-1.0, 0.0, 0.4], 0.3)])
+    simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["wind"]))
+    picture = iio.imread(tmp_path / "run" / "wind" / "00000.png")
+    assert picture.shape == (18, 32, 3)
+    assert (tmp_path / "run" / "wind.mp4").exists()
+    assert not (tmp_path / "run" / "frames").exists()

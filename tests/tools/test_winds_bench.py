@@ -1,0 +1,28 @@
+"""``bench.py winds`` and its tables."""
+
+import json
+
+from bench.cases import winds
+from bench.tables import winds as tables
+
+
+def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(winds, "BOX", (16, 8, 8))
+    monkeypatch.setattr(winds, "STEPS", {"cpu": 2})
+    monkeypatch.setattr(winds, "ROUNDS", {"cpu": 3})
+    monkeypatch.setattr("bench.pages.refill", lambda *_: None)
+    bench("winds", "--device", "cpu", "--results", tmp_path, "--counts", "64", "--formulations", "total")
+    found = json.loads((tmp_path / "winds_cpu.json").read_text())
+    assert [row["wind"] for row in found["rows"]] == list(winds.KINDS)
+    assert found["rows"][0]["ratio"] == 1.0
+    assert all(row["ratio"] > 0 and row["path"] == "torch" for row in found["rows"])
+    assert found["box"]["cells"] == [16, 8, 8]
+    assert len(tables.rows(found)) == 4 + len(winds.KINDS)
+    assert "at most 1.3 times" in tables.goals(found)[2]
+
+
+def test_a_missed_goal_says_no():
+    row = {"particles": 100_000, "formulation": "total", "wind": "turbulence", "ratio": 1.2, "median_ms": 0.05}
+    result = {"device": "NVIDIA H200", "rows": [row], "box": {"cells": [4, 4, 4], "isotropic_s": 0.1, "sheared_s": 0.3}}
+    goals = tables.goals(result)[2:]
+    assert [line.rstrip(" |").rsplit("| ", 1)[1] for line in goals] == ["no", "yes", "no"]

@@ -1,0 +1,146 @@
+"""``bench.py contact``: what contact costs in a substep, and how close surfaces come in scenes that touch."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.clock import spread, timed
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.validation.contacts import crossings, gaps, sheet_triangles
+
+Row = dict[str, Any]
+
+WIDTH, THICKNESS, PER_CELL = 0.9, 0.005, 2.2
+STEPS = 24
+"""Substeps of a timed rollout."""
+
+CASES = ("off", "nothing near", "a fifth in contact", "all in contact")
+"""Two sheets without contact; with contact, but far from each other; lying on each other by a fifth; and wholly."""
+
+
+def sheets(points: int, device: torch.device) -> tuple[MaterialPoints, Tensor]:
+    """Two level sheets of half the points each, and their normals; at rest they are 0.5 m apart."""
+    side = round((points / 2) ** 0.5)
+    spacing = WIDTH / side
+    axis = (torch.arange(side, device=device, dtype=torch.float32) + 0.5) * spacing
+    place = torch.cartesian_prod(axis, axis, torch.tensor([0.0, 0.5], device=device))
+    place = place[place[:, 2].argsort(stable=True)]
+    material = {"density": 100.0, "youngs_modulus": 5e3, "poisson_ratio": 0.3}
+    made = MaterialPoints.create(place.contiguous(), volume=spacing**2 * THICKNESS, **material)
+    return made, torch.tensor([0.0, 0.0, 1.0], device=device).expand(made.count, 3)
+
+
+def prepare(points: int, case: str, device: torch.device) -> tuple[MPMSolver, MPMState, float]:
+    """A solver, the state from which a rollout is timed, and its substep [s]."""
+    made, normal = sheets(points, device)
+    spacing = WIDTH / round((points / 2) ** 0.5)
+    contact = None if case == "off" else Contact(thickness=THICKNESS)
+    surface = None if contact is None else Surface.of_points(made, normal, spacing, THICKNESS, contact)
+    solver = MPMSolver(dx=PER_CELL * spacing, gravity=(0.0, 0.0, 0.0))
+    state = solver.init_state(made, surface=surface)
+    if case in CASES[2:]:  # the upper one just above the lower one, and falling onto it
+        nodes = state.grid.node_positions(made.position)
+        upper = (nodes[:, 2] > 0.25).to(nodes)
+        moved, velocity = torch.zeros_like(nodes), torch.zeros_like(nodes)
+        moved[:, 2] = upper * (THICKNESS - 0.5)
+        moved[:, 0] = upper * (0.8 * WIDTH if case == CASES[2] else 0.0)
+        velocity[:, 2] = -0.5 * upper
+        state = solver.bound.read_particles(state, moved, velocity)  # type: ignore[attr-defined]
+    return solver, state, solver.stable_substep() * 0.4
+
+
+def cost(points: int, case: str, device: torch.device, repeats: int) -> Row:
+    """Milliseconds of a substep (on a CPU those of the processor), and the pairs that are listed."""
+    solver, state, dt = prepare(points, case, device)
+    roll = partial(solver.rollout, state, dt, STEPS)
+    if device.type == "cuda":
+        row = timed(roll, device, repeats, warm=2, share=1 / STEPS)
+    else:  # time of the processor, so that other work on the machine does not count
+        roll()
+        marks = [time.process_time()]
+        for _ in range(repeats):
+            roll()
+            marks.append(time.process_time())
+        row = spread([1e3 * (b - a) for a, b in pairwise(marks)], 1 / STEPS)
+    stage = solver.bound.contact  # type: ignore[attr-defined]
+    lists = None if stage is None else stage.lists
+    found = 0 if lists is None else len(lists.first)
+    return {"points": solver.points.count, "case": case, "pairs": found, **row}
+
+
+def collision(speed: float, device: torch.device, points: int = 900, frames: int = 30) -> Row:
+    """A small sheet that flies onto a larger one: the gaps of all frames, and what crosses."""
+    side = round(points**0.5)
+    spacing = WIDTH / side
+    axis = torch.arange(side, device=device, dtype=torch.float32) * spacing
+    few = axis[: 2 * side // 3]
+    low = torch.cartesian_prod(axis, axis, torch.zeros(1, device=device))
+    high = torch.cartesian_prod(few + 0.13 * WIDTH, few + 0.11 * WIDTH, torch.full((1,), 5 * spacing, device=device))
+    thickness = 0.5 * spacing
+    made = MaterialPoints.create(
+        torch.cat([low, high]), volume=spacing**2 * thickness, density=100.0, youngs_modulus=2e4, poisson_ratio=0.3
+    )
+    velocity = torch.zeros_like(made.position)
+    velocity[len(low) :] = speed * torch.tensor([0.3, 0.0, -1.0], device=device)
+    normal = torch.tensor([0.0, 0.0, 1.0], device=device).expand(made.count, 3)
+    solver = MPMSolver(dx=PER_CELL * spacing, gravity=(0.0, 0.0, 0.0))
+    state = solver.init_state(made, velocity, surface=Surface.of_points(made, normal, spacing, thickness, Contact()))
+    momentum = solver.momenta(state)["linear"].double()
+    triangles = torch.cat([sheet_triangles(side, side), sheet_triangles(len(few), len(few), len(low))])
+    frame, shares, crossed = 25 * spacing / speed / frames, [], 0
+    for _ in range(frames):
+        steps = solver.substeps(state, frame)
+        state = solver.rollout(state, frame / steps, steps)
+        shares.append(gaps(solver.bound.contact, state).cpu())  # type: ignore[attr-defined]
+        crossed += crossings(state.position, triangles)
+    found = torch.cat(shares)
+    change = solver.momenta(state)["linear"].double() - momentum
+    return {
+        "speed_m_s": speed,
+        "points": made.count,
+        "frames": frames,
+        "pairs": len(found),
+        "closest": float(found.amin()),
+        "closer_than_half": float((found < 0.5).double().mean()),
+        "crossings": crossed,
+        "momentum_change": float(change.norm() / momentum.norm()),
+    }
+
+
+def add_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py contact``."""
+    command.add_argument("--points", default="10000,100000", help="separated by commas (default: %(default)s)")
+    command.add_argument("--repeats", type=int, default=5, help="timed rollouts of each case (default: %(default)s)")
+    command.add_argument("--speeds", default="2,50", help="of the collisions [m/s] (default: %(default)s)")
+
+
+def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
+    """Fill ``result``, saving it after each row; rows of other sizes and speeds are kept."""
+    device = torch.device(options.device)
+    rows = result.setdefault("rows", [])
+    for points in map(int, filter(None, options.points.split(","))):
+        for case in CASES:
+            begin = time.perf_counter()
+            with torch.inference_mode():
+                row = cost(points, case, device, options.repeats) | {"wanted": points}
+            rows[:] = [one for one in rows if (one["wanted"], one["case"]) != (points, case)] + [row]
+            print(json.dumps(row), f"{time.perf_counter() - begin:.0f} s", flush=True)
+            save(result)
+    collisions = result.setdefault("collisions", [])
+    for speed in map(float, filter(None, options.speeds.split(","))):
+        with torch.inference_mode():
+            row = collision(speed, device)
+        collisions[:] = [one for one in collisions if one["speed_m_s"] != speed] + [row]
+        print(json.dumps(row), flush=True)
+        save(result)

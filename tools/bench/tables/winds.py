@@ -1,0 +1,53 @@
+"""Tables of ``bench.py winds``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench.slots import table
+from bench.tables.markdown import grid, source, yes_no
+
+Row = dict[str, Any]
+PAGE = "wind.md"
+LARGEST = {"cuda": 1.15, "cpu": 1.3}
+"""Goals: time of a substep in turbulence, per that in uniform gusts."""
+BOX = {"cuda": 0.2, "cpu": 2.0}
+"""Goals: time to make a box [s]; on a CPU, with two cores."""
+
+
+def _kind(result: Row) -> str:
+    return "cuda" if "CPU" not in result["device"] else "cpu"
+
+
+@table(PAGE, "winds.rows", "winds_*")
+def rows(result: Row) -> list[str]:
+    """Time of a substep in each wind."""
+    head = ["sheet", "wind", "runs in", "substep [ms]", "per that in uniform gusts"]
+    found = []
+    for row in result["rows"]:
+        name = f"`{row['formulation']}`, {row['particles']:,} points"
+        if "failed" in row:
+            found.append([name, f"failed: {row['failed']}", "-", "-", "-"])
+            continue
+        found.append([name, row["wind"], row["path"], f"{row['median_ms']:.3g}", f"{row['ratio']:.2f}"])
+    return [source(result), "", *grid(head, found)]
+
+
+@table(PAGE, "winds.goals", "winds_*")
+def goals(result: Row) -> list[str]:
+    """The goals."""
+    kind = _kind(result)
+    found = []
+    for row in result["rows"]:
+        if row["wind"] == "turbulence":
+            name = f"substep in turbulence, `{row['formulation']}`, {row['particles']:,} points"
+            reached = yes_no(row["ratio"] <= LARGEST[kind])
+            found.append([name, f"at most {LARGEST[kind]} times uniform gusts", f"{row['ratio']:.2f}", reached])
+    box = result["box"]
+    size = " x ".join(map(str, box["cells"]))
+    for name in ("isotropic", "sheared"):
+        seconds = box[f"{name}_s"]
+        found.append(
+            [f"box of {size}, {name}", f"at most {BOX[kind]} s", f"{seconds:.2f} s", yes_no(seconds <= BOX[kind])]
+        )
+    return grid(["goal", "wanted", "measured", "reached"], found)
