@@ -94,11 +94,24 @@ def _hire(pool: list[_Worker], count: int, threads: int, explain: Explain, gpus:
         place = next(place for place in itertools.count() if place not in {worker.place for worker in pool})
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, threads, explain), daemon=True)
-        with _environment(**variables(place, threads, gpus)):
+        with _environment(**variables(place, threads, gpus)), _without_ctrl_c():
             process.start()
         theirs.close()  # so that the end of the worker closes the connection
         pool.append(_Worker(process, ours, place))
     return [worker for worker in pool if worker.job is None]
+
+
+@contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Block Ctrl-C for the processes that are started in the block; here it acts after the block."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def variables(place: int, threads: int, gpus: Sequence[str]) -> dict[str, str]:

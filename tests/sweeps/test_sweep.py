@@ -196,6 +196,20 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, number
     assert (folder / "sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
 
 
+def test_ctrl_c_while_the_workers_start(tmp_path, sweep_file):
+    """They import for seconds; Ctrl-C of the terminal reaches them too, and nobody prints a traceback."""
+    folder = tmp_path / "out"
+    driver = _start(sweep_file(tmp_path / "tiny.yaml"), folder, "--device", "cpu")
+    _wait(lambda: (folder / "sweep.csv").exists())
+    time.sleep(0.5)
+    os.killpg(driver.pid, signal.SIGINT)
+    _, error = driver.communicate(timeout=120)
+    assert driver.returncode == 130, error
+    assert "Traceback" not in error
+    assert "--resume" in error
+    assert {row["status"] for row in _rows(folder / "sweep.csv")} == {"missing"}
+
+
 # ---- failures
 
 
