@@ -12,7 +12,7 @@ FLOORS = (
     "aero rendering scenes",
     "captures",
     "simulation training",
-    "evaluation validation viewer",
+    "evaluation sweeps validation viewer",
     "cli",
 )
 """From the ground up; rooms of one floor do not know each other."""

@@ -1,0 +1,119 @@
+"""Many runs of one configuration: ``gaussian-swaying sweep SWEEP.yaml``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from gaussian_swaying import _program as program
+from gaussian_swaying.cli.continuing import command
+from gaussian_swaying.cli.errors import run_command, sentence
+from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.runs.signals import stop_signals
+from gaussian_swaying.simulation.simulation import Simulation
+
+MEMORY = "fewer `--workers`, a smaller `scene.region`, a coarser `solver.dx` or a smaller picture"
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The options."""
+    parser = argparse.ArgumentParser(
+        prog=program.name("sweep"),
+        description="Do many runs of `sim`: a base configuration, and axes along which options differ. Each run has "
+        "its own folder; sweep.csv has a row for each, and contact_sheet.png a picture.",
+    )
+    add = parser.add_argument
+    add("sweep", help="YAML file with base, axes and, if needed, settings, draws and seed; or a shipped one by name")
+    add("--output", help="folder for the results; outputs/sweeps/<name of the file> if left out")
+    add("--resume", action="store_true", help="do what is missing in the folder; complete runs are never done again")
+    add("--workers", type=int, help="runs at a time, each in a process; one per GPU or core if left out")
+    add("--threads", type=int, help="threads of each run; cores / workers if left out")
+    add(
+        "--retries",
+        type=int,
+        default=1,
+        help="how often a failed run is tried again; three times as often if its process was killed",
+    )
+    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    add("--picture", default="last", choices=("last", "middle"), help="frame of the contact sheet")
+    add("--list", action="store_true", help="print the runs and end")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse and sweep.
+
+    Returns:
+        0 if all runs are complete, 2 on bad input or if a run failed, 130 if stopped with Ctrl-C, 143 by SIGTERM. With
+        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+    """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    parser = build_parser()
+    begun: list[Path] = []
+
+    def advice(error: BaseException) -> str | None:
+        """How to continue, if the sweep has begun."""
+        return f"To do what is missing:\n  {command(arguments, '--resume')}" if begun else None
+
+    return run_command(
+        lambda: sweep(parser.parse_args(arguments), begun, arguments),
+        stopped="Stopped; complete runs are kept, and those that were running continue from their last frame.",
+        memory=MEMORY,
+        arguments=arguments,
+        advice=advice,
+    )
+
+
+def explain(error: BaseException) -> str:
+    """One sentence about an error of a run."""
+    found = sentence(error, MEMORY)
+    if found is not None:
+        return found
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0] if lines else ''} This is a bug; its traceback is in the folder logs."
+
+
+def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[str]) -> int:
+    """Do the runs that are missing, and report; the folder is put into ``begun`` once it is the sweep's."""
+    from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+    from gaussian_swaying.sweeps.record import TABLE
+    from gaussian_swaying.sweeps.sweep import run_sweep
+
+    file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
+    parser = Simulation.parser()
+    with guessing(parser):
+        plan = make_plan(read_sweep(file, lambda name: with_shipped(["--config", name], "sim")[1]), parser)
+    if options.list:
+        for name, run in zip(plan.names, plan.runs, strict=True):
+            print(f"{name}  {', '.join(f'{axis} {value}' for axis, value in run.items())}")
+        return 0
+    folder = Path(options.output or Path("outputs") / "sweeps" / file.stem)
+    with stop_signals():
+        results = run_sweep(
+            plan,
+            folder,
+            resume=options.resume,
+            workers=options.workers,
+            threads=options.threads,
+            retries=options.retries,
+            device=options.device,
+            picture=options.picture,
+            explain=explain,
+            started=lambda: begun.append(folder),
+        )
+    counts = Counter(result["status"] for result in results.values())
+    print(f"{len(results)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}")
+    for file in (folder / "runs", folder / TABLE, *sorted(folder.glob("contact_sheet*.png"))):
+        print(f"wrote {file}")
+    failed = [name for name, result in sorted(results.items()) if result["status"] != "complete"]
+    if failed:
+        print(
+            f"error: {len(failed)} of {len(results)} runs failed, the first because: {results[failed[0]]['reason']} "
+            f"After a change on this machine, `{command(arguments, '--resume')}` tries them again.",
+            file=sys.stderr,
+        )
+    return 2 if failed else 0

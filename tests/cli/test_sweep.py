@@ -1,0 +1,82 @@
+"""``gaussian-swaying sweep``: what it prints, and the one sentence it answers bad input with."""
+
+import pytest
+import yaml
+
+from gaussian_swaying.cli import shipped
+from gaussian_swaying.cli.main import main as program
+from gaussian_swaying.cli.sweep import main
+
+
+def _file(path, **fields):
+    path.write_text(yaml.safe_dump({"base": "flag", "settings": {"frames": 3}} | fields, sort_keys=False))
+    return str(path)
+
+
+def _refused(arguments, folder, capsys, *words):
+    before = sorted(folder.rglob("*"))
+    capsys.readouterr()
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1, error
+    for word in words:
+        assert word in error, error
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_the_list_of_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    axes = {"wind.flow": [[4, 0, 0], [8, 0, 0]], "material.E": {"from": 1e3, "to": 2e3, "count": 2}}
+    assert main([_file(tmp_path / "a.yaml", axes=axes), "--list"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "00000  wind.flow [4, 0, 0], material.E 1000.0",
+        "00001  wind.flow [4, 0, 0], material.E 2000.0",
+        "00002  wind.flow [8, 0, 0], material.E 1000.0",
+        "00003  wind.flow [8, 0, 0], material.E 2000.0",
+    ]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.yaml"]
+
+
+def test_a_shipped_sweep_by_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert "flag_winds" in shipped.names("sweep")
+    assert main(["flag_winds", "--list"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 18
+    _refused(["flag_wind"], tmp_path, capsys, "'flag_wind' (did you mean flag_winds?)")
+
+
+def test_bad_input(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    flow = {"wind.flow": [[4, 0, 0]]}
+    bad = [
+        (_file(tmp_path / "a.yaml", axes={"wind.flwo": [[4, 0, 0]]}), [], ("did you mean", "wind.flow?")),
+        (_file(tmp_path / "b.yaml", axes={"wind.flow": [[4, 0]]}, base="flga"), [], ("'flga' (did you mean flag?)",)),
+        (_file(tmp_path / "c.yaml", axes={"material.E": ["stiff"]}), [], ("Run 00000 (material.E: stiff)", "float")),
+        (_file(tmp_path / "d.yaml", axes=flow), ["--workers", "0"], ("`workers`", "at least 1")),
+        (_file(tmp_path / "d.yaml", axes=flow), ["--retries", "-1"], ("`retries`", "at least 0")),
+        (_file(tmp_path / "d.yaml", axes=flow), ["--resume"], ("nothing to resume", "outputs/sweeps/d")),
+        ("missing.yaml", [], ("missing.yaml does not exist",)),
+    ]
+    for file, more, words in bad:
+        _refused([file, *more], tmp_path, capsys, *words)
+
+
+def test_unknown_options_end_with_usage(capsys):
+    with pytest.raises(SystemExit) as left:
+        program(["sweep", "flag_winds", "--worker-count", "3"])
+    assert left.value.code == 2
+
+
+def test_a_sweep_from_the_installed_program(tmp_path, monkeypatch, capsys):
+    """Two runs, and the files that are named."""
+    monkeypatch.chdir(tmp_path)
+    settings = {"frames": 2, "scene.generator.init_args.spacing": 0.1, "solver.dx": 0.2, "solver.boundaries": []}
+    settings |= {"camera.init_args.width": 32, "camera.init_args.height": 18, "recorder.video": False}
+    file = _file(tmp_path / "two.yaml", settings=settings, axes={"wind.seed": [1, 2]})
+    assert program(["sweep", file, "--workers", "1", "--device", "cpu"]) == 0
+    out = capsys.readouterr().out
+    assert "2 runs: 2 complete" in out
+    for name in ("runs", "sweep.csv", "contact_sheet.png"):
+        assert f"wrote outputs/sweeps/two/{name}\n" in out
+        assert (tmp_path / "outputs/sweeps/two" / name).exists()

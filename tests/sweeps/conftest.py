@@ -1,0 +1,46 @@
+"""Sweeps of tiny flags: as a file, and done once without disturbance."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gaussian_swaying.cli.sweep import main
+
+FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
+POLE = {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}
+TINY = {
+    "frames": 12,
+    "scene.generator.init_args.spacing": 0.1,
+    "solver.dx": 0.2,
+    "solver.boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": POLE}}],
+    "camera.init_args.width": 32,
+    "camera.init_args.height": 18,
+}
+AXES = {
+    "wind.flow": [[4.0, 1.0, 0.0], [8.0, 2.0, 0.0]],
+    "material.E": {"from": 3e3, "to": 3e4, "count": 2, "scale": "log"},
+    "wind.seed": {"draw": "integer", "low": 0, "high": 10**6},
+}
+
+
+def write_sweep(path, axes=AXES, draws=2, settings=None, **more):
+    """A sweep file of tiny flags; ``settings`` are added to those that make them tiny."""
+    fields = {"base": str(FLAG), "settings": TINY | (settings or {}), "axes": axes, "draws": draws}
+    path.write_text(yaml.safe_dump(fields | more, sort_keys=False))
+    return path
+
+
+@pytest.fixture(scope="session")
+def sweep_file():
+    """Writes a sweep file to a path; eight runs unless told otherwise."""
+    return write_sweep
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
+    """Folder of the sweep of eight runs."""
+    folder = tmp_path_factory.mktemp("sweep")
+    file = write_sweep(folder / "tiny.yaml")
+    assert main([str(file), "--output", str(folder / "whole"), "--workers", "2", "--device", "cpu"]) == 0
+    return folder / "whole"
