@@ -74,7 +74,7 @@ def test_a_slot_that_a_page_lacks_is_named_with_its_page(bench, tmp_path):
     assert before == {name: (docs / name).read_text() for name in NAMES}
     (docs / "results/sim_mps.json").unlink()
     (docs / "training.md").unlink()
-    with pytest.raises(SystemExit, match=r"There is no .*training\.md, which has .* `training\.goals train_cuda`"):
+    with pytest.raises(SystemExit, match=r"There is no .*training\.md, which has .* `surfaces\.goals surfaces_cuda`"):
         bench("pages", "--results", docs / "results")
 
 
