@@ -14,12 +14,6 @@ from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.cli.train import make_cli
 
 
-@pytest.fixture(autouse=True)
-def _not_called():
-    yield
-    program._called.clear()
-
-
 def test_what_there_is(capsys):
     assert main([]) == 0
     out = capsys.readouterr().out
