@@ -58,13 +58,14 @@ def surface_quality(
     angle = torch.rad2deg(torch.acos(cosine))
     found["near_share"] = float((distance <= near).float().mean())
     close = distance <= near
+    areas = {mode: part.areas(mode) for mode in ("paper", "coverage")}
     for size in (0.1, 0.2, 0.4):
-        parts = (places[close], part.normals()[close], normals[close], size, part.areas()[close])
+        parts = (places[close], part.normals()[close], normals[close], size, areas["coverage"][close])
         found[f"tilt_{round(100 * size)}cm_deg"] = patch_normal_error(*parts) if bool(close.any()) else math.nan
     for name, values in (("angle", angle), ("distance", distance)):
         unit = "deg" if name == "angle" else "m"
         found[f"{name}_median_{unit}"] = float(values.median())
         found[f"{name}_p90_{unit}"] = float(values.sort().values[math.ceil(0.9 * len(values)) - 1])
-    for mode in ("paper", "coverage"):
-        found[f"area_{mode}_ratio"] = float(part.areas(mode).double().sum()) / truth.area()
+    for mode, area in areas.items():
+        found[f"area_{mode}_ratio"] = float(area.double().sum()) / truth.area()
     return found

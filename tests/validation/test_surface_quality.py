@@ -48,6 +48,8 @@ def test_tilt_distance_shape_and_opacity_are_told_apart(flat):
     tilted = surface_quality(_model(tilt=math.radians(12.0), lift=0.03), flat)
     assert tilted["angle_median_deg"] == pytest.approx(12.0, abs=1e-3)
     assert tilted["angle_p90_deg"] == pytest.approx(12.0, abs=1e-3)
+    for size in (10, 20, 40):
+        assert tilted[f"tilt_{size}cm_deg"] == pytest.approx(12.0, abs=1e-3)
     assert tilted["distance_median_m"] == pytest.approx(0.03, rel=1e-5)
     assert surface_quality(_model(lift=0.06), flat)["near_share"] == 0.0
     long = surface_quality(_model(ratio=1.2), flat)

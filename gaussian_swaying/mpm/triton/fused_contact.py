@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -124,7 +125,14 @@ class FusedContact:
         known = self._lists
         if known is not None:
             far = float((position - known.before).square().sum(-1).amax()) ** 0.5
-            self.late += 2 * ARM * far > known.margin * (1 + 1e-6)
+            if 2 * ARM * far > known.margin * (1 + 1e-6):
+                self.late += 1
+                if self.late == 1:
+                    warnings.warn(
+                        "Points moved farther than contact had looked ahead, so some may have passed through each "
+                        "other: lower `solver.cfl`.",
+                        stacklevel=2,
+                    )
             self._adapt(dt)
         stage.update(state, dt, MOST / 4)
         lists = stage.lists

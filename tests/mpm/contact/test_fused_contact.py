@@ -68,6 +68,18 @@ def test_many_substeps_use_the_lists_again(sheet, scene, device):
     torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-4)
 
 
+def test_lists_that_are_too_old_are_told(sheet, scene, device):
+    """Once: points that jumped farther than the margin of the lists may have passed through each other."""
+    points, velocity, _ = _collision(sheet, device)
+    solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="triton")
+    state = solver.rollout(state, DT, 1)
+    touching = solver.fused().touching
+    jumped = state.replace(position=state.position + 10 * touching._lists.margin)
+    with pytest.warns(UserWarning, match="passed through each other"):
+        touching.look(jumped, DT)
+    assert touching.late == 1
+
+
 @pytest.mark.gpu
 def test_graphs_do_what_single_substeps_do(sheet, scene):
     """On a GPU: substeps of a collision from graphs, and a new list in the middle, against torch."""

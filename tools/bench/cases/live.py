@@ -81,13 +81,11 @@ def camera_rotation(eye: Any, target: Any, up: list[float]) -> list[float]:
     import torch
 
     from gaussian_swaying.geometry.rotations import rotation_to_quat
+    from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
-    forward = np.array(target, dtype=float) - np.array(eye, dtype=float)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
-    return [float(x) for x in rotation_to_quat(torch.tensor(rotation))]
+    eye, target = (torch.as_tensor(np.array(place, dtype=float)) for place in (eye, target))
+    camera = look_at_camera(eye, target, up, 40.0, 2, 2, dtype=torch.float64)
+    return [float(x) for x in rotation_to_quat(camera.world_to_camera[:3, :3].T.contiguous())]
 
 
 def pixels_of(jpeg: bytes) -> np.ndarray:
