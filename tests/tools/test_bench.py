@@ -2,6 +2,9 @@
 
 import json
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -133,3 +136,16 @@ def test_the_time_of_a_comparison():
         assert [goal[2] for goal in goals] == ([] if reached is None else [reached])
     assert "250 frames" in whole(result)[-1]
     assert "480 x 270 pixels against a surface of 10,000 points in 29.0 s" in whole(result)[-1]
+
+
+def test_bench_starts_without_the_packages_of_extras():
+    """A machine that measures needs no browser, no Blender, no viewer: an import at the top of one case stopped all of them."""
+    program = (
+        "import sys\n"
+        "for name in ('msgspec', 'viser', 'websockets', 'zstandard', 'bpy', 'playwright', 'ray', 'newton', 'cv2'):\n"
+        "    sys.modules[name] = None\n"
+        f"sys.path.insert(0, {str(Path(__file__).parents[2] / 'tools')!r})\n"
+        "import bench.command\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -7,15 +7,17 @@ import io
 import statistics
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench import record
-from bench.page_client import PageClient
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.page import Page
 from gaussian_swaying.viewer.session import Session, share_cores
+
+if TYPE_CHECKING:
+    from bench.page_client import PageClient
 
 Row = dict[str, Any]
 SIZES = {"cpu": (640, 360), "cuda": (1920, 1080)}
@@ -26,6 +28,8 @@ PATIENCE = 10.0  # s
 
 def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
     """A page, and one client on the same machine."""
+    from bench.page_client import PageClient  # needs the extra [viewer]
+
     parser = Simulation.parser()
     session = Session(parser, parser.parse_args([*arguments, "--device", device]))
     if device == "cpu":
