@@ -139,7 +139,7 @@ def test_the_time_of_a_comparison():
 
 
 def test_bench_starts_without_the_packages_of_extras():
-    """A machine that measures needs no browser, no Blender, no viewer: an import at the top of one case stopped all of them."""
+    """An import at the top of one case would stop all of them."""
     program = (
         "import sys\n"
         "for name in ('msgspec', 'viser', 'websockets', 'zstandard', 'bpy', 'playwright', 'ray', 'newton', 'cv2'):\n"
