@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from lightning.pytorch.utilities.types import STEP_OUTPUT
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -26,9 +26,12 @@ from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
+from gaussian_swaying.training.counting import count_further_image, images_until_hooks, inner_hooks_used, number_batch
+from gaussian_swaying.training.data.datamodule import TrainingImage
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
+from gaussian_swaying.training.optimizers import OPTIMIZERS, make_optimizer, step_all
 from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
 from gaussian_swaying.training.random_stream import random_state, set_random_state
 from gaussian_swaying.training.rates import LearningRates, means_rate
@@ -41,7 +44,7 @@ class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
     A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one.
-    Random numbers come from a separate stream, which starts from the seed and is stored in checkpoints. So nothing else
+    Lightning's callbacks are called after several images, see ``hooks_every``. Random numbers come from a separate stream, which starts from the seed and is stored in checkpoints. So nothing else
     changes them, and a resumed run continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
@@ -64,6 +67,10 @@ class SplatTrainer(lightning.LightningModule):
         seed: Seed of backgrounds and new Gaussians.
         panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
+        hooks_every: Images between calls of Lightning's callbacks, which take a fixed time. They are also called where
+            a checkpoint, a validation or the end is due. The result does not depend on it.
+        optimizer: ``adam``, or ``selective_adam``, which moves only the Gaussians in the picture (CUDA only), see
+            :func:`~gaussian_swaying.training.optimizers.make_optimizer`.
         output: Folder of the panels and the final ``point_cloud.ply``; ``trainer.default_root_dir`` by default.
         init_ply: Splat with the initial Gaussians.
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
@@ -90,6 +97,8 @@ class SplatTrainer(lightning.LightningModule):
         seed: int = 0,
         panels: int = 3,
         log_every: int = 50,
+        hooks_every: int = 10,
+        optimizer: Literal["adam", "selective_adam"] = "adam",
         output: str | None = None,
         init_ply: str | None = None,
         lpips: Literal["alex", "vgg", "squeeze"] | None = "alex",
@@ -100,6 +109,9 @@ class SplatTrainer(lightning.LightningModule):
         for name, value in (("sh_every", sh_every), ("panels", panels), ("seed", seed)):
             check_positive(name, value, allow_zero=True)
         check_positive("log_every", log_every)
+        check_positive("hooks_every", hooks_every)
+        check_choice("optimizer", optimizer, OPTIMIZERS)
+        self.hooks_every, self.optimizer = int(hooks_every), optimizer
         if scene_scale is not None:
             check_positive("scene_scale", scene_scale)
         self.automatic_optimization = False
@@ -124,6 +136,7 @@ class SplatTrainer(lightning.LightningModule):
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
         self._pending: PendingLoss | None = None
+        self._inner_hooks = True  # whether callbacks want to be called within a step
         self._seen = 0  # number of images that the checkpoint was trained on
         self._begun = 0  # [ns] start of the training
         self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
@@ -163,15 +176,12 @@ class SplatTrainer(lightning.LightningModule):
         self.model.reference_normals = None
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        """One Adam for each parameter, in the order of :data:`PARAMETERS`."""
+        """One optimiser for each parameter, in the order of :data:`PARAMETERS`."""
         assert self.scene_scale is not None
-        fused = self.splat.means.device.type == "cuda"
         rates = {name: getattr(self.rates, name) for name in PARAMETERS} | {
             "means": self.rates.means * self.scene_scale
         }
-        return [
-            torch.optim.Adam([getattr(self.splat, name)], lr=rates[name], eps=1e-15, fused=fused) for name in PARAMETERS
-        ]
+        return [make_optimizer(getattr(self.splat, name), rates[name], self.optimizer) for name in PARAMETERS]
 
     def on_fit_start(self) -> None:
         """Refuse settings that would silently train wrongly."""
@@ -190,6 +200,7 @@ class SplatTrainer(lightning.LightningModule):
         assert self.scene_scale is not None
         optimizers = dict(zip(PARAMETERS, self._raw_optimizers(), strict=True))
         self.densification.attach(self.splat, optimizers, self.scene_scale)
+        self._inner_hooks = inner_hooks_used(self.trainer, self)
 
     def _raw_optimizers(self) -> list[torch.optim.Optimizer]:
         found = self.optimizers(use_pl_optimizer=False)
@@ -240,25 +251,41 @@ class SplatTrainer(lightning.LightningModule):
             self._made[device.type] = make_renderer(device)
         return self._made[device.type]
 
-    def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
-        """One image: picture, losses, gradients, six optimisers, densification."""
+    def training_step(self, dataloader_iter: Iterator[tuple[Any, int, int]]) -> STEP_OUTPUT:
+        """Train on the images until Lightning's hooks are due, see ``hooks_every``.
+
+        Each image: picture, losses, gradients, six optimisers, densification.
+        """
         outside = random_state(self.device)
         if self._random:
             set_random_state(self._random, self.device)
         else:
             torch.manual_seed(self.seed)
+        loss: STEP_OUTPUT = None
         try:
-            return self._train_on(batch, self.global_step)
+            for number in range(images_until_hooks(self.trainer, self.hooks_every)):
+                if number and getattr(dataloader_iter, "done", False):
+                    break
+                batch = self._on_device(next(dataloader_iter)[0])
+                if number:
+                    count_further_image(self.trainer)
+                loss = self._train_on(batch, self.global_step)
+            number_batch(self.trainer, dataloader_iter)
+            return loss
         finally:
             self._random = random_state(self.device)
             set_random_state(outside, self.device)
 
+    def _on_device(self, batch: Any) -> Any:
+        if isinstance(batch, TrainingImage):
+            return batch.to(self.device, non_blocking=True)
+        return self.trainer.strategy.batch_to_device(batch)
+
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
         optimizers = self._raw_optimizers()
-        means_optimizer, *others = optimizers
         assert self.scene_scale is not None
         rate = means_rate(self.rates, self.scene_scale, step, int(self.trainer.max_steps))
-        means_optimizer.param_groups[0]["lr"] = rate
+        optimizers[0].param_groups[0]["lr"] = rate
         target, alpha, background = self._target(batch, train=True)
         needs = self.loss.needs(step)
         output = self.render(
@@ -285,17 +312,16 @@ class SplatTrainer(lightning.LightningModule):
         if not loss.requires_grad:  # no Gaussian in the picture, and the loss depends only on the picture
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
-        self.manual_backward(loss)
+        if self._inner_hooks:
+            self.manual_backward(loss)
+        else:
+            loss.backward()  # type: ignore[no-untyped-call]
         if self._pending is None:
             self._pending = PendingLoss(self.device)
         self._pending.send(step, loss.detach())
         if self.device.type != "cuda":
             self._check_pending()
-        # Lightning counts a step of its wrapper as one of `max_steps`: it wraps one optimiser only.
-        wrapped = self.optimizers()
-        (wrapped[0] if isinstance(wrapped, list) else wrapped).step()
-        for optimizer in others:
-            optimizer.step()
+        self._step(optimizers, output)
         for name in PARAMETERS:
             getattr(splat, name).grad = None
         self.densification.after_step(step, output.screen)
@@ -307,6 +333,18 @@ class SplatTrainer(lightning.LightningModule):
         if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
+
+    def _step(self, optimizers: list[torch.optim.Optimizer], output: SplatOutput) -> None:
+        """Step all optimisers, which Lightning counts as one step of the trainer."""
+        if self._inner_hooks and self.optimizer == "adam":
+            wrapped = self.optimizers()
+            (wrapped[0] if isinstance(wrapped, list) else wrapped).step()  # calls the hooks and counts
+            step_all(optimizers[1:])
+            return
+        counted = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
+        counted.increment_ready()
+        step_all(optimizers, output.screen.seen(len(self.splat)) if self.optimizer != "adam" else None)
+        counted.increment_completed()
 
     def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
         assert output.channels is not None
@@ -346,8 +384,8 @@ class SplatTrainer(lightning.LightningModule):
 
     def _log_step(self, loss: Tensor, terms: Mapping[str, Tensor], image: Tensor, target: Tensor) -> None:
         psnr = peak_signal_noise_ratio(image.clamp(0.0, 1.0), target, data_range=1.0)
-        self.log("psnr", psnr, prog_bar=True, logger=False)
-        self.log("gaussians", float(len(self.splat)), prog_bar=True, logger=False)
+        self.log("psnr", psnr, prog_bar=True, logger=False, batch_size=1)
+        self.log("gaussians", float(len(self.splat)), prog_bar=True, logger=False, batch_size=1)
         values: dict[str, Any] = {"loss": loss, "psnr": psnr, "gaussians": len(self.splat)} | dict(terms)
         values["rate_means"] = self._raw_optimizers()[0].param_groups[0]["lr"]
         for logger in self.trainer.loggers:  # not self.log, which would write them again at every step
