@@ -56,7 +56,7 @@ def count_further_image(trainer: Trainer) -> None:
 
 
 def number_batch(trainer: Trainer, dataloader_iter: Any) -> None:
-    """Let the hooks after this step have the number of its last image; Lightning would restart with 0 in a resumed run."""
+    """Tell the hooks after this step the number of its last image; Lightning would restart with 0 in a resumed run."""
     fetcher = getattr(dataloader_iter, "data_fetcher", None)
     if fetcher is not None:
         fetcher._batch_idx = trainer.fit_loop.epoch_loop.batch_idx

@@ -269,13 +269,11 @@ class DefaultDensification(Densification):
 
 @cache
 def _default_strategy() -> type:
-    """gsplat's ``DefaultStrategy``, without the waits for the GPU in its sums of gradients."""
+    """The ``DefaultStrategy`` of gsplat, without the waits for the GPU in its sums of gradients."""
     from gsplat import DefaultStrategy
 
     class Strategy(DefaultStrategy):
-        def _update_state(
-            self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False
-        ) -> None:
+        def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
             if packed or state["grad2d"] is None or self.refine_scale2d_stop_iter > 0:
                 super()._update_state(params, state, info, packed)
                 return

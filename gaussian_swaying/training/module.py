@@ -12,16 +12,13 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from einops import rearrange
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
@@ -29,11 +26,12 @@ from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
 from gaussian_swaying.training.counting import count_further_image, images_until_hooks, inner_hooks_used, number_batch
 from gaussian_swaying.training.data.datamodule import TrainingImage
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
-from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
+from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged, finite_cloud
+from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
 from gaussian_swaying.training.optimizers import OPTIMIZERS, make_optimizer, step_all
-from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
-from gaussian_swaying.training.random_stream import random_state, set_random_state
+from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
+from gaussian_swaying.training.random_stream import random_stream
 from gaussian_swaying.training.rates import LearningRates, means_rate
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 
@@ -44,8 +42,9 @@ class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
     A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one.
-    Lightning's callbacks are called after several images, see ``hooks_every``. Random numbers come from a separate stream, which starts from the seed and is stored in checkpoints. So nothing else
-    changes them, and a resumed run continues exactly.
+    Lightning's callbacks are called after several images, see ``hooks_every``. Random numbers come from a separate
+    stream, which starts from the seed and is stored in checkpoints. So nothing else changes them, and a resumed run
+    continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
     the colours of the image are not premultiplied. Losses that compare two views also need the item ``index``, and
@@ -67,10 +66,10 @@ class SplatTrainer(lightning.LightningModule):
         seed: Seed of backgrounds and new Gaussians.
         panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
-        hooks_every: Images between calls of Lightning's callbacks, which take a fixed time. They are also called where
-            a checkpoint, a validation or the end is due. The result does not depend on it.
-        optimizer: ``adam``, or ``selective_adam``, which moves only the Gaussians in the picture (CUDA only), see
-            :func:`~gaussian_swaying.training.optimizers.make_optimizer`.
+        hooks_every: Images between calls of Lightning's callbacks, which also come where a checkpoint, a validation or
+            the end is due. The result does not depend on it.
+        optimizer: See :func:`~gaussian_swaying.training.optimizers.make_optimizer`; ``selective_adam`` needs CUDA.
+        packed: Keep values of the Gaussians in the picture alone: less memory on a GPU, one more wait.
         output: Folder of the panels and the final ``point_cloud.ply``; ``trainer.default_root_dir`` by default.
         init_ply: Splat with the initial Gaussians.
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
@@ -99,6 +98,7 @@ class SplatTrainer(lightning.LightningModule):
         log_every: int = 50,
         hooks_every: int = 10,
         optimizer: Literal["adam", "selective_adam"] = "adam",
+        packed: bool = False,
         output: str | None = None,
         init_ply: str | None = None,
         lpips: Literal["alex", "vgg", "squeeze"] | None = "alex",
@@ -111,7 +111,7 @@ class SplatTrainer(lightning.LightningModule):
         check_positive("log_every", log_every)
         check_positive("hooks_every", hooks_every)
         check_choice("optimizer", optimizer, OPTIMIZERS)
-        self.hooks_every, self.optimizer = int(hooks_every), optimizer
+        self.hooks_every, self.optimizer, self.packed = int(hooks_every), optimizer, packed
         if scene_scale is not None:
             check_positive("scene_scale", scene_scale)
         self.automatic_optimization = False
@@ -160,13 +160,7 @@ class SplatTrainer(lightning.LightningModule):
             check_positive("scene_scale", self.scene_scale)
         if self.model is None:
             if self.init_ply is not None:
-                cloud = read_gaussians(self.init_ply)
-                wanted = (self.sh_degree + 1) ** 2
-                sh = cloud.sh[:, :wanted]
-                missing = sh.new_zeros(len(cloud), wanted - sh.shape[1], 3)
-                cloud = GaussianCloud(
-                    cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.cat([sh, missing], 1), cloud.normals
-                )
+                cloud = gaussians_from_file(self.init_ply, self.sh_degree)
             elif hasattr(datamodule, "initial_cloud"):
                 cloud = datamodule.initial_cloud(self.sh_degree)
             else:
@@ -248,7 +242,7 @@ class SplatTrainer(lightning.LightningModule):
             return self.renderer
         device = self.splat.means.device
         if device.type not in self._made:
-            self._made[device.type] = make_renderer(device)
+            self._made[device.type] = make_renderer(device, self.packed)
         return self._made[device.type]
 
     def training_step(self, dataloader_iter: Iterator[tuple[Any, int, int]]) -> STEP_OUTPUT:
@@ -256,13 +250,8 @@ class SplatTrainer(lightning.LightningModule):
 
         Each image: picture, losses, gradients, six optimisers, densification.
         """
-        outside = random_state(self.device)
-        if self._random:
-            set_random_state(self._random, self.device)
-        else:
-            torch.manual_seed(self.seed)
         loss: STEP_OUTPUT = None
-        try:
+        with random_stream(self._random, self.device, self.seed):
             for number in range(images_until_hooks(self.trainer, self.hooks_every)):
                 if number and getattr(dataloader_iter, "done", False):
                     break
@@ -271,10 +260,7 @@ class SplatTrainer(lightning.LightningModule):
                     count_further_image(self.trainer)
                 loss = self._train_on(batch, self.global_step)
             number_batch(self.trainer, dataloader_iter)
-            return loss
-        finally:
-            self._random = random_state(self.device)
-            set_random_state(outside, self.device)
+        return loss
 
     def _on_device(self, batch: Any) -> Any:
         if isinstance(batch, TrainingImage):
@@ -284,8 +270,8 @@ class SplatTrainer(lightning.LightningModule):
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
         optimizers = self._raw_optimizers()
         assert self.scene_scale is not None
-        rate = means_rate(self.rates, self.scene_scale, step, int(self.trainer.max_steps))
-        optimizers[0].param_groups[0]["lr"] = rate
+        steps = int(self.trainer.max_steps)
+        optimizers[0].param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps)
         target, alpha, background = self._target(batch, train=True)
         needs = self.loss.needs(step)
         output = self.render(
@@ -315,7 +301,7 @@ class SplatTrainer(lightning.LightningModule):
         if self._inner_hooks:
             self.manual_backward(loss)
         else:
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
         if self._pending is None:
             self._pending = PendingLoss(self.device)
         self._pending.send(step, loss.detach())
@@ -330,15 +316,14 @@ class SplatTrainer(lightning.LightningModule):
                 f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
                 "losses that lower opacities."
             )
-        if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
+        if step % self.log_every == 0 or step + 1 == steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
 
     def _step(self, optimizers: list[torch.optim.Optimizer], output: SplatOutput) -> None:
-        """Step all optimisers, which Lightning counts as one step of the trainer."""
+        """Step all optimisers; Lightning counts one."""
         if self._inner_hooks and self.optimizer == "adam":
-            wrapped = self.optimizers()
-            (wrapped[0] if isinstance(wrapped, list) else wrapped).step()  # calls the hooks and counts
+            self.optimizers()[0].step()  # type: ignore[index]  # calls the hooks and counts
             step_all(optimizers[1:])
             return
         counted = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
@@ -422,7 +407,7 @@ class SplatTrainer(lightning.LightningModule):
             "scene_scale": self.scene_scale,
             "sh_degree": self.sh_degree,
             "seed": self.seed,
-            "random": self._random,
+            "random": dict(self._random),
             "seen": self.global_step,
         }
 
@@ -447,7 +432,7 @@ class SplatTrainer(lightning.LightningModule):
         )
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
-        self._random = {name: state.cpu() for name, state in stored["random"].items()}
+        self._random.update({name: state.cpu() for name, state in stored["random"].items()})
         self._seen = int(stored["seen"])
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
@@ -489,15 +474,8 @@ class SplatTrainer(lightning.LightningModule):
         fitting = self.trainer.state.fn == "fit"
         degree = self.active_degree(max(self.global_step - 1, 0)) if fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
-        one, two = (rearrange(picture, "h w c -> 1 c h w").float() for picture in (image, target))
-        values = {"psnr": peak_signal_noise_ratio(one, two, data_range=1.0)}
-        if min(image.shape[:2]) >= SSIM_TAPS:
-            ssim = structural_similarity_index_measure(one, two, data_range=1.0)
-            assert isinstance(ssim, Tensor)
-            values["ssim"] = ssim
-        if self._lpips and min(image.shape[:2]) >= LPIPS_SIDE:
-            values["lpips"] = self._lpips[0].to(self.device)(one, two)
-        for name, value in values.items():
+        lpips = self._lpips[0].to(self.device) if self._lpips else None
+        for name, value in picture_metrics(image, target, lpips).items():
             self._metrics.setdefault(name, []).append(value)
         if batch_idx < self.panels and not self.trainer.sanity_checking:
             step = self.global_step if fitting else self._seen
@@ -513,17 +491,8 @@ class SplatTrainer(lightning.LightningModule):
         return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
 
     def _write_panel(self, batch: Mapping[str, Any], target: Tensor, image: Tensor, name: str, step: int) -> None:
-        from imageio.v3 import imwrite
-
         pictures = panel(self.splat, self._drawing(), batch["camera"], target, image)
-        folder = self.folder / "panels"
-        folder.mkdir(parents=True, exist_ok=True)
-        pixels = (pictures * 255.0).round().clamp(0, 255).to(torch.uint8).cpu()
-        imwrite(folder / f"{name}_{step:06d}.png", pixels.numpy())
-        for logger in self.trainer.loggers:
-            board: Any = getattr(logger, "experiment", None)
-            if hasattr(board, "add_image"):
-                board.add_image(name, pixels.numpy(), step, dataformats="HWC")
+        write_panel(pictures, self.folder / "panels", name, step, self.trainer.loggers)
 
     # ---- the end
 
@@ -546,8 +515,6 @@ class SplatTrainer(lightning.LightningModule):
         Raises:
             ValueError: If none is finite.
         """
-        cloud = self.splat.to_cloud()
-        values = (cloud.means, cloud.quats, cloud.scales, cloud.opacities[:, None], cloud.sh.flatten(1))
-        finite = torch.cat(values, dim=1).isfinite().all(-1)
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        GaussianSurfaceModel.from_cloud(cloud.select(finite), requires_grad=False).save_ply(path)
+        finite = finite_cloud(self.splat.to_cloud())
+        GaussianSurfaceModel.from_cloud(finite, requires_grad=False).save_ply(path)

@@ -46,28 +46,29 @@ def step_all(optimizers: Sequence[torch.optim.Optimizer], seen: Tensor | None = 
         optimizers: The optimisers, from :func:`make_optimizer`.
         seen: Which Gaussians were in the picture, bool (N,), for ``selective_adam``.
     """
-    fused: list[tuple[dict[str, Any], Tensor, dict[str, Tensor]]] = []
-    for optimizer in optimizers:
-        group = optimizer.param_groups[0]
+    fused: list[tuple[dict[str, Any], Tensor, Tensor, dict[str, Tensor]]] = []
+    one: Any
+    for one in optimizers:
+        group = one.param_groups[0]
         parameter = group["params"][0]
-        state = optimizer.state.get(parameter)
+        state = one.state.get(parameter)
         if parameter.grad is None:
             continue
-        if not isinstance(optimizer, torch.optim.Adam) or type(optimizer) is not torch.optim.Adam:
-            optimizer.step(visibility=seen)  # type: ignore[call-arg]
+        if type(one) is not torch.optim.Adam:
+            one.step(visibility=seen)
         elif group["fused"] and state:
-            fused.append((group, parameter, state))
+            fused.append((group, parameter, parameter.grad, state))
         else:
-            optimizer.step()
+            one.step()
     if not fused:
         return
     with torch.no_grad():
-        torch._foreach_add_([state["step"] for _, _, state in fused], 1.0)
-        for group, parameter, state in fused:
+        torch._foreach_add_([state["step"] for *_, state in fused], 1.0)
+        for group, parameter, gradient, state in fused:
             beta1, beta2 = group["betas"]
             torch._fused_adam_(
                 [parameter],
-                [parameter.grad],
+                [gradient],
                 [state["exp_avg"]],
                 [state["exp_avg_sq"]],
                 [],

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bench.cases import surfaces
+from bench.cases import surfaces, trained
 from bench.tables.surfaces import goal_table, limits_table, rows_table
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
@@ -35,7 +35,7 @@ def test_axes_that_are_turned_and_centres_that_are_not(cloth, tmp_path):
     cloud = replace(cloud, quats=rotation_to_quat(turn @ quat_to_rotation(cloud.quats)))
     cloud.means[0, 1] += 0.3
     write_ply(tmp_path / "flag.ply", cloud)
-    found = surfaces.tilts(tmp_path / "flag.ply", cloth)
+    found = trained.tilts(tmp_path / "flag.ply", cloth)
     assert found["gaussians"] == len(cloud.means) - 1
     assert found["height_rms_mm"] < 1e-3
     for size in (10, 20, 40):

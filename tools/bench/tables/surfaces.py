@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from bench.cases.surfaces import NORMALS, SIZES, WAYS
+from bench.cases.surfaces import WAYS
+from bench.cases.trained import NORMALS, SIZES
 from bench.slots import table
 from bench.tables.markdown import grid, source, yes_no
 
