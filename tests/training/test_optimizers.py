@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from gaussian_swaying.rendering.protocol import ScreenGaussians
 from gaussian_swaying.training.optimizers import make_optimizer, step_all
 
 
@@ -46,3 +47,12 @@ def test_the_selective_one_moves_what_was_seen():
     step_all([optimizer], torch.tensor([True, False, True, False], device="cuda"))
     assert (parameter[[1, 3]] == 1).all()
     assert (parameter[[0, 2]] < 1).all()
+
+
+def test_which_gaussians_a_picture_shows():
+    """From all of them, and from a list of those that were drawn."""
+    radii = torch.tensor([[2, 3], [0, 1], [4, 1]])
+    everything = ScreenGaussians(torch.zeros(1, 3, 2), radii[None], None, 8, 8)
+    assert everything.seen(3).tolist() == [True, False, True]
+    listed = ScreenGaussians(torch.zeros(3, 2), radii, torch.tensor([4, 0, 2]), 8, 8)
+    assert listed.seen(5).tolist() == [False, False, True, False, True]
