@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -42,9 +44,7 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
     # One plane per channel: (1, planes, H, W).
     x, y = (picture.movedim(-1, -3).reshape(1, -1, height, width) for picture in (image, target))
     planes = x.shape[1]
-    offsets = torch.arange(SSIM_TAPS, dtype=x.dtype, device=x.device) - SSIM_TAPS // 2
-    window = torch.exp(-0.5 * (offsets / _SIGMA).square())
-    window = window / window.sum()
+    window = _window(x.dtype, x.device)
     if padding != "valid":
         mode = "constant" if padding == "zeros" else padding
         x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, mode) for plane in (x, y))
@@ -61,6 +61,15 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
         (mean_x.square() + mean_y.square() + _C1) * (variance_x + variance_y + _C2)
     )
     return similarity.reshape(*image.shape[:-3], channels, *similarity.shape[-2:]).movedim(-3, -1)
+
+
+@cache
+def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Weights of the window along one side, shape (11,)."""
+    with torch.inference_mode(False):  # validation may ask first, and training needs its gradient
+        offsets = torch.arange(SSIM_TAPS, dtype=dtype, device=device) - SSIM_TAPS // 2
+        window = torch.exp(-0.5 * (offsets / _SIGMA).square())
+        return window / window.sum()
 
 
 def check_pictures(image: Tensor, target: Tensor) -> None:

@@ -123,7 +123,7 @@ def render_gsplat(
         opacities=opacities,  # for a tighter radius
     )
     values = torch.cat([colors.float()[None], depths[..., None]], dim=-1)
-    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera)
+    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities[None], camera)
     return _compose(pixels[0], alpha[0], background, dtype)
 
 
@@ -141,7 +141,8 @@ def rasterize_splat(
     eps2d: float = 0.3,
     absgrad: bool = False,
     channels: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    packed: bool = False,
+) -> tuple[Tensor, Tensor, ScreenGaussians]:
     """``gsplat.rasterization`` for one camera, built from gsplat's functions.
 
     Picture and gradients are the same. ``rasterization`` inverts the camera's matrix to find the eye, and the host
@@ -158,15 +159,15 @@ def rasterize_splat(
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
         absgrad: Keep absolute gradients of the centres on the screen.
         channels: Further values to blend behind the colours, over zero, shape (N, E).
+        packed: Keep values of the Gaussians in the picture alone, which takes less memory and one more wait.
 
     Returns:
-        Colours and further values (1, H, W, 3 + E), alphas (1, H, W, 1), centres on the screen (1, N, 2) and radii
-        (1, N, 2) [pixels].
+        Colours and further values (1, H, W, 3 + E), alphas (1, H, W, 1), and where the Gaussians are on the screen.
     """
     load_kernels()
     from gsplat import fully_fused_projection, spherical_harmonics
 
-    radii, means2d, depths, conics, _ = fully_fused_projection(
+    found = fully_fused_projection(
         means,
         None,
         quats,
@@ -177,18 +178,29 @@ def rasterize_splat(
         camera.height,
         eps2d=eps2d,
         near_plane=camera.near,
+        packed=packed,
         opacities=opacities,  # for a tighter radius
     )
-    seen = (radii > 0).all(-1)
-    toward = (means - camera.position)[None]
-    colors = spherical_harmonics(sh_degree(sh.shape[1]), toward, sh[None], masks=seen)
+    if packed:
+        _, image, index, radii, means2d, depths, conics, _ = found
+        ids = (image, index)
+        means, sh, opacities = means[index], sh[index], opacities[index]
+        channels = None if channels is None else channels[index]
+    else:
+        radii, means2d, depths, conics, _ = found
+        ids = None
+        means, sh, opacities = means[None], sh[None], opacities[None]
+        channels = None if channels is None else channels[None]
+    colors = spherical_harmonics(
+        sh_degree(sh.shape[-2]), means - camera.position, sh, masks=None if packed else (radii > 0).all(-1)
+    )
     values = (colors + 0.5).clamp_min(0.0)
     behind = None if background is None else background.to(means)[None]
     if channels is not None:
-        values = torch.cat([values, channels[None]], dim=-1)
-        behind = None if behind is None else torch.nn.functional.pad(behind, (0, channels.shape[1]))
-    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera, behind, absgrad)
-    return pixels, alpha, means2d, radii
+        values = torch.cat([values, channels], dim=-1)
+        behind = None if behind is None else torch.nn.functional.pad(behind, (0, channels.shape[-1]))
+    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera, behind, absgrad, ids)
+    return pixels, alpha, ScreenGaussians(means2d, radii, ids[1] if ids else None, camera.width, camera.height)
 
 
 def _rasterize(
@@ -201,24 +213,32 @@ def _rasterize(
     camera: Camera,
     background: Tensor | None = None,
     absgrad: bool = False,
+    ids: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Sort the Gaussians into tiles, for which the host waits, and blend values: (1, H, W, C) and (1, H, W, 1)."""
+    """Sort the Gaussians into tiles, for which the host waits, and blend values: (1, H, W, C) and (1, H, W, 1).
+
+    Packed values come with the image (all 0) and the Gaussian that each belongs to.
+    """
     from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     tiles = (-(-camera.width // _TILE), -(-camera.height // _TILE))
-    _, crossings, order = isect_tiles(means2d, radii, depths, _TILE, *tiles)
+    image, index = (None, None) if ids is None else ids
+    _, crossings, order = isect_tiles(
+        means2d, radii, depths, _TILE, *tiles, packed=ids is not None, n_images=1, image_ids=image, gaussian_ids=index
+    )
     offsets = isect_offset_encode(crossings, 1, *tiles).reshape(1, tiles[1], tiles[0])
     pixels, alpha = rasterize_to_pixels(
         means2d,
         conics,
         values,
-        opacities[None],
+        opacities,
         camera.width,
         camera.height,
         _TILE,
         offsets,
         order,
         backgrounds=background,
+        packed=ids is not None,
         absgrad=absgrad,
     )
     return pixels, alpha
@@ -237,18 +257,19 @@ class GsplatRenderer(nn.Module):
 
     Args:
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        packed: Keep values of the Gaussians in the picture alone in training, see :func:`rasterize_splat`.
 
     Raises:
         RuntimeError: If there is no CUDA device.
         ValueError: If ``eps2d`` is negative.
     """
 
-    def __init__(self, eps2d: float = 0.3) -> None:
+    def __init__(self, eps2d: float = 0.3, packed: bool = False) -> None:
         super().__init__()
         check_positive("eps2d", eps2d, allow_zero=True)
         if not torch.cuda.is_available():
             raise RuntimeError("GsplatRenderer needs CUDA, but torch finds no CUDA device: use TorchRenderer instead.")
-        self.eps2d = float(eps2d)
+        self.eps2d, self.packed = float(eps2d), bool(packed)
 
     def forward(
         self,
@@ -282,10 +303,10 @@ class GsplatRenderer(nn.Module):
         if means.device.type != "cuda":
             raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
         view = camera.to(means.device, torch.float32)
-        pixels, alpha, means2d, radii = rasterize_splat(
-            means, quats, log_scales.exp(), opacities, sh, view, background, self.eps2d, absgrad, channels
+        scales = log_scales.exp()
+        pixels, alpha, screen = rasterize_splat(
+            means, quats, scales, opacities, sh, view, background, self.eps2d, absgrad, channels, self.packed
         )
-        screen = ScreenGaussians(means2d, radii, None, camera.width, camera.height)
         if channels is None:
             return SplatOutput(pixels[0], alpha[0], screen)
         return SplatOutput(pixels[0, ..., :3], alpha[0], screen, pixels[0, ..., 3:])

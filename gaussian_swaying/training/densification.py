@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import torch
@@ -211,9 +212,7 @@ class DefaultDensification(Densification):
         """``gsplat.DefaultStrategy`` with these options."""
         if self.absgrad and device.type != "cuda":
             raise ValueError("`densification.absgrad` needs CUDA: leave it off on a CPU.")
-        from gsplat import DefaultStrategy
-
-        return DefaultStrategy(**self._options)
+        return _default_strategy()(**self._options)
 
     def _initial_state(self, scene_scale: float) -> dict[str, Any]:
         return dict(self._strategy.initialize_state(scene_scale=scene_scale))
@@ -266,6 +265,27 @@ class DefaultDensification(Densification):
             from gsplat.strategy.ops import reset_opa
 
             reset_opa(parameters, self._optimizers, self._state, value=2.0 * self.prune_opacity)
+
+
+@cache
+def _default_strategy() -> type:
+    """The ``DefaultStrategy`` of gsplat, without the waits for the GPU in its sums of gradients."""
+    from gsplat import DefaultStrategy
+
+    class Strategy(DefaultStrategy):
+        def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
+            if packed or state["grad2d"] is None or self.refine_scale2d_stop_iter > 0:
+                super()._update_state(params, state, info, packed)
+                return
+            means2d = info[self.key_for_gradient]
+            grads = (means2d.absgrad if self.absgrad else means2d.grad).clone()
+            grads[..., 0] *= info["width"] / 2.0 * info["n_cameras"]
+            grads[..., 1] *= info["height"] / 2.0 * info["n_cameras"]
+            seen = (info["radii"] > 0.0).all(dim=-1)  # as a mask: a list of indices would have to reach the host
+            state["grad2d"] += torch.where(seen, grads.norm(dim=-1), 0.0).sum(0)
+            state["count"] += seen.sum(0)
+
+    return Strategy
 
 
 def _is_per_row(value: Any, rows: int) -> bool:

@@ -1,9 +1,11 @@
-"""The check that the loss stays finite, without waiting for the GPU, and the error if it does not."""
+"""What is finite: the loss, checked without waiting for the GPU, and the Gaussians of a splat."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 
 
 class TrainingDiverged(RuntimeError):  # noqa: N818
@@ -46,3 +48,9 @@ class PendingLoss:
             self._arrived.synchronize()
         self.step = None
         return float(self._host)
+
+
+def finite_cloud(cloud: GaussianCloud) -> GaussianCloud:
+    """The Gaussians of a splat without those that are not finite."""
+    values = (cloud.means, cloud.quats, cloud.scales, cloud.opacities[:, None], cloud.sh.flatten(1))
+    return cloud.select(torch.cat(values, dim=1).isfinite().all(-1))

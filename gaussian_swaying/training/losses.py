@@ -173,11 +173,25 @@ class LossTerm(nn.Module, ABC):
 
     Attributes:
         start: Images trained on before the term begins.
+        stop: Images trained on before it ends; None for the end of the training.
+        fade: Images before ``stop`` over which its weight falls to zero in a straight line.
+        every: It is computed for one image in so many, with so many times its weight.
         needs: Some of :data:`NEEDS`.
     """
 
     start: int = 0
+    stop: int | None = None
+    fade: int = 0
+    every: int = 1
     needs: frozenset[str] = frozenset()
+
+    def share(self, step: int) -> float:
+        """What its weight is multiplied by at a step; 0 where it is not computed."""
+        if step < self.start or (step - self.start) % self.every:
+            return 0.0
+        if self.stop is None:
+            return float(self.every)
+        return self.every * min(max((self.stop - step) / max(self.fade, 1), 0.0), 1.0)
 
     @abstractmethod
     def forward(self, inputs: LossInputs) -> Tensor:
@@ -302,7 +316,7 @@ class TotalLoss(nn.Module):
     r"""Weighted sum of named terms, :math:`\mathcal L = \sum_k \lambda_k \mathcal L_k`.
 
     The four terms of Gaussian Swaying are included with its weights: ``rgb`` 1, ``anisotropy`` 10, ``entropy`` 0.01 and
-    ``size`` 0.01. A term with weight 0 is not computed, nor is one before its ``start``.
+    ``size`` 0.01. A term with weight 0 is not computed, nor is one where its :meth:`LossTerm.share` is 0.
 
     Args:
         terms: Further terms by name, or others in place of the four.
@@ -331,16 +345,17 @@ class TotalLoss(nn.Module):
                 raise ValueError(f"Expected `loss_weights.{name}` to be finite, but got {weight}.")
         if not any(self.weights.values()):
             raise ValueError("Expected one of `loss_weights` not to be zero.")
-        self.terms = nn.ModuleDict({name: term for name, term in named.items() if self.weights[name] != 0.0})
+        self._by_name = {name: term for name, term in named.items() if self.weights[name] != 0.0}
+        self.terms = nn.ModuleDict(self._by_name)
 
-    def active(self, step: int) -> dict[str, nn.Module]:
-        """The terms that have begun at a step, by name."""
-        return {name: term for name, term in self.terms.items() if getattr(term, "start", 0) <= step}
+    def active(self, step: int) -> dict[str, LossTerm]:
+        """The terms that are computed at a step, by name."""
+        return {name: term for name, term in self._by_name.items() if term.share(step)}
 
     def needs(self, step: int) -> frozenset[str]:
         """What these terms need, see :data:`NEEDS`."""
         wanted: frozenset[str] = frozenset()
-        return wanted.union(*(getattr(term, "needs", wanted) for term in self.active(step).values()))
+        return wanted.union(*(term.needs for term in self.active(step).values()))
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
         """The sum, with its gradient, and each active term before its weight, detached.
@@ -348,14 +363,15 @@ class TotalLoss(nn.Module):
         Raises:
             ValueError: If a term is not a number.
         """
-        values = {name: term(inputs) for name, term in self.active(inputs.step).items()}
+        terms = self.active(inputs.step)
+        values = {name: term(inputs) for name, term in terms.items()}
         for name, value in values.items():
             if value.dim():
                 raise ValueError(
                     f"Expected the term `{name}` to be a number, but got shape {tuple(value.shape)}: return the mean "
                     "or the sum."
                 )
-        total = sum(self.weights[name] * value for name, value in values.items())
-        if not isinstance(total, Tensor):  # no term has begun
+        total = sum(self.weights[name] * terms[name].share(inputs.step) * value for name, value in values.items())
+        if not isinstance(total, Tensor):  # no term is due
             total = inputs.image.new_zeros(())
         return total, {name: value.detach() for name, value in values.items()}

@@ -6,31 +6,32 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import lightning
 import torch
-from einops import rearrange
 from lightning.pytorch.utilities.types import STEP_OUTPUT
 from torch import Tensor
-from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
+from gaussian_swaying.training.counting import count_further_image, images_until_hooks, inner_hooks_used, number_batch
+from gaussian_swaying.training.data.datamodule import TrainingImage
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
-from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
+from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged, finite_cloud
+from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
-from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
-from gaussian_swaying.training.random_stream import random_state, set_random_state
+from gaussian_swaying.training.optimizers import OPTIMIZERS, make_optimizer, step_all
+from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
+from gaussian_swaying.training.random_stream import random_stream
 from gaussian_swaying.training.rates import LearningRates, means_rate
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 
@@ -41,8 +42,9 @@ class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
     A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one.
-    Random numbers come from a separate stream, which starts from the seed and is stored in checkpoints. So nothing else
-    changes them, and a resumed run continues exactly.
+    Lightning's callbacks are called after several images, see ``hooks_every``. Random numbers come from a separate
+    stream, which starts from the seed and is stored in checkpoints. So nothing else changes them, and a resumed run
+    continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
     the colours of the image are not premultiplied. Losses that compare two views also need the item ``index``, and
@@ -64,6 +66,10 @@ class SplatTrainer(lightning.LightningModule):
         seed: Seed of backgrounds and new Gaussians.
         panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
+        hooks_every: Images between calls of Lightning's callbacks, which also come where a checkpoint, a validation or
+            the end is due. The result does not depend on it.
+        optimizer: See :func:`~gaussian_swaying.training.optimizers.make_optimizer`; ``selective_adam`` needs CUDA.
+        packed: Keep values of the Gaussians in the picture alone: less memory on a GPU, one more wait.
         output: Folder of the panels and the final ``point_cloud.ply``; ``trainer.default_root_dir`` by default.
         init_ply: Splat with the initial Gaussians.
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
@@ -90,6 +96,9 @@ class SplatTrainer(lightning.LightningModule):
         seed: int = 0,
         panels: int = 3,
         log_every: int = 50,
+        hooks_every: int = 10,
+        optimizer: Literal["adam", "selective_adam"] = "adam",
+        packed: bool = False,
         output: str | None = None,
         init_ply: str | None = None,
         lpips: Literal["alex", "vgg", "squeeze"] | None = "alex",
@@ -100,6 +109,9 @@ class SplatTrainer(lightning.LightningModule):
         for name, value in (("sh_every", sh_every), ("panels", panels), ("seed", seed)):
             check_positive(name, value, allow_zero=True)
         check_positive("log_every", log_every)
+        check_positive("hooks_every", hooks_every)
+        check_choice("optimizer", optimizer, OPTIMIZERS)
+        self.hooks_every, self.optimizer, self.packed = int(hooks_every), optimizer, packed
         if scene_scale is not None:
             check_positive("scene_scale", scene_scale)
         self.automatic_optimization = False
@@ -124,6 +136,7 @@ class SplatTrainer(lightning.LightningModule):
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
         self._pending: PendingLoss | None = None
+        self._inner_hooks = True  # whether callbacks want to be called within a step
         self._seen = 0  # number of images that the checkpoint was trained on
         self._begun = 0  # [ns] start of the training
         self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
@@ -147,13 +160,7 @@ class SplatTrainer(lightning.LightningModule):
             check_positive("scene_scale", self.scene_scale)
         if self.model is None:
             if self.init_ply is not None:
-                cloud = read_gaussians(self.init_ply)
-                wanted = (self.sh_degree + 1) ** 2
-                sh = cloud.sh[:, :wanted]
-                missing = sh.new_zeros(len(cloud), wanted - sh.shape[1], 3)
-                cloud = GaussianCloud(
-                    cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.cat([sh, missing], 1), cloud.normals
-                )
+                cloud = gaussians_from_file(self.init_ply, self.sh_degree)
             elif hasattr(datamodule, "initial_cloud"):
                 cloud = datamodule.initial_cloud(self.sh_degree)
             else:
@@ -163,15 +170,12 @@ class SplatTrainer(lightning.LightningModule):
         self.model.reference_normals = None
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        """One Adam for each parameter, in the order of :data:`PARAMETERS`."""
+        """One optimiser for each parameter, in the order of :data:`PARAMETERS`."""
         assert self.scene_scale is not None
-        fused = self.splat.means.device.type == "cuda"
         rates = {name: getattr(self.rates, name) for name in PARAMETERS} | {
             "means": self.rates.means * self.scene_scale
         }
-        return [
-            torch.optim.Adam([getattr(self.splat, name)], lr=rates[name], eps=1e-15, fused=fused) for name in PARAMETERS
-        ]
+        return [make_optimizer(getattr(self.splat, name), rates[name], self.optimizer) for name in PARAMETERS]
 
     def on_fit_start(self) -> None:
         """Refuse settings that would silently train wrongly."""
@@ -190,6 +194,7 @@ class SplatTrainer(lightning.LightningModule):
         assert self.scene_scale is not None
         optimizers = dict(zip(PARAMETERS, self._raw_optimizers(), strict=True))
         self.densification.attach(self.splat, optimizers, self.scene_scale)
+        self._inner_hooks = inner_hooks_used(self.trainer, self)
 
     def _raw_optimizers(self) -> list[torch.optim.Optimizer]:
         found = self.optimizers(use_pl_optimizer=False)
@@ -237,28 +242,36 @@ class SplatTrainer(lightning.LightningModule):
             return self.renderer
         device = self.splat.means.device
         if device.type not in self._made:
-            self._made[device.type] = make_renderer(device)
+            self._made[device.type] = make_renderer(device, self.packed)
         return self._made[device.type]
 
-    def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
-        """One image: picture, losses, gradients, six optimisers, densification."""
-        outside = random_state(self.device)
-        if self._random:
-            set_random_state(self._random, self.device)
-        else:
-            torch.manual_seed(self.seed)
-        try:
-            return self._train_on(batch, self.global_step)
-        finally:
-            self._random = random_state(self.device)
-            set_random_state(outside, self.device)
+    def training_step(self, dataloader_iter: Iterator[tuple[Any, int, int]]) -> STEP_OUTPUT:
+        """Train on the images until Lightning's hooks are due, see ``hooks_every``.
+
+        Each image: picture, losses, gradients, six optimisers, densification.
+        """
+        loss: STEP_OUTPUT = None
+        with random_stream(self._random, self.device, self.seed):
+            for number in range(images_until_hooks(self.trainer, self.hooks_every)):
+                if number and getattr(dataloader_iter, "done", False):
+                    break
+                batch = self._on_device(next(dataloader_iter)[0])
+                if number:
+                    count_further_image(self.trainer)
+                loss = self._train_on(batch, self.global_step)
+            number_batch(self.trainer, dataloader_iter)
+        return loss
+
+    def _on_device(self, batch: Any) -> Any:
+        if isinstance(batch, TrainingImage):
+            return batch.to(self.device, non_blocking=True)
+        return self.trainer.strategy.batch_to_device(batch)
 
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
         optimizers = self._raw_optimizers()
-        means_optimizer, *others = optimizers
         assert self.scene_scale is not None
-        rate = means_rate(self.rates, self.scene_scale, step, int(self.trainer.max_steps))
-        means_optimizer.param_groups[0]["lr"] = rate
+        steps = int(self.trainer.max_steps)
+        optimizers[0].param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps)
         target, alpha, background = self._target(batch, train=True)
         needs = self.loss.needs(step)
         output = self.render(
@@ -285,17 +298,16 @@ class SplatTrainer(lightning.LightningModule):
         if not loss.requires_grad:  # no Gaussian in the picture, and the loss depends only on the picture
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
-        self.manual_backward(loss)
+        if self._inner_hooks:
+            self.manual_backward(loss)
+        else:
+            loss.backward()
         if self._pending is None:
             self._pending = PendingLoss(self.device)
         self._pending.send(step, loss.detach())
         if self.device.type != "cuda":
             self._check_pending()
-        # Lightning counts a step of its wrapper as one of `max_steps`: it wraps one optimiser only.
-        wrapped = self.optimizers()
-        (wrapped[0] if isinstance(wrapped, list) else wrapped).step()
-        for optimizer in others:
-            optimizer.step()
+        self._step(optimizers, output)
         for name in PARAMETERS:
             getattr(splat, name).grad = None
         self.densification.after_step(step, output.screen)
@@ -304,9 +316,20 @@ class SplatTrainer(lightning.LightningModule):
                 f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
                 "losses that lower opacities."
             )
-        if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
+        if step % self.log_every == 0 or step + 1 == steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
+
+    def _step(self, optimizers: list[torch.optim.Optimizer], output: SplatOutput) -> None:
+        """Step all optimisers; Lightning counts one."""
+        if self._inner_hooks and self.optimizer == "adam":
+            self.optimizers()[0].step()  # type: ignore[index]  # calls the hooks and counts
+            step_all(optimizers[1:])
+            return
+        counted = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
+        counted.increment_ready()
+        step_all(optimizers, output.screen.seen(len(self.splat)) if self.optimizer != "adam" else None)
+        counted.increment_completed()
 
     def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
         assert output.channels is not None
@@ -346,8 +369,8 @@ class SplatTrainer(lightning.LightningModule):
 
     def _log_step(self, loss: Tensor, terms: Mapping[str, Tensor], image: Tensor, target: Tensor) -> None:
         psnr = peak_signal_noise_ratio(image.clamp(0.0, 1.0), target, data_range=1.0)
-        self.log("psnr", psnr, prog_bar=True, logger=False)
-        self.log("gaussians", float(len(self.splat)), prog_bar=True, logger=False)
+        self.log("psnr", psnr, prog_bar=True, logger=False, batch_size=1)
+        self.log("gaussians", float(len(self.splat)), prog_bar=True, logger=False, batch_size=1)
         values: dict[str, Any] = {"loss": loss, "psnr": psnr, "gaussians": len(self.splat)} | dict(terms)
         values["rate_means"] = self._raw_optimizers()[0].param_groups[0]["lr"]
         for logger in self.trainer.loggers:  # not self.log, which would write them again at every step
@@ -384,7 +407,7 @@ class SplatTrainer(lightning.LightningModule):
             "scene_scale": self.scene_scale,
             "sh_degree": self.sh_degree,
             "seed": self.seed,
-            "random": self._random,
+            "random": dict(self._random),
             "seen": self.global_step,
         }
 
@@ -409,7 +432,7 @@ class SplatTrainer(lightning.LightningModule):
         )
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
-        self._random = {name: state.cpu() for name, state in stored["random"].items()}
+        self._random.update({name: state.cpu() for name, state in stored["random"].items()})
         self._seen = int(stored["seen"])
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
@@ -451,15 +474,8 @@ class SplatTrainer(lightning.LightningModule):
         fitting = self.trainer.state.fn == "fit"
         degree = self.active_degree(max(self.global_step - 1, 0)) if fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
-        one, two = (rearrange(picture, "h w c -> 1 c h w").float() for picture in (image, target))
-        values = {"psnr": peak_signal_noise_ratio(one, two, data_range=1.0)}
-        if min(image.shape[:2]) >= SSIM_TAPS:
-            ssim = structural_similarity_index_measure(one, two, data_range=1.0)
-            assert isinstance(ssim, Tensor)
-            values["ssim"] = ssim
-        if self._lpips and min(image.shape[:2]) >= LPIPS_SIDE:
-            values["lpips"] = self._lpips[0].to(self.device)(one, two)
-        for name, value in values.items():
+        lpips = self._lpips[0].to(self.device) if self._lpips else None
+        for name, value in picture_metrics(image, target, lpips).items():
             self._metrics.setdefault(name, []).append(value)
         if batch_idx < self.panels and not self.trainer.sanity_checking:
             step = self.global_step if fitting else self._seen
@@ -475,17 +491,8 @@ class SplatTrainer(lightning.LightningModule):
         return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
 
     def _write_panel(self, batch: Mapping[str, Any], target: Tensor, image: Tensor, name: str, step: int) -> None:
-        from imageio.v3 import imwrite
-
         pictures = panel(self.splat, self._drawing(), batch["camera"], target, image)
-        folder = self.folder / "panels"
-        folder.mkdir(parents=True, exist_ok=True)
-        pixels = (pictures * 255.0).round().clamp(0, 255).to(torch.uint8).cpu()
-        imwrite(folder / f"{name}_{step:06d}.png", pixels.numpy())
-        for logger in self.trainer.loggers:
-            board: Any = getattr(logger, "experiment", None)
-            if hasattr(board, "add_image"):
-                board.add_image(name, pixels.numpy(), step, dataformats="HWC")
+        write_panel(pictures, self.folder / "panels", name, step, self.trainer.loggers)
 
     # ---- the end
 
@@ -508,8 +515,6 @@ class SplatTrainer(lightning.LightningModule):
         Raises:
             ValueError: If none is finite.
         """
-        cloud = self.splat.to_cloud()
-        values = (cloud.means, cloud.quats, cloud.scales, cloud.opacities[:, None], cloud.sh.flatten(1))
-        finite = torch.cat(values, dim=1).isfinite().all(-1)
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        GaussianSurfaceModel.from_cloud(cloud.select(finite), requires_grad=False).save_ply(path)
+        finite = finite_cloud(self.splat.to_cloud())
+        GaussianSurfaceModel.from_cloud(finite, requires_grad=False).save_ply(path)

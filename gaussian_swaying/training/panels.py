@@ -1,16 +1,19 @@
-"""Panels to look at during training, and the LPIPS metric."""
+"""Panels to look at during training, and the metrics of a picture."""
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
+from einops import rearrange
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.protocol import Renderer
@@ -56,6 +59,40 @@ def panel(
         areas = (areas - low) / (high - low).clamp_min(1e-6)
     drawn = [renderer(*gaussians, colors, camera).color for colors in (normal_colors, colormap(areas))]
     return torch.cat([photo.to(image), image, *drawn], dim=1).clamp(0.0, 1.0)
+
+
+def write_panel(pictures: Tensor, folder: Path, name: str, step: int, loggers: Iterable[Any] = ()) -> None:
+    """Write a panel as PNG with its step in its name, and show it on the boards of loggers that take pictures."""
+    from imageio.v3 import imwrite
+
+    folder.mkdir(parents=True, exist_ok=True)
+    pixels = (pictures * 255.0).round().clamp(0, 255).to(torch.uint8).cpu()
+    imwrite(folder / f"{name}_{step:06d}.png", pixels.numpy())
+    for logger in loggers:
+        board: Any = getattr(logger, "experiment", None)
+        if hasattr(board, "add_image"):
+            board.add_image(name, pixels.numpy(), step, dataformats="HWC")
+
+
+def picture_metrics(image: Tensor, target: Tensor, lpips: Any | None = None) -> dict[str, Tensor]:
+    """PSNR [dB], and SSIM and LPIPS where a picture is large enough for them.
+
+    Args:
+        image: Picture from 0 to 1, shape (H, W, 3).
+        target: Photo, of the same shape.
+        lpips: The metric of :func:`lpips_metric`; None to leave it out.
+    """
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+    one, two = (rearrange(picture, "h w c -> 1 c h w").float() for picture in (image, target))
+    values = {"psnr": peak_signal_noise_ratio(one, two, data_range=1.0)}
+    if min(image.shape[:2]) >= SSIM_TAPS:
+        ssim = structural_similarity_index_measure(one, two, data_range=1.0)
+        assert isinstance(ssim, Tensor)
+        values["ssim"] = ssim
+    if lpips is not None and min(image.shape[:2]) >= LPIPS_SIDE:
+        values["lpips"] = lpips(one, two)
+    return values
 
 
 def lpips_metric(net: str = "alex") -> Any | None:

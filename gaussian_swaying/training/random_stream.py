@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -19,3 +20,24 @@ def set_random_state(state: Mapping[str, Tensor], device: torch.device) -> None:
     torch.set_rng_state(state["cpu"])
     if device.type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"], device)
+
+
+@contextmanager
+def random_stream(held: dict[str, Tensor], device: torch.device, seed: int) -> Iterator[None]:
+    """Draw random numbers from a separate stream, and leave those of others as they were.
+
+    Args:
+        held: The state of the stream, by :func:`random_state`; updated at the end. Empty before its start.
+        device: The device.
+        seed: Where the stream starts.
+    """
+    outside = random_state(device)
+    if held:
+        set_random_state(held, device)
+    else:
+        torch.manual_seed(seed)
+    try:
+        yield
+    finally:
+        held.update(random_state(device))
+        set_random_state(outside, device)

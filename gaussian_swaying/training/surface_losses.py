@@ -15,8 +15,6 @@ from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.planes import SurfaceMaps, depth_normals
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView
 
-_FLAT = 1e-4
-"""A patch with less variance of its grey values has nothing to compare: 0.01 of the range, three steps of a byte."""
 _GREY = (0.299, 0.587, 0.114)
 """Shares of red, green and blue (ITU-R BT.601)."""
 
@@ -163,21 +161,32 @@ def offsets(radius: int, like: Tensor) -> Tensor:
     return torch.stack([across.reshape(-1), down.reshape(-1)], dim=-1)
 
 
-def cross_correlation(one: Tensor, two: Tensor) -> tuple[Tensor, Tensor]:
+def cross_correlation(one: Tensor, two: Tensor, contrast: float = 0.01) -> tuple[Tensor, Tensor]:
     """Normalised cross-correlation of patches of grey values.
 
     Args:
         one: Values, shape (S, P).
         two: Values, shape (S, P).
+        contrast: Least standard deviation within a patch; there is nothing to compare in one with less.
 
     Returns:
         Correlations from -1 to 1, shape (S,), and where both patches have enough contrast, bool (S,).
     """
     one, two = one - one.mean(-1, keepdim=True), two - two.mean(-1, keepdim=True)
     first, second = one.square().mean(-1), two.square().mean(-1)
-    fine = (first > _FLAT) & (second > _FLAT)
+    fine = (first > contrast**2) & (second > contrast**2)
     scale = torch.where(fine, first * second, 1.0).sqrt()
     return torch.where(fine, (one * two).mean(-1) / scale, 0.0), fine
+
+
+def textured(image: Tensor, radius: int, contrast: float) -> Tensor:
+    """Where the patch around a pixel of a grey picture (H, W) has a standard deviation above ``contrast``, bool (H, W).
+
+    False within ``radius`` pixels of the border.
+    """
+    both = torch.stack([image, image.square()])[None]
+    mean, square = functional.avg_pool2d(both, 2 * radius + 1, stride=1)[0]
+    return functional.pad(square - mean.square() > contrast**2, [radius] * 4)
 
 
 def chosen_pixels(known: Tensor, count: int, margin: int) -> Tensor:
@@ -198,29 +207,46 @@ class SurfaceTerm(LossTerm):
 
     Args:
         start: Images trained on before this term begins.
+        stop: Images trained on before it ends; null for the end of the training.
+        fade: Images before ``stop`` over which its weight falls to zero, so that the picture can recover.
+        every: Compute it for one image in so many, with so many times its weight.
+
+    Raises:
+        ValueError: If ``start``, ``fade`` or ``every`` is too small, or ``stop`` is not after ``start``.
     """
 
     needs = frozenset({"surface"})
 
-    def __init__(self, start: int = 7000) -> None:
+    def __init__(self, start: int = 7000, stop: int | None = None, fade: int = 0, every: int = 1) -> None:
         super().__init__()
         check_positive("start", start, allow_zero=True)
-        self.start = int(start)
+        check_positive("fade", fade, allow_zero=True)
+        check_positive("every", every)
+        if stop is not None and stop <= start:
+            raise ValueError(f"Expected `stop` above `start` ({start}), but got {stop}.")
+        if fade and stop is None:
+            raise ValueError("Expected `stop` with `fade`: set the number of images after which the weight is zero.")
+        self.start, self.stop, self.fade, self.every = int(start), stop, int(fade), int(every)
 
 
 class DepthNormalLoss(SurfaceTerm):
     """Rendered normals against those of rendered depths, see :func:`depth_normal_loss`.
 
     Args:
-        start: Images trained on before this term begins.
+        start: See :class:`SurfaceTerm`.
         edges: Weigh pixels by :func:`edge_weight`.
+        stop: See :class:`SurfaceTerm`.
+        fade: See :class:`SurfaceTerm`.
+        every: See :class:`SurfaceTerm`.
 
     Raises:
-        ValueError: If ``start`` is negative.
+        ValueError: If a number is out of range.
     """
 
-    def __init__(self, start: int = 7000, edges: bool = True) -> None:
-        super().__init__(start)
+    def __init__(
+        self, start: int = 7000, edges: bool = True, stop: int | None = None, fade: int = 0, every: int = 1
+    ) -> None:
+        super().__init__(start, stop, fade, every)
         self.edges = bool(edges)
 
     def forward(self, inputs: LossInputs) -> Tensor:
@@ -237,9 +263,12 @@ class MultiViewGeometricLoss(SurfaceTerm):
     surface of the other view is taken as it is: its gradient comes when its turn comes.
 
     Args:
-        start: Images trained on before this term begins.
+        start: See :class:`SurfaceTerm`.
         samples: Pixels of an image that are tried.
         farthest: Longest distance that counts [pixels].
+        stop: See :class:`SurfaceTerm`.
+        fade: See :class:`SurfaceTerm`.
+        every: See :class:`SurfaceTerm`.
 
     Raises:
         ValueError: If a number is out of range.
@@ -247,8 +276,16 @@ class MultiViewGeometricLoss(SurfaceTerm):
 
     needs = frozenset({"surface", "other_view"})
 
-    def __init__(self, start: int = 7000, samples: int = 102_400, farthest: float = 1.0) -> None:
-        super().__init__(start)
+    def __init__(
+        self,
+        start: int = 7000,
+        samples: int = 102_400,
+        farthest: float = 1.0,
+        stop: int | None = None,
+        fade: int = 0,
+        every: int = 1,
+    ) -> None:
+        super().__init__(start, stop, fade, every)
         check_positive("samples", samples)
         check_positive("farthest", farthest)
         self.samples, self.farthest = int(samples), float(farthest)
@@ -274,10 +311,15 @@ class MultiViewPhotometricLoss(SurfaceTerm):
     :func:`warped_patches` and :func:`cross_correlation`.
 
     Args:
-        start: Images trained on before this term begins.
+        start: See :class:`SurfaceTerm`.
         samples: Patches of an image.
         radius: Half side of a patch [pixels].
         farthest: Longest round trip of a patch that counts [pixels].
+        contrast: Least standard deviation of the grey values (0 to 1) in a patch that counts. Where a surface has one
+            colour, a patch is noise.
+        stop: See :class:`SurfaceTerm`.
+        fade: See :class:`SurfaceTerm`.
+        every: See :class:`SurfaceTerm`.
 
     Raises:
         ValueError: If a number is out of range.
@@ -285,11 +327,22 @@ class MultiViewPhotometricLoss(SurfaceTerm):
 
     needs = frozenset({"surface", "other_view"})
 
-    def __init__(self, start: int = 7000, samples: int = 102_400, radius: int = 3, farthest: float = 1.0) -> None:
-        super().__init__(start)
-        for name, value in (("samples", samples), ("radius", radius), ("farthest", farthest)):
+    def __init__(
+        self,
+        start: int = 7000,
+        samples: int = 102_400,
+        radius: int = 3,
+        farthest: float = 1.0,
+        contrast: float = 0.01,
+        stop: int | None = None,
+        fade: int = 0,
+        every: int = 1,
+    ) -> None:
+        super().__init__(start, stop, fade, every)
+        for name, value in (("samples", samples), ("radius", radius), ("farthest", farthest), ("contrast", contrast)):
             check_positive(name, value)
         self.samples, self.radius, self.farthest = int(samples), int(radius), float(farthest)
+        self.contrast = float(contrast)
 
     def forward(self, inputs: LossInputs) -> Tensor:
         """See above; 0 if no patch can be compared, or no other view is close enough."""
@@ -297,7 +350,9 @@ class MultiViewPhotometricLoss(SurfaceTerm):
         other = inputs.other
         if other is None:
             return maps.depth.sum() * 0.0
-        place = chosen_pixels(maps.known[..., 0], self.samples, self.radius)
+        photo = grey(inputs.target)
+        worth = maps.known[..., 0] & textured(photo, self.radius, self.contrast)
+        place = chosen_pixels(worth, self.samples, self.radius)
         row, column = place.unbind(-1)
         pixel = place.flip(-1).to(maps.depth.dtype) + 0.5
         with torch.no_grad():
@@ -306,8 +361,8 @@ class MultiViewPhotometricLoss(SurfaceTerm):
             pixel, maps.unit[row, column], maps.distance[row, column], camera, other, self.radius
         )
         shift = offsets(self.radius, pixel).long()
-        here = grey(inputs.target)[row[:, None] + shift[:, 1], column[:, None] + shift[:, 0]]
-        alike, contrast = cross_correlation(here, there)
+        here = photo[row[:, None] + shift[:, 1], column[:, None] + shift[:, 0]]
+        alike, contrast = cross_correlation(here, there, self.contrast)
         weight = weight * (fine & contrast)
         return weighted_mean(1.0 - alike, weight)
 

@@ -164,14 +164,14 @@ def _interrupts():
 
 
 def _stop_at(monkeypatch, step, error):
-    train = SplatTrainer.training_step
+    train = SplatTrainer._train_on
 
-    def stop(self, batch, batch_idx):
-        if self.global_step == step:
+    def stop(self, batch, now):
+        if now == step:
             raise error
-        return train(self, batch, batch_idx)
+        return train(self, batch, now)
 
-    monkeypatch.setattr(SplatTrainer, "training_step", stop)
+    monkeypatch.setattr(SplatTrainer, "_train_on", stop)
 
 
 @pytest.mark.usefixtures("_interrupts")

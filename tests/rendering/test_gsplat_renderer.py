@@ -174,7 +174,8 @@ def test_one_process_compiles_the_kernels_of_gsplat_at_a_time(tmp_path, monkeypa
 @pytest.mark.gpu
 @pytest.mark.parametrize("absgrad", [False, True])
 @pytest.mark.parametrize("degree", [0, 2])
-def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(absgrad, degree):
+@pytest.mark.parametrize("packed", [False, True])
+def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(absgrad, degree, packed):
     """Colours, alphas and gradients; the sums of the kernels' atomics are in no fixed order."""
     from gsplat import rasterization
 
@@ -194,7 +195,8 @@ def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(absgrad, degre
     for own in (True, False):
         inputs = {name: value.cuda().requires_grad_() for name, value in leaves.items()}
         if own:
-            pixels, alpha, centres, radii = rasterize_splat(*inputs.values(), camera, background, 0.3, absgrad)
+            pixels, alpha, screen = rasterize_splat(*inputs.values(), camera, background, 0.3, absgrad, packed=packed)
+            centres, radii = screen.means2d, screen.radii
         else:
             pixels, alpha, meta = rasterization(
                 *(inputs[name] for name in ("means", "quats", "scales", "opacities", "sh")),
@@ -204,11 +206,12 @@ def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(absgrad, degre
                 70,
                 near_plane=camera.near,
                 sh_degree=degree,
-                packed=False,
+                packed=packed,
                 backgrounds=background[None],
                 absgrad=absgrad,
             )
             centres, radii = meta["means2d"], meta["radii"]
+            assert not packed or torch.equal(screen.index, meta["gaussian_ids"])
         centres.retain_grad()
         ((pixels[0] * weight).sum() + alpha.square().sum()).backward()
         kept = centres.absgrad if absgrad else centres.grad

@@ -196,3 +196,54 @@ def test_a_training_that_is_there_is_kept_with_its_account(tmp_path, monkeypatch
     assert flags.train(1, flags.VARIANTS["ours"], tmp_path, target, 7) == first
     (target / "training.json").unlink()
     assert flags.train(1, flags.VARIANTS["ours"], tmp_path, target, 7) == {"kept": True}
+
+
+def test_rows_with_trainings_at_the_same_time(tmp_path, monkeypatch):
+    """Each splat is trained once; a training that fails leaves its row, and no other."""
+    trained, simulated, saved = [], [], []
+
+    def train(pattern, variant, dataset, target, steps):
+        trained.append((pattern, target.name))
+        if target.name == "two_views":
+            (target.parent / "two_views.log").write_text("ValueError: no photos\n")
+            raise flags.subprocess.CalledProcessError(1, "train.py")
+        target.mkdir(parents=True)
+        (target / "point_cloud.ply").write_bytes(b"ply")
+        return {"seconds": 1.0, "steps": steps}
+
+    def run_row(pattern, variant, options, splat, output):
+        simulated.append(pattern)
+        return {"status": "complete", "splat": str(splat)}
+
+    monkeypatch.setattr(flags, "train", train)
+    monkeypatch.setattr(flags, "run_row", run_row)
+    monkeypatch.setattr(flags, "tilts", lambda splat, cloth: {"gaussians": 3})
+    for pattern in (1, 2):
+        (tmp_path / f"pattern{pattern}").mkdir()
+        (tmp_path / f"pattern{pattern}" / "cloth.npz").write_bytes(b"")
+    given = {"rows": "ours,neighbours,two_views", "patterns": "1,2", "splats": str(tmp_path / "splats"), "more": None}
+    given |= {"dataset": str(tmp_path), "train_steps": 7, "at_once": 3, "sims_at_once": 2, "pictures": str(tmp_path)}
+    result = {"rows": {"membrane": {"1": {"status": "complete"}}}}
+    flags.measure(flags.argparse.Namespace(**given), result, lambda now: saved.append(len(now["rows"])))
+    assert sorted(trained) == [(1, "all_losses"), (1, "two_views"), (2, "all_losses"), (2, "two_views")]
+    assert sorted(simulated) == [1, 1, 2, 2]
+    rows = result["rows"]
+    assert rows["membrane"] == {"1": {"status": "complete"}}
+    assert rows["two_views"]["2"]["failed"] == "ValueError: no photos"
+    assert rows["ours"]["1"]["tilt"] == {"gaussians": 3}
+    assert "tilt" not in rows["neighbours"]["1"]
+    assert rows["neighbours"]["2"]["training"] == {"seconds": 1.0, "steps": 7, "at_once": 3}
+    assert len(saved) == 6
+
+
+def test_two_view_options_parse_for_any_number_of_images(tmp_path, monkeypatch):
+    from gaussian_swaying.cli.train import make_cli
+
+    monkeypatch.chdir(tmp_path)
+    given = [f"--config={ROOT}/configs/train/default.yaml", f"--config={ROOT}/configs/bench/train.yaml"]
+    cli = make_cli([*given, *flags.filled(flags.GENTLE, 100), "--trainer.accelerator=cpu"], run=False)
+    for name in ("geometric", "photometric"):
+        term = cli.model.loss.terms[name]
+        assert (term.start, term.stop, term.every) == (50, 100, 2)
+        assert term.share(50) > 0
+    assert cli.model.loss.terms["photometric"].contrast == 0.03

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bench.cases import surfaces
+from bench.cases import surfaces, trained
 from bench.tables.surfaces import goal_table, limits_table, rows_table
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
@@ -35,7 +35,7 @@ def test_axes_that_are_turned_and_centres_that_are_not(cloth, tmp_path):
     cloud = replace(cloud, quats=rotation_to_quat(turn @ quat_to_rotation(cloud.quats)))
     cloud.means[0, 1] += 0.3
     write_ply(tmp_path / "flag.ply", cloud)
-    found = surfaces.tilts(tmp_path / "flag.ply", cloth)
+    found = trained.tilts(tmp_path / "flag.ply", cloth)
     assert found["gaussians"] == len(cloud.means) - 1
     assert found["height_rms_mm"] < 1e-3
     for size in (10, 20, 40):
@@ -83,3 +83,27 @@ def test_tables():
     assert goal_table(result)[-1] == "| training at most 1.6 times as long | 2.00 times, 1.54 times | no |"
     assert "| 0.60, 0.60 | 0.40, 0.40 | 0.08, 0.08 | 1.00, 1.00 |" in rows_table(result)[-1]
     assert limits_table(result)[-1] == "| all of the views (175) | 71 | 0.0010 | 0.010 | 0.0010 |"
+
+
+def test_ways_are_compared_at_the_same_time(tmp_path, monkeypatch):
+    """Splats that exist are not trained again; each is simulated with both kinds of normals; gentler losses count."""
+    for way in ("paper", "gentle"):
+        (tmp_path / f"{way}_0").mkdir()
+        (tmp_path / f"{way}_0" / "point_cloud.ply").write_bytes(b"ply")
+    monkeypatch.setattr(surfaces, "limits", lambda photos: {})
+    monkeypatch.setattr(surfaces, "tilts", lambda splat, cloth: _row(1, 1)["tilt"])
+
+    def run_row(pattern, variant, options, splat, output, pictures):
+        assert not pictures
+        return {"chamfer_share": 0.03 if options.more.endswith("smallest_axis") else 0.015}
+
+    monkeypatch.setattr(surfaces, "run_row", run_row)
+    given = {"ways": "paper,gentle", "seeds": 1, "dataset": str(tmp_path), "pattern": 2, "train_steps": 7, "at_once": 2}
+    given |= {"splats": str(tmp_path), "more": "--frames=2"}
+    saved, result = [], {"device": "NVIDIA H200", "versions": {"torch": "2"}}
+    surfaces.measure(surfaces.argparse.Namespace(**given), result, lambda now: saved.append(len(now["rows"])))
+    assert saved == [1, 2]
+    for way in ("paper", "gentle"):
+        assert result["rows"][way]["0"]["chamfer"] == {"smallest_axis": 0.03, "neighbours": 0.015}
+    result["rows"]["views"] = {"0": _row(30.0, 400.0)}
+    assert "| 1.50 % | yes |" in goal_table(result)[-1]

@@ -20,16 +20,17 @@ def _result(**sections):
 def test_goals_are_judged_from_the_medians():
     pair = {
         "bare": [_row(), _row(seconds=44.0), _row(seconds=39.0, psnr_db=25.2)],
-        "lightning": [_row(seconds=43.9, psnr_db=24.95), _row(seconds=43.0, psnr_db=24.8), _row(seconds=60.0)],
+        "lightning": [_row(seconds=42.0, psnr_db=24.95), _row(seconds=41.0, psnr_db=24.8), _row(seconds=60.0)],
     }
     found = {goal: (value, reached) for goal, value, reached in tables.goals(_result(pair=pair))}
     assert found["capture: test PSNR at most 0.1 dB below the bare loop"] == ("-0.05 dB", True)
-    assert found["capture: at most 1.10 times as long as the bare loop"] == ("1.10 times", True)
+    assert found["capture: at most 1.05 times as long as the bare loop"] == ("1.05 times", True)
+    assert found["capture: faster than the bare loop"] == ("1.05 times", False)
     assert found["capture: GPU memory within 1 GiB"] == ("0.50 GiB", True)
     pair["lightning"] = [_row(seconds=44.1, psnr_db=24.89, memory_bytes=2**31)]
-    assert [reached for _, _, reached in tables.goals(_result(pair=pair))] == [False, False, False]
+    assert [reached for _, _, reached in tables.goals(_result(pair=pair))] == [False, False, False, False]
     variants = {"mcmc": _row(psnr_db=25.4), "absgrad": {"failed": "x"}, "surface": _row(psnr_db=24.0)}
-    best = tables.goals(_result(pair=pair, variants=variants))[3]
+    best = tables.goals(_result(pair=pair, variants=variants))[4]
     assert best[1:] == ("+0.40 dB (MCMC, 300,000 Gaussians)", True)
 
 

@@ -204,3 +204,23 @@ def test_a_split_before_the_end_of_densification_is_refused():
         DefaultDensification(stop=100, split_at=99)
     with pytest.raises(ValueError, match="split_size"):
         DefaultDensification(split_size=0.0)
+
+
+def test_sums_of_gradients_without_waiting_are_those_of_gsplat():
+    """The same sums and counts, bit for bit, over pictures that show different Gaussians."""
+    from gsplat import DefaultStrategy
+
+    ours, theirs = DefaultDensification().make_strategy(torch.device("cpu")), DefaultStrategy()
+    parameters = {"means": torch.zeros(50, 3)}
+    states = [strategy.initialize_state(scene_scale=1.0) for strategy in (ours, theirs)]
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(4):
+        means2d = torch.rand(1, 50, 2, generator=generator)
+        means2d.grad = torch.randn(1, 50, 2, generator=generator)
+        radii = torch.randint(0, 3, (1, 50, 2), generator=generator)
+        info = {"means2d": means2d, "radii": radii, "gaussian_ids": None, "width": 96, "height": 54, "n_cameras": 1}
+        for strategy, state in zip((ours, theirs), states, strict=True):
+            strategy._update_state(parameters, state, info)
+    assert states[1]["count"].unique().numel() > 2
+    for name in ("grad2d", "count"):
+        assert torch.equal(states[0][name], states[1][name])

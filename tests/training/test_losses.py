@@ -173,3 +173,20 @@ def test_total_with_a_term_of_ones_own():
 def test_bad_terms(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+class _Ones(LossTerm):
+    """One, whenever it is asked."""
+
+    def forward(self, inputs):
+        return inputs.log_scales.sum() * 0.0 + 1.0
+
+
+def test_terms_at_some_images_with_a_weight_that_fades():
+    term = _Ones()
+    term.start, term.stop, term.fade, term.every = 4, 12, 4, 2
+    total = TotalLoss({"one": term}, {"rgb": 0.0, "anisotropy": 0.0, "entropy": 0.0, "size": 0.0, "one": 0.5})
+    found = [float(total(_inputs(step=step))[0]) for step in range(15)]
+    assert found == [0, 0, 0, 0, 1, 0, 1, 0, 1, 0, 0.5, 0, 0, 0, 0]
+    assert [bool(total.active(step)) for step in (3, 4, 5, 10, 12)] == [False, True, False, True, False]
+    assert [_Ones().share(step) for step in (0, 1, 99)] == [1.0] * 3

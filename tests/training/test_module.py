@@ -145,7 +145,7 @@ def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path
                 module.splat.quats.data[3] = math.nan
 
     only_rgb = {"anisotropy": 0, "entropy": 0, "size": 0}
-    module = _module(loss_weights=only_rgb, densification=NoDensification())
+    module = _module(loss_weights=only_rgb, densification=NoDensification(), hooks_every=1)
     callbacks = [Spoils(), _checkpoints(tmp_path, every=3)]
     with pytest.raises(TrainingDiverged, match=r"step 6: a value of `.*step=3\.ckpt"):
         make_trainer(20, enable_checkpointing=True, callbacks=callbacks).fit(module, data)

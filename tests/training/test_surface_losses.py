@@ -23,6 +23,7 @@ from gaussian_swaying.training.surface_losses import (
     edge_weight,
     round_trip,
     sample,
+    textured,
     warped_patches,
 )
 
@@ -305,3 +306,33 @@ def test_a_datamodule_without_other_views_is_named(data, make_trainer):
     module = SplatTrainer(loss_terms=TERMS, sh_degree=0, lpips=None)
     with pytest.raises(ValueError, match="other_view"):
         make_trainer(6).fit(module, data)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"start": 10, "stop": 10}, r"`stop` above `start` \(10\)"),
+        ({"fade": 5}, "`stop` with `fade`"),
+        ({"every": 0}, "`every`"),
+        ({"fade": -1, "stop": 8000}, "`fade`"),
+    ],
+)
+def test_bad_times_of_terms(options, words):
+    for kind in (DepthNormalLoss, MultiViewGeometricLoss, MultiViewPhotometricLoss):
+        with pytest.raises(ValueError, match=words):
+            kind(**options)
+
+
+def test_patches_of_one_colour_are_left_out():
+    """A picture with a print in its left half: only patches that reach into it count."""
+    image = torch.full((40, 60), 0.5)
+    image[:, :20] += 0.1 * (torch.arange(20) % 2)
+    found = textured(image, 3, 0.01)
+    rows, columns = found.nonzero().unbind(-1)
+    assert (int(rows.min()), int(rows.max())) == (3, 36)
+    assert int(columns.min()) == 3
+    assert 20 <= int(columns.max()) <= 23  # the last that reaches into it has one column of it
+    assert found[3:-3, 3:20].all()
+    patches = image.unfold(0, 7, 1).unfold(1, 7, 1).reshape(34 * 54, 49)
+    assert torch.equal(found[3:-3, 3:-3].reshape(-1), cross_correlation(patches, patches)[1])
+    assert not cross_correlation(patches, patches, contrast=0.2)[1].any()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 
 from gaussian_swaying._files import write_text
 from gaussian_swaying._provenance import describe_device, versions
@@ -47,12 +48,33 @@ def kept_rows(folder: Path, name: str, keep: Callable[[Row], bool]) -> list[Row]
 
 
 def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable[..., None]) -> None:
-    """Add to an earlier record of the same device, and write after each part."""
+    """Add to an earlier record of the same device, and write after each part.
+
+    What another process has added to the record meanwhile is kept.
+    """
     folder = Path(options.results)
     path = folder / f"{name}.json"
     if path.exists():
         kept = json.loads(path.read_text())
         if kept["device"] == result["device"]:
             result = kept | result
-    measure(options, result, lambda now: write(folder, name, now, quiet=True))
+
+    def save(now: Row) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        with FileLock(path.with_suffix(".lock")):
+            there = json.loads(path.read_text()) if path.exists() else {}
+            write(folder, name, merged(there, now) if there.get("device") == now["device"] else now, quiet=True)
+
+    measure(options, result, save)
+    path.with_suffix(".lock").unlink(missing_ok=True)
     print(f"wrote {path}")
+
+
+def merged(old: Row, new: Row) -> Row:
+    """A record with the rows of both, those of ``new`` where both have one; tables of rows are merged, rows are not."""
+    both = dict(old)
+    for key, value in new.items():
+        tables = [part for part in (value, both.get(key)) if isinstance(part, dict)]
+        deeper = len(tables) == 2 and all(isinstance(row, dict) for part in tables for row in part.values())
+        both[key] = merged(both[key], value) if deeper else value
+    return both

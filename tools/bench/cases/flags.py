@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from bench.cases.trained import GENTLE, filled, last_psnr, tilts
 from bench.record import ROOT
 from bench.tables.figure import save_figure
 from gaussian_swaying.evaluation.compare import compare_run
@@ -54,6 +58,8 @@ def grid_options(dx: float) -> tuple[str, ...]:
     return (f"--solver.dx={dx:g}", f"--scene.particle_spacing={0.45 * dx:g}")
 
 
+_NEIGHBOURS = ("--scene.normals=neighbours",)
+
 VARIANTS: dict[str, Variant] = {
     "ours": Variant("ours (`total`, three layers)"),
     "particle": Variant("PhysGaussian's way", ("particle",)),
@@ -64,6 +70,8 @@ VARIANTS: dict[str, Variant] = {
     "paper_area": Variant("patch areas π s1 s2", ("paper_area",)),
     "membrane": Variant("one layer (no bending stiffness)", options=("--scene.layers=1",)),
     "true_normals": Variant("with the reference's normals at rest", patterns=(2, 3), true_normals=True),
+    "neighbours": Variant("normals of neighbouring centres", options=_NEIGHBOURS),
+    "two_views": Variant("trained with two views, normals of neighbouring centres", (), _NEIGHBOURS, training=GENTLE),
     "one_point": Variant("one point per Gaussian", options=("--scene.particle_spacing=null",)),
     "total_04": Variant("`total`, dx = 0.04 m", options=grid_options(0.04)),
     "total_03": Variant("`total`, dx = 0.03 m", options=grid_options(0.03)),
@@ -135,11 +143,11 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
     command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
     command += [f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"]
     command += [f"--data.init_args.path={dataset / f'pattern{pattern}' / 'train'}"]
-    command += [f"--trainer.default_root_dir={target}", *variant.training]
+    command += [f"--trainer.default_root_dir={target}", *filled(variant.training, steps)]
     begin = time.perf_counter()
     with (target.parent / f"{target.name}.log").open("w") as log:
         subprocess.run(command, check=True, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT)
-    row: Row = {"seconds": time.perf_counter() - begin, "steps": steps}
+    row: Row = {"seconds": time.perf_counter() - begin, "steps": steps, "psnr_db": last_psnr(target)}
     account.write_text(json.dumps(row))
     return row
 
@@ -187,7 +195,7 @@ def run_row(
     if not pictures or len(list((reference / "video" / "frames").glob("*.png"))) != 250:  # they may not be finished yet
         bare = output.parent / f"surface_{pattern}"
         bare.mkdir(parents=True, exist_ok=True)
-        if not (bare / "cloth.npz").exists():
+        with contextlib.suppress(FileExistsError):  # another row made it
             (bare / "cloth.npz").symlink_to((reference / "cloth.npz").resolve())
         reference = bare
         command += ["--recorder.images=false", "--recorder.video=false"]
@@ -267,10 +275,35 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--splats", default="outputs/flags", help="folder of the trained splats; `made` for splats "
                          "made in code, without training")  # fmt: skip
     command.add_argument("--train_steps", type=int, default=7000, help="images of a training run")
+    command.add_argument("--at_once", type=int, default=1, help="training runs at the same time")
+    command.add_argument("--sims_at_once", type=int, default=1, help="simulations at the same time; their times then "
+                         "mean little")  # fmt: skip
     command.add_argument("--frames", type=int, help="only the first frames")
     command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
+
+
+def splat_folder(options: argparse.Namespace, name: str, pattern: int) -> Path:
+    """Folder of the splat of a row; rows without a training of their own share one."""
+    return Path(options.splats) / f"pattern{pattern}" / (name if VARIANTS[name].training else "all_losses")
+
+
+def train_all(jobs: list[tuple[str, int]], options: argparse.Namespace) -> dict[Path, Row]:
+    """Train the splats that rows need, several at the same time, and return their accounts by folder."""
+    wanted = {splat_folder(options, name, pattern): (name, pattern) for name, pattern in jobs}
+
+    def one(item: tuple[Path, tuple[str, int]]) -> tuple[Path, Row]:
+        target, (name, pattern) = item
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            row = train(pattern, VARIANTS[name], Path(options.dataset), target, options.train_steps)
+        except subprocess.CalledProcessError:
+            row = {"failed": what_failed((target.parent / f"{target.name}.log").read_text())}
+        return target, row | ({"at_once": options.at_once} if options.at_once > 1 else {})
+
+    with ThreadPoolExecutor(options.at_once) as pool:
+        return dict(pool.map(one, wanted.items()))
 
 
 def open_dataset(dataset: Path, patterns: list[int], result: Row) -> None:
@@ -298,28 +331,42 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
     result["more"] = options.more or ""
     rows = result.setdefault("rows", {})
+    made = options.splats == "made"
+    jobs = [(name, p) for name in names for p in patterns if p in VARIANTS[name].patterns]
+    if made:  # there is nothing to train, and the normals are right
+        jobs = [job for job in jobs if not VARIANTS[job[0]].training and not VARIANTS[job[0]].true_normals]
+    trained = {} if made else train_all(jobs, options)
+    lock = threading.Lock()
     with tempfile.TemporaryDirectory() as scratch:
-        for name in names:
-            variant = VARIANTS[name]
-            for pattern in [p for p in patterns if p in variant.patterns]:
-                splat = None
-                row: Row = {}
-                if options.splats != "made":
-                    home = Path(options.splats) / f"pattern{pattern}"
-                    home.mkdir(parents=True, exist_ok=True)
-                    target = home / (name if variant.training else "all_losses")
-                    row["training"] = train(pattern, variant, Path(options.dataset), target, options.train_steps)
-                    splat = target / "point_cloud.ply"
-                    if variant.true_normals:
-                        own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
-                        turn_to_reference(own, Path(options.dataset) / f"pattern{pattern}" / "cloth.npz", splat)
-                elif variant.training or variant.true_normals:
-                    continue  # there is nothing to train, and the normals are right
+
+        def simulate(job: tuple[str, int]) -> None:
+            name, pattern = job
+            variant, splat = VARIANTS[name], None
+            row: Row = {}
+            if not made:
+                target = splat_folder(options, name, pattern)
+                row["training"] = trained[target]
+                splat = target / "point_cloud.ply"
+                cloth = Path(options.dataset) / f"pattern{pattern}" / "cloth.npz"
+                if splat.exists() and variant.true_normals:
+                    own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
+                    turn_to_reference(own, cloth, splat)
+                if splat.exists() and (variant.training or name == "ours"):
+                    row["tilt"] = tilts(splat, cloth)
+            if splat is not None and not splat.exists():
+                row["failed"] = row["training"].get("failed", "no splat")
+            else:
                 row |= run_row(pattern, variant, options, splat, Path(scratch) / f"{name}_{pattern}")
+            if options.sims_at_once > 1:
+                row["sims_at_once"] = options.sims_at_once
+            with lock:
                 rows.setdefault(name, {})[str(pattern)] = row
                 shown = {k: v for k, v in row.items() if k != "chamfer_per_frame_m"}
                 print(f"pattern {pattern}, {name}: {json.dumps(shown)}", flush=True)
                 save(result)
+
+        with ThreadPoolExecutor(options.sims_at_once) as pool:
+            list(pool.map(simulate, jobs))
         for pattern in patterns:
             runs = {n: Path(scratch) / f"{n}_{pattern}" for n in names if (Path(scratch) / f"{n}_{pattern}").is_dir()}
             target = Path(options.pictures) / f"flags_pattern{pattern}.png"

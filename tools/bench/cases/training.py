@@ -68,6 +68,17 @@ FOX_VARIANTS: dict[str, tuple[str, list[str]]] = {
         [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000", "--model.sh_every=500"],
     ),
     "degree_1": ("harmonics of degree 1", [*_weights(**_NO_SURFACE), "--model.sh_degree=1"]),
+    "hooks_1": ("Lightning's hooks after every image", [*_weights(**_NO_SURFACE), "--model.hooks_every=1"]),
+    "selective": ("gsplat's selective Adam", [*_weights(**_NO_SURFACE), "--model.optimizer=selective_adam"]),
+    "packed": ("gsplat's packed projection", [*_weights(**_NO_SURFACE), "--model.packed=true"]),
+    "passes": (
+        "densification every 200 images",
+        [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.every=200"],
+    ),
+    "settled": (
+        "densification until step 4,000",
+        [*_weights(**_NO_SURFACE), *_DEFAULT, "--model.densification.stop=4000"],
+    ),
 }
 """Variants of the schedule of the bare loop on the fox: name to description and command line."""
 

@@ -1,0 +1,83 @@
+"""The optimisers of the Gaussians, and their steps without the detours of ``Optimizer.step``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+OPTIMIZERS = ("adam", "selective_adam")
+"""Kinds of :func:`make_optimizer`."""
+
+
+def make_optimizer(parameter: Tensor, rate: float, kind: str = "adam") -> torch.optim.Optimizer:
+    """An optimiser of one parameter of the Gaussians.
+
+    Args:
+        parameter: The parameter, shape (N, ...).
+        rate: Its learning rate.
+        kind: ``adam``, or ``selective_adam``: gsplat's Adam of the Gaussians in the picture alone (Mallick et al. 2024,
+            "Taming 3DGS"); CUDA only. It does not correct the bias of the first steps.
+
+    Raises:
+        ValueError: If ``kind`` does not run on the parameter's device.
+    """
+    on_gpu = parameter.device.type == "cuda"
+    if kind == "adam":
+        return torch.optim.Adam([parameter], lr=rate, eps=1e-15, fused=on_gpu)
+    if not on_gpu:
+        raise ValueError(f"`optimizer` {kind} needs CUDA, but the Gaussians are on {parameter.device}: use adam there.")
+    from gsplat import SelectiveAdam
+
+    made: torch.optim.Optimizer = SelectiveAdam([parameter], eps=1e-15, betas=(0.9, 0.999))
+    made.param_groups[0]["lr"] = rate
+    return made
+
+
+def step_all(optimizers: Sequence[torch.optim.Optimizer], seen: Tensor | None = None) -> None:
+    """Step optimisers with one parameter each.
+
+    Fused Adams are stepped by torch's kernel, as ``step`` would; all else that ``step`` does takes the host longer than
+    the kernel takes the GPU.
+
+    Args:
+        optimizers: The optimisers, from :func:`make_optimizer`.
+        seen: Which Gaussians were in the picture, bool (N,), for ``selective_adam``.
+    """
+    fused: list[tuple[dict[str, Any], Tensor, Tensor, dict[str, Tensor]]] = []
+    one: Any
+    for one in optimizers:
+        group = one.param_groups[0]
+        parameter = group["params"][0]
+        state = one.state.get(parameter)
+        if parameter.grad is None:
+            continue
+        if type(one) is not torch.optim.Adam:
+            one.step(visibility=seen)
+        elif group["fused"] and state:
+            fused.append((group, parameter, parameter.grad, state))
+        else:
+            one.step()
+    if not fused:
+        return
+    with torch.no_grad():
+        torch._foreach_add_([state["step"] for *_, state in fused], 1.0)
+        for group, parameter, gradient, state in fused:
+            beta1, beta2 = group["betas"]
+            torch._fused_adam_(
+                [parameter],
+                [gradient],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                lr=group["lr"],
+                beta1=beta1,
+                beta2=beta2,
+                weight_decay=group["weight_decay"],
+                eps=group["eps"],
+                amsgrad=False,
+                maximize=group["maximize"],
+            )
