@@ -1,7 +1,7 @@
 """Flow round bodies in the wind as Triton functions, for the fused substep.
 
 The references are ``aero.obstacle_flow`` and ``aero.obstacles``; ``aero.effects_twin`` says what they read. All of it is
-computed in float32.
+is computed in float32.
 """
 
 import triton

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import torch
@@ -203,18 +204,44 @@ class WindForce(Force):
         """:meth:`force` in the wind of ``state.time``."""
         return self.force(state, self.air(state.time, state.position))
 
+    def _shelters(self) -> list[Shelter]:
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)):
+            return []
+        return [effect for effect in wind.effects if isinstance(effect, Shelter)]
+
+    def foreseen(self, state: MPMState) -> WindForce:
+        """The same force as it will be in the frame that starts with a state; this one does not change.
+
+        Shelters of the result have tables of their own, as this one may be in use on another stream.
+        """
+        if not self._shelters():
+            return self
+        other, wind = copy(self), copy(self._fields[0])
+        wind._modules = dict(wind._modules)
+        effects = [copy(effect) for effect in wind.effects]
+        for effect in effects:
+            if isinstance(effect, Shelter):
+                effect._buffers = {name: held.clone() for name, held in effect._buffers.items() if held is not None}
+        wind.effects = nn.ModuleList(effects)
+        other._modules = {**self._modules, "_fields": nn.ModuleList([wind])}
+        other.refresh(state)
+        return other
+
+    def refreshed(self) -> list[Tensor]:
+        """The tensors that :meth:`refresh` writes."""
+        return tensors_in(self._shelters())
+
     def refresh(self, state: MPMState) -> None:
         """Take in how the body stands now, for :class:`~gaussian_swaying.aero.shelter.Shelter`; once in a frame.
 
         Args:
             state: The state at the start of the frame.
         """
-        wind = self._fields[0]
-        if not (self._shared and isinstance(wind, WindField)) or state.position.ndim > 2:
+        wind, shelters = self._fields[0], self._shelters()
+        if not shelters or state.position.ndim > 2:
             return
-        shelters = [effect for effect in wind.effects if isinstance(effect, Shelter)]
-        if not shelters:
-            return
+        assert isinstance(wind, WindField)
         with torch.no_grad():
             flow = wind.mean_flow(state.time)
             axes = wind_axes(flow)

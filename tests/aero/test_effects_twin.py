@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from gaussian_swaying.aero import effects_twin
 from gaussian_swaying.aero.carried import CarriedField, Turbulence
 from gaussian_swaying.aero.effects import LogProfile, PowerProfile
 from gaussian_swaying.aero.force import AeroForce
@@ -66,8 +67,8 @@ def _wind(name):
         "held": [_field((False, True, False))],
         "sphere": [SphereObstacle(MIDDLE, 0.05)],
         "cylinder": [CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0])],
-        "ellipsoid": [EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0)],
-        "wall": [EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05], drag=0.0)],
+        "ellipsoid": [EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0)],
+        "wall": [EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05])],
         "several": [
             LogProfile(**low, roughness=0.02),
             CylinderObstacle([0.02, 0.1, 0.1], 0.02, street=False),
@@ -146,6 +147,24 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
     torch.testing.assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
     for one, other in ((1, 2), (2, 3)):
         assert float((ends[one].velocity - ends[other].velocity).abs().max()) > 1e-3
+
+
+def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
+    """A shelter is refreshed in every frame; the turbulence before it has fifty megabytes in its full size."""
+    _, state, load = _bodies(kernel_device, "total", _wind("sheltered"))
+    load.twin()
+    written, write = [], effects_twin._write
+    monkeypatch.setattr(effects_twin, "_write", lambda effect, *to: written.append(effect) or write(effect, *to))
+    load.twin()
+    assert written == []
+    load.refresh(state)
+    load.twin()
+    assert written == [load.wind.effects[1]]
+    load.wind.effects[0].table.mul_(2.0)
+    space = load.twin().space.clone()
+    assert written == list(load.wind.effects)[::-1]
+    load._space = None
+    assert torch.equal(load.twin().space, space)
 
 
 def test_the_last_place_of_a_table_that_repeats(kernel_device):
