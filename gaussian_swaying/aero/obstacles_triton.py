@@ -1,13 +1,14 @@
 """Flow round bodies in the wind as Triton functions, for the fused substep.
 
-The references are ``aero.obstacle_flow`` and ``aero.obstacles``; ``aero.effects_twin`` says what they read. All of it is
-is computed in float32.
+The references are ``aero.obstacle_flow`` and ``aero.obstacles``; ``aero.effects_twin`` says what they read. They
+compute in float32.
 """
 
 import triton
 import triton.language as tl
 
 from gaussian_swaying.aero import obstacle_flow
+from gaussian_swaying.geometry.linalg_triton import cross3, dot3, read3
 
 PI = tl.constexpr(3.141592653589793)
 STREET_SPEED = tl.constexpr(obstacle_flow.STREET_SPEED)
@@ -20,24 +21,9 @@ DUPLICATIONS = tl.constexpr(5)  # of Carlson's integral, to float32
 
 
 @triton.jit
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@triton.jit
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@triton.jit
-def _load3(head):
-    return tl.load(head), tl.load(head + 1), tl.load(head + 2)
-
-
-@triton.jit
 def _direction(flow):
     """Unit vector of a flow, zero in still air, and its speed."""
-    speed = tl.sqrt(_dot(flow, flow))
+    speed = tl.sqrt(dot3(flow, flow))
     scale = 1 / tl.maximum(speed, 1e-12)
     return (flow[0] * scale, flow[1] * scale, flow[2] * scale), speed
 
@@ -100,21 +86,21 @@ def vortex_street(behind, aside, width, turns, strouhal):
 @triton.jit
 def past_sphere(v, x, head, vector, WAKE: tl.constexpr):
     """As ``SphereObstacle``; ``head``: middle (3), radius, drag, start of the wake."""
-    middle = _load3(head)
+    middle = read3(head)
     radius = tl.load(head + 3)
     p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
-    square = _dot(p, p)
+    square = dot3(p, p)
     outside = square >= radius * radius
     away = tl.maximum(square, radius * radius)
-    along = 3 * _dot(v, p) / away
+    along = 3 * dot3(v, p) / away
     share = 0.5 * radius * radius * radius / (away * tl.sqrt(away))
     v = (
         v[0] + share * (v[0] - along * p[0]), v[1] + share * (v[1] - along * p[1]), v[2] + share * (v[2] - along * p[2])
     )  # fmt: skip
     v = _only(outside, v)
     if WAKE:
-        direction, _speed = _direction(_load3(vector + 7))
-        behind = _dot(p, direction)
+        direction, _speed = _direction(read3(vector + 7))
+        behind = dot3(p, direction)
         aside = tl.sqrt(tl.maximum(square - behind * behind, 0.0))
         v = _scaled(v, 1 - round_wake(behind, aside, 2 * radius, tl.load(head + 4), tl.load(head + 5)))
     return v
@@ -126,18 +112,18 @@ def past_cylinder(v, x, head, vector, WAKE: tl.constexpr, STREET: tl.constexpr):
 
     ``STREET`` is which of the numbers in ``vector`` holds its turns, 0 without a street.
     """
-    middle = _load3(head)
+    middle = read3(head)
     radius = tl.load(head + 3)
-    axis = _load3(head + 5)
+    axis = read3(head + 5)
     p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
-    height = _dot(p, axis)
+    height = dot3(p, axis)
     away = (p[0] - height * axis[0], p[1] - height * axis[1], p[2] - height * axis[2])
-    rising = _dot(v, axis)
+    rising = dot3(v, axis)
     across = (v[0] - rising * axis[0], v[1] - rising * axis[1], v[2] - rising * axis[2])
-    square = _dot(away, away)
+    square = dot3(away, away)
     outside = square >= radius * radius
     square = tl.maximum(square, radius * radius)
-    along = 2 * _dot(across, away) / square
+    along = 2 * dot3(across, away) / square
     share = radius * radius / square
     v = (
         v[0] + share * (across[0] - along * away[0]),
@@ -146,13 +132,13 @@ def past_cylinder(v, x, head, vector, WAKE: tl.constexpr, STREET: tl.constexpr):
     )
     v = _only(outside, v)
     if WAKE:
-        flow = _load3(vector + 7)
-        rising = _dot(flow, axis)
+        flow = read3(vector + 7)
+        rising = dot3(flow, axis)
         flow = (flow[0] - rising * axis[0], flow[1] - rising * axis[1], flow[2] - rising * axis[2])
         direction, speed = _direction(flow)
-        left = _cross(axis, direction)
-        behind = _dot(p, direction)
-        aside = _dot(p, left)
+        left = cross3(axis, direction)
+        behind = dot3(p, direction)
+        aside = dot3(p, left)
         v = _scaled(v, 1 - plane_wake(behind, aside, 2 * radius, tl.load(head + 4)))
         if STREET > 0:
             a, b = vortex_street(behind, aside, 2 * radius, tl.load(vector + STREET), tl.load(head + 8))
@@ -204,30 +190,30 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
     ``head``: middle (3), size (its longest half axis), drag, start of the wake, axes (9), the half axes per ``size``
     (3), and what its flow is strengthened by along each axis (3).
     """
-    middle = _load3(head)
+    middle = read3(head)
     size = tl.load(head + 3)
-    first = _load3(head + 6)
-    second = _load3(head + 9)
-    third = _load3(head + 12)
-    r = _load3(head + 15)
+    first = read3(head + 6)
+    second = read3(head + 9)
+    third = read3(head + 12)
+    r = read3(head + 15)
     p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
-    q = (_dot(first, p) / size, _dot(second, p) / size, _dot(third, p) / size)
-    w = (_dot(first, v), _dot(second, v), _dot(third, v))
+    q = (dot3(first, p) / size, dot3(second, p) / size, dot3(third, p) / size)
+    w = (dot3(first, v), dot3(second, v), dot3(third, v))
     a = (r[0] * r[0], r[1] * r[1], r[2] * r[2])
     outside = q[0] * q[0] / a[0] + q[1] * q[1] / a[1] + q[2] * q[2] / a[2] >= 1
     q = (tl.where(outside, q[0], r[0]), tl.where(outside, q[1], r[1]), tl.where(outside, q[2], r[2]))
     sides = tl.maximum(tl.maximum(q[0] * q[0] - a[0], q[1] * q[1] - a[1]), q[2] * q[2] - a[2])
-    root = tl.maximum(tl.maximum(sides, _dot(q, q) - 1), 0.0)
+    root = tl.maximum(tl.maximum(sides, dot3(q, q) - 1), 0.0)
     for _step in range(NEWTON):
         n = _over(q, a, root)
-        root = tl.maximum(root + (_dot(q, n) - 1) / _dot(n, n), 0.0)
+        root = tl.maximum(root + (dot3(q, n) - 1) / dot3(n, n), 0.0)
     s = (a[0] + root, a[1] + root, a[2] + root)
     n = _over(q, a, root)
     volume = r[0] * r[1] * r[2]
     third_of = 2 / 3 * volume
     strong = (tl.load(head + 18) * w[0], tl.load(head + 19) * w[1], tl.load(head + 20) * w[2])
     along = strong[0] * q[0] / s[0] + strong[1] * q[1] / s[1] + strong[2] * q[2] / s[2]
-    steep = -2 * volume / tl.sqrt(s[0] * s[1] * s[2]) * along / _dot(n, n)
+    steep = -2 * volume / tl.sqrt(s[0] * s[1] * s[2]) * along / dot3(n, n)
     w = (
         w[0] + strong[0] * third_of * carlson_rd(s[1], s[2], s[0]) + steep * n[0],
         w[1] + strong[1] * third_of * carlson_rd(s[2], s[0], s[1]) + steep * n[1],
@@ -240,16 +226,16 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
         first[2] * w[0] + second[2] * w[1] + third[2] * w[2],
     )
     if WAKE:
-        direction, _speed = _direction(_load3(vector + 7))
+        direction, _speed = _direction(read3(vector + 7))
         flat = tl.maximum(tl.sqrt(direction[0] * direction[0] + direction[1] * direction[1]), 1e-12)
         side = (-direction[1] / flat, direction[0] / flat, 0.0)
-        up = _cross(direction, side)
+        up = cross3(direction, side)
         wide = _across(side, first, second, third, r) * size
         high = _across(up, first, second, third, r) * size
         mean = tl.sqrt(tl.maximum(wide * high, 1e-12))
-        left = _dot(p, side) * (mean / tl.maximum(wide, 1e-12))
-        above = _dot(p, up) * (mean / tl.maximum(high, 1e-12))
-        behind = _dot(p, direction) / mean
+        left = dot3(p, side) * (mean / tl.maximum(wide, 1e-12))
+        above = dot3(p, up) * (mean / tl.maximum(high, 1e-12))
+        behind = dot3(p, direction) / mean
         aside = tl.sqrt(left * left + above * above) / mean
         v = _scaled(v, 1 - round_wake(behind, aside, 1.0, tl.load(head + 4), tl.load(head + 5)))
     return v
@@ -258,7 +244,7 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
 @triton.jit
 def _across(direction, first, second, third, r):
     """Width of an ellipsoid in a direction."""
-    a = _dot(first, direction) * r[0]
-    b = _dot(second, direction) * r[1]
-    c = _dot(third, direction) * r[2]
+    a = dot3(first, direction) * r[0]
+    b = dot3(second, direction) * r[1]
+    c = dot3(third, direction) * r[2]
     return 2 * tl.sqrt(a * a + b * b + c * c)
