@@ -8,7 +8,7 @@
   half space its normal (3); of a grid of distances its first node (3), its axes (9) and its spacing;
 
 and :data:`WHOLE` whole numbers: where its grid starts, the nodes of that along each axis, where its keys start, and how
-many there are. A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has :data:`POSE`:
+many there are (and two unused). A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has :data:`POSE`:
 place of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix (9) and the
 velocity of the centre (3).
 """
@@ -19,7 +19,7 @@ import triton.language as tl
 from gaussian_swaying.geometry.linalg_triton import dot3, matmul, matvec, read3, read9, transpose
 from gaussian_swaying.mpm.triton.shared import VARIES
 
-NUMBERS, WHOLE, KEY, POSE = tl.constexpr(24), tl.constexpr(6), tl.constexpr(7), tl.constexpr(24)
+NUMBERS, WHOLE, KEY, POSE = tl.constexpr(24), tl.constexpr(8), tl.constexpr(7), tl.constexpr(24)
 PLANE, BALL, CAPSULE, BOX, HALF_SPACE = (tl.constexpr(k) for k in range(5))
 GRID = tl.constexpr(5)
 LEAST = tl.constexpr(1.0842022e-19)

@@ -76,9 +76,9 @@ class Solids:
         for (part, _), size, moves in zip(self.parts, sizes, self.moves, strict=True):
             shape = part.values.shape if isinstance(part, MeshObstacle | StillGaussians) else (0, 0, 0)
             many = len(part.times) if isinstance(part, Obstacle) and moves else 0
-            whole.append([start, *shape, keys, many])
+            whole.append([start, *shape, keys, many, 0, 0])
             start, keys = start + size, keys + many
-        self.whole = torch.tensor(whole or [[0] * 6], dtype=torch.int32, device=device)
+        self.whole = torch.tensor(whole or [[0] * 8], dtype=torch.int32, device=device)
         self.keys = torch.zeros(max(keys, 1), kernels.KEY.value, dtype=torch.float64, device=device)
         self._made_of: list[int] | None = None  # versions of the tensors that the tables were made from
 
