@@ -82,7 +82,7 @@ def packed(wind: WindField, device: torch.device, before: Packed | None = None) 
     for effect, size in zip(effects, sizes, strict=True):
         flags = (0, 0, 0)
         if isinstance(effect, CarriedField):
-            flags = tuple(map(int, effect.wraps))  # type: ignore[assignment]
+            flags = (int(effect.wraps[0]), int(effect.wraps[1]), int(effect.wraps[2]))
         elif isinstance(effect, Obstacle):
             street = STREETS + streets.index(effect) if effect in streets else 0  # type: ignore[arg-type]
             flags = (int(effect.drag > 0), street, 0)

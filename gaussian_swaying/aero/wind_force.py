@@ -218,8 +218,9 @@ class WindForce(Force):
         if not self._shelters():
             return self
         other, wind = copy(self), copy(self._fields[0])
+        assert isinstance(wind, WindField)
         wind._modules = dict(wind._modules)
-        effects = [copy(effect) for effect in wind.effects]
+        effects: list[nn.Module] = [copy(effect) for effect in wind.effects]
         for effect in effects:
             if isinstance(effect, Shelter):
                 effect._buffers = {name: held.clone() for name, held in effect._buffers.items() if held is not None}

@@ -174,6 +174,20 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
+def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until):
+    page.session.pause()
+    until(lambda: page.session.paused)
+    time.sleep(1.0)
+    without = _seen(window)
+    window.get_by_role("button", name="Picture").click()
+    box = window.get_by_text("Streaks of air").locator("xpath=ancestor::*[.//input][1]").locator("input")
+    for streaks in (True, False):
+        box.last.click()
+        until(lambda wanted=streaks: page.streaks == wanted)
+        until(lambda wanted=streaks: (_seen(window) != without) == wanted)
+    assert window.problems == []
+
+
 @pytest.mark.slow
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")

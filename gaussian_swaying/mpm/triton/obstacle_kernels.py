@@ -7,10 +7,10 @@
   radius, half of its axis (3) and one over the square of that; of a box half of its sides (3) and its axes (9); of a
   half space its normal (3); of a grid of distances its first node (3), its axes (9) and its spacing;
 
-and :data:`WHOLE` whole numbers: where its grid starts, the nodes of that along each axis, where its keys start, and how
-many there are (and two unused). A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has :data:`POSE`:
-place of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix (9) and the
-velocity of the centre (3).
+and :data:`WHOLE` whole numbers: where its grid starts, the nodes of that along each axis, where its keys start, how
+many there are, and two unused. A key has :data:`KEY` numbers: time, place (3), and turn (3). The pose of a substep has
+:data:`POSE`: place of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a matrix
+(9) and the velocity of the centre (3).
 """
 
 import triton
