@@ -84,7 +84,7 @@ def packed(wind: WindField, device: torch.device, before: Packed | None = None) 
         if isinstance(effect, CarriedField):
             flags = (int(effect.wraps[0]), int(effect.wraps[1]), int(effect.wraps[2]))
         elif isinstance(effect, Obstacle):
-            street = STREETS + streets.index(effect) if effect in streets else 0  # type: ignore[arg-type]
+            street = STREETS + streets.index(effect) if effect in streets else 0
             flags = (int(effect.drag > 0), street, 0)
         kinds += [KINDS[type(effect)], start, *flags]  # type: ignore[index]
         start += size

@@ -1,4 +1,4 @@
-"""The paper's scenes and those of docs/wind.md for ``bench.py gallery``: runs them, checks their motion, and makes pictures."""
+"""The paper's scenes and those of docs/wind.md: ``bench.py gallery`` runs them, checks motion, and makes pictures."""
 
 from __future__ import annotations
 
