@@ -221,6 +221,13 @@ def test_the_host_reads_nothing_of_a_wind(name, interpolation, tmp_path):
     assert torch.equal(found, expected)
 
 
+def test_the_host_reads_nothing_of_a_shelter():
+    """So the needs of the next frame can be measured in a CUDA graph."""
+    _, state, load = _bodies("cpu", "total", _wind("sheltered"), transfer="torch")
+    with _NoReading():
+        load.foreseen(state).samples(state, DT, 5)
+
+
 def test_what_the_kernels_do_not_know_runs_in_torch():
     class Doubled(LogProfile):
         def factor(self, above):
