@@ -156,7 +156,7 @@ def test_coherence_is_that_of_the_waves_of_the_box(measured):
 def test_coherence_falls_with_the_distance_as_von_karmans():
     """Within 5 % where it is more than 0.2, with cells of L / 8, twice as wide as the default ones, in a box 12 L wide.
 
-    Cells of L / 4 hold too few of the small waves, and give up to 7 % more. The standard error over the 20 seeds is
+    Cells of L / 4 hold too few of the small waves, and give up to 21 % more. The standard error over the 20 seeds is
     below 1 %, and 3.2 % at the distance L; what this box leaves out adds 1 to 2 %, and 4.5 % at 2.2 < k L < 4.
     """
     cells, spacing = (128, 96, 96), 0.125
