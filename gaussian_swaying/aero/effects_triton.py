@@ -1,15 +1,18 @@
 """Effects of the wind as Triton functions, for the fused substep.
 
-The references are in ``aero.effects``, ``carried`` and ``shelter``; ``aero.effects_twin`` says what they read.
+The references are in ``aero.effects``, ``carried``, ``shelter`` and ``obstacles``; ``aero.effects_twin`` says what they
+read.
 """
 
 import triton
 import triton.language as tl
 
 from gaussian_swaying.aero.force_triton import force_on_group, force_on_patch
+from gaussian_swaying.aero.obstacles_triton import past_cylinder, past_ellipsoid, past_sphere
 
 HEADER = tl.constexpr(32)  # numbers of an effect
-LOG, POWER, CARRIED = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
+LOG, POWER, CARRIED, SHELTER = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2), tl.constexpr(3)
+SPHERE, CYLINDER = tl.constexpr(4), tl.constexpr(5)
 
 
 @triton.jit
@@ -90,9 +93,11 @@ def _turned(head, x):
 def shaped_wind(position, vector, space, OPTIONS: tl.constexpr):
     """Velocity of the air at some places: twin of ``WindField.shaped``.
 
-    ``vector``: velocity without effects (3), place of the object's centre in a carried field [cells] (3), its strength.
+    ``vector``: velocity without effects (3), place of the object's centre in a carried field [cells] (3), its strength,
+    the mean flow (3), and how far the streets of vortices are (one each).
     ``OPTIONS`` after four others: number of effects, and five for each: its kind, where its table starts in ``space``,
-    and whether that repeats along each axis.
+    and whether that repeats along each axis; of an obstacle, whether it has a wake, and where in ``vector`` its street
+    is, or 0.
     """
     zero = position[0] * 0
     v = (tl.load(vector) + zero, tl.load(vector + 1) + zero, tl.load(vector + 2) + zero)
@@ -117,11 +122,17 @@ def shaped_wind(position, vector, space, OPTIONS: tl.constexpr):
             strength = tl.load(vector + 6)
             found = _turned(head + 9, found)
             v = (v[0] + strength * found[0], v[1] + strength * found[1], v[2] + strength * found[2])
-        else:
+        elif OPTIONS[5 + 5 * m] == SPHERE:
+            v = past_sphere(v, position, head, vector, OPTIONS[7 + 5 * m])
+        elif OPTIONS[5 + 5 * m] == CYLINDER:
+            v = past_cylinder(v, position, head, vector, OPTIONS[7 + 5 * m], OPTIONS[8 + 5 * m])
+        elif OPTIONS[5 + 5 * m] == SHELTER:
             p = _turned(head, position)
             p = (p[0] + tl.load(head + 9), p[1] + tl.load(head + 10), p[2] + tl.load(head + 11))
             factor, _b, _c = _look_up(space + OPTIONS[6 + 5 * m], head + 18, p, False, False, False, 1)
             v = (v[0] * factor, v[1] * factor, v[2] * factor)
+        else:
+            v = past_ellipsoid(v, position, head, vector, OPTIONS[7 + 5 * m])
     return v
 
 

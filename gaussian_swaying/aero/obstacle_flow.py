@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -13,6 +14,15 @@ STREET_SPEED = 0.86
 
 KARMAN_RATIO = 0.281
 """Distance of the two rows of a street per distance of the vortices in a row (von Karman 1911; Lamb 1932, 156)."""
+
+CORE = 0.3
+"""Width of the cores of the vortices: delta in :func:`vortex_street`."""
+
+PLANE_GROWTH = 0.29 / math.sqrt(2 * math.log(2))
+"""Standard deviation of a plane wake per root of thickness times distance (Wygnanski and others 1986)."""
+
+ROUND_GROWTH = 0.05
+"""How fast a round wake widens: 0.03 in smooth wind, 0.05 in gusty wind (Bastankhah & Porté-Agel 2014)."""
 
 
 def sphere_flow(velocity: Tensor, place: Tensor, radius: float) -> Tensor:
@@ -93,6 +103,14 @@ def carlson_rd(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     return 3 * total + factor * series / (mean * mean.sqrt())
 
 
+@lru_cache(maxsize=64)
+def ellipsoid_strength(radii: tuple[float, ...]) -> tuple[float, ...]:
+    r""":math:`1 / (2 - \alpha_i(0))` of :func:`ellipsoid_flow`, for the three axes i."""
+    with torch.device("cpu"):
+        a = torch.tensor([(radius / max(radii)) ** 2 for radius in radii], dtype=torch.float64)
+        return tuple((1 / (2 - 2 / 3 * a.prod().sqrt() * carlson_rd(a.roll(-1), a.roll(-2), a))).tolist())
+
+
 def ellipsoid_flow(velocity: Tensor, place: Tensor, radii: Sequence[float]) -> Tensor:
     r"""Potential flow round an ellipsoid at the origin whose axes are those of the coordinates; zero inside.
 
@@ -111,23 +129,25 @@ def ellipsoid_flow(velocity: Tensor, place: Tensor, radii: Sequence[float]) -> T
     x = place / size
     outside = (x.square() / squares).sum(-1, keepdim=True) >= 1
     x = torch.where(outside, x, squares.sqrt())
-    root = (x.square().sum(-1, keepdim=True) - 1).clamp(min=0)  # left of it, so Newton rises to it
-    for _ in range(30):
+    # left of the root, so that Newton rises to it: every part of the sum is at most 1, and the longest half axis is 1
+    nearer = (x.square() - squares).amax(-1, keepdim=True)
+    root = (x.square().sum(-1, keepdim=True) - 1).maximum(nearer).clamp(min=0)
+    for _ in range(12):
         part = x.square() / (squares + root)
         root = (root + (part.sum(-1, keepdim=True) - 1) / (part / (squares + root)).sum(-1, keepdim=True)).clamp(min=0)
     volume = math.prod(radius / size for radius in radii)
+    strong = ellipsoid_strength(tuple(map(float, radii)))
+    strength = torch.stack([velocity[..., axis] * factor for axis, factor in enumerate(strong)], dim=-1)
     shifted = squares + root
     first, second = shifted.roll(-1, -1), shifted.roll(-2, -1)
     alpha = 2 / 3 * volume * carlson_rd(first, second, shifted)
-    rest = 2 / 3 * volume * carlson_rd(squares.roll(-1, -1), squares.roll(-2, -1), squares)
-    strength = velocity / (2 - rest)
     slope = -volume / (shifted * shifted.prod(-1, keepdim=True).sqrt())  # of alpha with the root
     normal = 2 * x / shifted / (x / shifted).square().sum(-1, keepdim=True)  # slope of the root with the place
     found = velocity + strength * alpha + (strength * x * slope).sum(-1, keepdim=True) * normal
     return torch.where(outside, found, 0.0).to(given)
 
 
-def round_wake(behind: Tensor, aside: Tensor, width: float, drag: float, growth: float = 0.05) -> Tensor:
+def round_wake(behind: Tensor, aside: Tensor, width: float, drag: float, growth: float = ROUND_GROWTH) -> Tensor:
     r"""Share of the speed that is missing in the wake of a body: a Gaussian that conserves the momentum.
 
     .. math::
@@ -143,16 +163,20 @@ def round_wake(behind: Tensor, aside: Tensor, width: float, drag: float, growth:
         aside: Distance r from the line behind the centre [m], as ``behind``.
         width: Width d of the body across the wind [m].
         drag: Its drag coefficient, below 1.
-        growth: k; 0.03 in smooth wind, 0.05 in gusty wind.
+        growth: k.
 
     Returns:
         Between 0 and 1, as ``behind``.
     """
-    root = math.sqrt(1 - drag)
-    start = 0.25 * math.sqrt(0.5 * (1 + root) / root)
-    sigma = growth * behind.clamp(min=0) / width + start
+    sigma = growth * behind.clamp(min=0) / width + wake_start(drag)
     depth = 1 - (1 - drag / (8 * sigma.square())).clamp(min=0).sqrt()
     return torch.where(behind > 0, depth * torch.exp(-0.5 * (aside / (width * sigma)).square()), 0.0)
+
+
+def wake_start(drag: float) -> float:
+    r"""Standard deviation of a round wake at the body, per width: :math:`\tfrac14 \sqrt\beta` in :func:`round_wake`."""
+    root = math.sqrt(1 - drag)
+    return 0.25 * math.sqrt(0.5 * (1 + root) / root)
 
 
 def plane_wake(behind: Tensor, aside: Tensor, width: float, drag: float) -> Tensor:
@@ -171,7 +195,7 @@ def plane_wake(behind: Tensor, aside: Tensor, width: float, drag: float) -> Tens
         drag: C_D.
     """
     thickness = 0.5 * drag * width
-    sigma = 0.29 / math.sqrt(2 * math.log(2)) * (thickness * behind.clamp(min=0)).sqrt()
+    sigma = PLANE_GROWTH * (thickness * behind.clamp(min=0)).sqrt()
     sigma = sigma.clamp(min=2 * thickness / math.sqrt(math.pi))  # nearer, no wake of this shape takes the momentum
     depth = (1 - (1 - 2 * thickness / (math.sqrt(math.pi) * sigma)).clamp(min=0).sqrt()) / math.sqrt(2)
     return torch.where(behind > 0, depth * torch.exp(-0.5 * (aside / sigma).square()), 0.0)
@@ -207,7 +231,7 @@ def vortex_street(behind: Tensor, aside: Tensor, width: float, turns: Tensor, st
     for sign in (1.0, -1.0):
         y = (2 * math.pi / length) * (aside - sign * half)
         x = phase if sign > 0 else phase + math.pi
-        rise = torch.cosh(y.clamp(-20, 20)) + 0.3
+        rise = torch.cosh(y.clamp(-20, 20)) + CORE
         bottom = rise - torch.cos(x)
         steep = torch.sinh(y.clamp(-20, 20))
         u = u + sign * steep * (1 / bottom - 1 / (rise.square() - 1).sqrt())  # the mean over a length is taken off

@@ -150,19 +150,38 @@ class CylinderObstacle(Obstacle):
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
         """See :class:`Obstacle`."""
         axis = self.axis.to(place.dtype)
-        across = moment.flow - (moment.flow * self.axis).sum() * self.axis  # what flows along the pole meets nothing
-        speed = torch.linalg.vector_norm(across)
-        direction = (across / speed.clamp(min=1e-12)).to(place.dtype)
+        across, speed = self._across(moment.flow)
+        direction = across.to(place.dtype)
+        speed = speed[0]
         left = torch.linalg.cross(axis, direction)
         behind, aside, width = (place * direction).sum(-1), (place * left).sum(-1), 2 * self.radius
         missing = plane_wake(behind, aside, width, self.drag)
         if not self.street:
             return missing, None
-        turns = (moment.carried * (across / speed.clamp(min=1e-12))).sum() * (self.strouhal / width)
-        u, v = vortex_street(behind, aside, width, turns.remainder(1.0).to(place.dtype), self.strouhal).unbind(-1)
+        turns = self.turns(moment.flow, moment.carried).to(place.dtype)
+        u, v = vortex_street(behind, aside, width, turns, self.strouhal).unbind(-1)
         outside = behind.square() + aside.square() >= self.radius**2
         swirl = (u[..., None] * direction + v[..., None] * left) * speed.to(place.dtype)
         return missing, torch.where(outside[..., None], swirl, 0.0)
+
+    def _across(self, flow: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit vectors of the flow (..., 3) across the axis, zero without one, and its speed, shape (..., 1)."""
+        across = flow - (flow * self.axis).sum(-1, keepdim=True) * self.axis  # what flows along it meets nothing
+        speed = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+        return across / speed.clamp(min=1e-12), speed
+
+    def turns(self, flow: Tensor, carried: Tensor) -> Tensor:
+        """How far the street is on its way to the next vortex, from 0 to 1.
+
+        Args:
+            flow: The mean flow [m/s], shape (..., 3), float64.
+            carried: How far it has carried the air since time zero [m], shape (..., 3), float64.
+
+        Returns:
+            Shape (...).
+        """
+        way = (carried * self._across(flow)[0]).sum(-1)
+        return (way * (self.strouhal / (2 * self.radius))).remainder(1.0)
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record, tensors_in
 from gaussian_swaying.aero.effects import Moment
-from gaussian_swaying.aero.effects_twin import has_twin, packed, vectors
+from gaussian_swaying.aero.effects_twin import Packed, has_twin, packed, vectors
 from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.shelter import Shelter, wind_axes
@@ -78,7 +79,7 @@ class WindForce(Force):
             )
         self._key: tuple[tuple[object, ...], ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._space: tuple[object, tuple[int, ...], Tensor] | None = None
+        self._space: Packed | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """The state without the CUDA graph, which cannot be copied."""
@@ -203,18 +204,45 @@ class WindForce(Force):
         """:meth:`force` in the wind of ``state.time``."""
         return self.force(state, self.air(state.time, state.position))
 
+    def _shelters(self) -> list[Shelter]:
+        wind = self._fields[0]
+        if not (self._shared and isinstance(wind, WindField)):
+            return []
+        return [effect for effect in wind.effects if isinstance(effect, Shelter)]
+
+    def foreseen(self, state: MPMState) -> WindForce:
+        """The same force as it will be in the frame that starts with a state; this one does not change.
+
+        Shelters of the result have tables of their own, as this one may be in use on another stream.
+        """
+        if not self._shelters():
+            return self
+        other, wind = copy(self), copy(self._fields[0])
+        assert isinstance(wind, WindField)
+        wind._modules = dict(wind._modules)
+        effects: list[nn.Module] = [copy(effect) for effect in wind.effects]
+        for effect in effects:
+            if isinstance(effect, Shelter):
+                effect._buffers = {name: held.clone() for name, held in effect._buffers.items() if held is not None}
+        wind.effects = nn.ModuleList(effects)
+        other._modules = {**self._modules, "_fields": nn.ModuleList([wind])}
+        other.refresh(state)
+        return other
+
+    def refreshed(self) -> list[Tensor]:
+        """The tensors that :meth:`refresh` writes."""
+        return tensors_in(self._shelters())
+
     def refresh(self, state: MPMState) -> None:
         """Take in how the body stands now, for :class:`~gaussian_swaying.aero.shelter.Shelter`; once in a frame.
 
         Args:
             state: The state at the start of the frame.
         """
-        wind = self._fields[0]
-        if not (self._shared and isinstance(wind, WindField)) or state.position.ndim > 2:
+        wind, shelters = self._fields[0], self._shelters()
+        if not shelters or state.position.ndim > 2:
             return
-        shelters = [effect for effect in wind.effects if isinstance(effect, Shelter)]
-        if not shelters:
-            return
+        assert isinstance(wind, WindField)
         with torch.no_grad():
             flow = wind.mean_flow(state.time)
             axes = wind_axes(flow)
@@ -255,7 +283,7 @@ class WindForce(Force):
         options: tuple[Any, ...] = (aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit)
         functions, space = (wind_force, wind_on_groups), None
         if not self.uniform:
-            kinds, space = self._packed()
+            kinds, space, _ = self._packed()
             functions, options = (shaped_wind_force, shaped_wind_on_groups), (*options, *kinds)
 
         def numbers() -> Tensor:
@@ -285,19 +313,13 @@ class WindForce(Force):
             space=space,
         )
 
-    def _packed(self) -> tuple[tuple[int, ...], Tensor]:
-        """What the kernels read of the effects, again where they changed, at the same address where possible."""
+    def _packed(self) -> Packed:
+        """What the kernels read of the effects; what has changed is written again, in place where possible."""
         wind = self._fields[0]
         assert isinstance(wind, WindField)
-        tensors = tensors_in([wind.effects])
-        key = (fingerprint(wind.effects), tuple(None if t.is_inference() else t._version for t in tensors))
-        if self._space is None or self._space[0] != key:
-            with torch.inference_mode(False), torch.no_grad():
-                kinds, space = packed(wind, self.area.device)
-                if self._space is not None and self._space[1] == kinds and len(self._space[2]) == len(space):
-                    space = self._space[2].copy_(space)
-                self._space = (key, kinds, space)
-        return self._space[1], self._space[2]
+        with torch.inference_mode(False), torch.no_grad():
+            self._space = packed(wind, self.area.device, self._space)
+        return self._space
 
     def _vectors(self, time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
         """As :meth:`winds`, for a wind with effects; shape (steps, 7)."""

@@ -45,6 +45,22 @@ def load9(pointer, stride, index, mask):
 
 
 @triton.jit
+def read3(pointer):
+    """Three numbers in a row, the same for all particles."""
+    return tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2)
+
+
+@triton.jit
+def read9(pointer):
+    """Nine numbers in a row, the same for all particles."""
+    return (
+        tl.load(pointer), tl.load(pointer + 1), tl.load(pointer + 2),
+        tl.load(pointer + 3), tl.load(pointer + 4), tl.load(pointer + 5),
+        tl.load(pointer + 6), tl.load(pointer + 7), tl.load(pointer + 8),
+    )  # fmt: skip
+
+
+@triton.jit
 def store9(pointer, stride, index, value, mask):
     """The counterpart of :func:`load9`."""
     for k in tl.static_range(9):
@@ -71,6 +87,16 @@ def matmul(a, b):
 def transpose(a):
     """The transpose."""
     return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
+
+
+@triton.jit
+def matvec(m, x):
+    """A matrix times a vector."""
+    return (
+        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
+        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
+        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
+    )
 
 
 @triton.jit

@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.state import MPMState
 MOST_STEPS = 256
 """Largest number of substeps for which a :class:`ForceTwin` computes its vectors at once."""
 
-TWIN_VALUES, TWIN_NUMBERS, TWIN_VECTOR = 4, 8, 8
+TWIN_VALUES, TWIN_NUMBERS, TWIN_VECTOR = 4, 8, 16
 """Largest number of values per particle, of shared numbers before the table, and of those per substep and scene, in a
 :class:`ForceTwin`."""
 
@@ -48,7 +48,7 @@ class ForceTwin:
             as lists that the values point to; called when ``values`` is. None for none.
         vectors: ``vectors(time, dt, steps)`` returns what depends only on time: a vector for the start of each of
             ``steps`` (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3),
-            or (steps, B, 1, 3) for a batch of scenes. Up to eight numbers may take the place of the three.
+            or (steps, B, 1, 3) for a batch of scenes. Up to sixteen numbers may take the place of the three.
         space: What the force reads depending on the place: numbers in float32, shape (n,), which stay at the same
             address and may change between rollouts. The function then has two more arguments: ``(F, velocity, position,
             values, vector, numbers, space, OPTIONS)``. None for a force that does not depend on the place.

@@ -128,7 +128,9 @@ def parts_of(simulation: Simulation) -> tuple[object, ...] | None:
     tensors = tensors_in([wind])
     if any(tensor.is_inference() or tensor.device != simulation.device for tensor in tensors):
         return None
-    return (simulation.solver.bound, fingerprint([wind]), tuple(tensor._version for tensor in tensors))
+    made = {id(tensor) for tensor in wind.refreshed()}  # from the state, in every frame
+    versions = tuple(tensor._version for tensor in tensors if id(tensor) not in made)
+    return (simulation.solver.bound, fingerprint([wind]), versions)
 
 
 def needs_of(simulation: Simulation, state: MPMState, winds: Tensor | None) -> Tensor:

@@ -506,7 +506,7 @@ class Simulation(nn.Module):
         idle = self.idle
 
         def needs(at: MPMState) -> Tensor:
-            return needs_of(self, at, None if idle else self.wind_force.samples(at, self.frame_dt / 4, 5))
+            return needs_of(self, at, None if idle else self._winds(self.wind_force.foreseen(at), at))
 
         same = None if parts is None else (idle, self.frame_dt, parts)
         return self._gauge(self.solver, end, steps, courant, work, state, needs, same)
@@ -523,7 +523,7 @@ class Simulation(nn.Module):
     def foresees(self) -> bool:
         """Whether the needs of the next frame are measured at the end of a frame, so that the host waits once."""
         simple = self.solver.substep is None and self.solver.stiffness_damping == 0
-        return simple and self.solver.has_kernels and self.wind_force.uniform and self.wind_force.recordable
+        return simple and self.solver.has_kernels and self.wind_force.recordable
 
     def substeps(self, state: MPMState, parts: tuple[object, ...] | None = None) -> int:
         """How many substeps the next frame takes, for waves in the material and explicit drag on light patches.
@@ -535,13 +535,17 @@ class Simulation(nn.Module):
         if self.outlook is not None and self.outlook.holds(state, parts):
             cells, rate, blowing = self.outlook.needs
         else:
-            winds = None if self.idle else self.wind_force.samples(state, self.frame_dt / 4, 5)
+            winds = None if self.idle else self._winds(self.wind_force, state)
             cells, rate, blowing = needs_of(self, state, winds).tolist()
         steps = self.solver.substeps(state, self.frame_dt, cells)
         if not (math.isfinite(rate) and blowing < MAX_WIND):
             cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
             self.give_up(state, cause, "check the flow and the modulations of the wind")
         return steps if self.aero.drag_step == "semi_implicit" else max(steps, int(rate * self.frame_dt) + 1)
+
+    def _winds(self, force: WindForce, state: MPMState) -> Tensor:
+        """Velocities of the air in the frame that starts with a state [m/s], shape (5, ...)."""
+        return force.samples(state, self.frame_dt / 4, 5)
 
     def _roll(self, state: MPMState, steps: int) -> tuple[MPMState, Tensor]:
         """The state some substeps later, and the largest Courant number on the way."""

@@ -121,12 +121,14 @@ class Controls:
         self.shown = gui.add_dropdown("Show", SHOWN, initial_value=SHOWN[0])
         self.light = gui.add_slider("Light from [deg]", -180.0, 180.0, 1.0, self._light_azimuth())
         self.shading = gui.add_checkbox("Shading", self.session.simulation.painter.shader is not None)
+        self.streaks = gui.add_checkbox("Streaks of air", False, hint="Coloured by speed, near a plane along the wind")
         self.arrow = gui.add_checkbox("Arrow of the wind", True)
         self.box = gui.add_checkbox("Box of the grid", False)
         self.pins = gui.add_checkbox("What is held", False, hint="Points that pins and handles hold, at rest")
         self.shown.on_update(lambda _: self._show())
         self.light.on_update(lambda _: self._shade())
         self.shading.on_update(lambda _: self._unless_quiet(self._shade))
+        self.streaks.on_update(lambda _: self._show())
         self.arrow.on_update(lambda _: self.draw_handles())
         self.box.on_update(lambda _: self.draw_handles())
         self.pins.on_update(lambda _: self.draw_handles())
@@ -193,7 +195,7 @@ class Controls:
         self.session.change({"wind.modulations": [gust] if self.gusts.value else []})
 
     def _show(self) -> None:
-        self.page.shown = self.shown.value
+        self.page.shown, self.page.streaks = self.shown.value, self.streaks.value
         self.page.redraw()
 
     def _light_azimuth(self) -> float:

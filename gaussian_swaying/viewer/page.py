@@ -154,6 +154,7 @@ class Page:
 
     Attributes:
         shown: What is drawn, one of :data:`.pictures.SHOWN`.
+        streaks: Whether streaks of air are drawn over it.
         recording: The video that is being recorded, or None.
     """
 
@@ -162,6 +163,7 @@ class Page:
 
         self.session, self.largest = session, largest
         self.shown = "colour"
+        self.streaks = False
         self.recording: FilmStrip | None = None
         self.recorder: int | None = None  # the browser from whose camera is recorded
         self._closed = threading.Event()
@@ -285,7 +287,7 @@ class Page:
         camera = camera_of(pose.wxyz.tolist(), pose.position.tolist(), float(pose.fov), width, height, near)
         with self.session.lock:
             waited = time.perf_counter()
-            picture = draw(snapshot, camera, self.shown, self.controls.force_end)
+            picture = draw(snapshot, camera, self.shown, self.controls.force_end, self.streaks)
         if not still:
             size.took(time.perf_counter() - waited)
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.simulation.wind_picture import draw_wind
 from gaussian_swaying.viewer.session import Snapshot
 
 SHOWN = ("colour", "normals", "wind force")
@@ -40,7 +42,9 @@ def camera_of(
 
 
 @torch.inference_mode()
-def draw(snapshot: Snapshot, camera: Camera, shown: str = "colour", force_end: float = 1.0) -> np.ndarray:
+def draw(
+    snapshot: Snapshot, camera: Camera, shown: str = "colour", force_end: float = 1.0, streaks: bool = False
+) -> np.ndarray:
     """The picture of a snapshot, uint8, shape (H, W, 3).
 
     Args:
@@ -48,18 +52,24 @@ def draw(snapshot: Snapshot, camera: Camera, shown: str = "colour", force_end: f
         camera: From where.
         shown: One of :data:`SHOWN`.
         force_end: End of the colour scale of the wind force [Pa].
+        streaks: Whether streaks of air are drawn over it, as in the render ``wind``.
     """
     simulation, state = snapshot.simulation, snapshot.state
     painter = simulation.painter
     means = simulation.scene.model.means
     camera = camera.to(means.device, means.dtype)
     gaussians = painter.deformed(state)
+    seen = None
     if shown == "normals":
         picture = painter.draw_normals(gaussians, camera, "world")
     elif shown == "wind force":
         picture = painter.draw_pressure(simulation.wind_pressure(state), gaussians, camera, force_end)
     else:
-        picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera).color
+        seen = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+        picture = seen.color
+    if streaks:
+        seen = seen or painter.draw(gaussians, torch.zeros_like(gaussians.means), camera)  # for its depth
+        picture = draw_wind(simulation, state, camera, replace(seen, color=picture))
     return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 

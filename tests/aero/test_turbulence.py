@@ -137,19 +137,52 @@ def test_spectrum_falls_with_the_power_five_thirds():
     assert slope == pytest.approx(-5 / 3, rel=0.05)
 
 
-def test_coherence_falls_with_the_distance_as_von_karmans(measured):
-    (k1, k2, _), share = _waves()
+def _closed_coherence(k1, distance):
+    """Of the component along the wind at two places apart across it, by von Karman's correlations."""
+    x = distance * (k1.square() + 1 / (VON_KARMAN * L) ** 2).sqrt()
+    first = (x / 2) ** (5 / 6) * _bessel_k(5 / 6, x)
+    return 2 / math.gamma(5 / 6) * (first - (x / 2) ** (11 / 6) * _bessel_k(1 / 6, x))
+
+
+def test_coherence_is_that_of_the_waves_of_the_box(measured):
+    (_, k2, _), share = _waves()
     for j, cross in measured[3].items():
         found = cross / measured[1]
         turned = (share * torch.cos(k2 * j * H)[:, None]).sum((1, 2)) / share.sum((1, 2)).clamp(min=1e-30)
-        x = j * H * (k1.square() + 1 / (VON_KARMAN * L) ** 2).sqrt()
-        closed = 2 / math.gamma(5 / 6) * ((x / 2) ** (5 / 6) * _bessel_k(5 / 6, x))
-        closed -= 2 / math.gamma(5 / 6) * ((x / 2) ** (11 / 6) * _bessel_k(1 / 6, x))
         for first, last in ((1, 3), (3, 6), (6, 12)):
-            band = slice(first, last)
-            assert float((found - turned)[band].mean()) == pytest.approx(0.0, abs=0.025)
-            if j > 1 and last < 12:  # further apart than a cell, and waves that the cells follow
-                assert float((found - closed)[band].mean()) == pytest.approx(0.0, abs=0.05)
+            assert float((found - turned)[first:last].mean()) == pytest.approx(0.0, abs=0.025)
+
+
+def test_coherence_falls_with_the_distance_as_von_karmans():
+    """Within 5 % where it is more than 0.2, with cells of L / 8, twice as wide as the default ones, in a box 12 L wide.
+
+    Cells of L / 4 hold too few of the small waves, and give up to 21 % more. The standard error over the 20 seeds is
+    below 1 %, and 3.2 % at the distance L; what this box leaves out adds 1 to 2 %, and 4.5 % at 2.2 < k L < 4.
+    """
+    cells, spacing = (128, 96, 96), 0.125
+    k1 = 2 * math.pi * torch.fft.fftfreq(cells[0], spacing, dtype=torch.float64)
+    bands = [(k1 > low) & (k1 <= high) for low, high in ((0.15, 0.45), (0.45, 1.0), (1.0, 2.2), (2.2, 4.0))]
+    distances, own, both = (2, 4, 8), [], []
+    for seed in range(SEEDS):
+        wave = torch.fft.fft(turbulence_box(cells, [spacing] * 3, L, seed=seed)[..., 0], dim=0)
+        own.append(wave.abs().square().mean((1, 2)).double())
+        both.append(torch.stack([(wave * wave.roll(-j, 1).conj()).real.mean((1, 2)).double() for j in distances]))
+    spectrum, cross = torch.stack(own), torch.stack(both, dim=1)
+    verdicts = 0
+    for j, pair in zip(distances, cross, strict=True):
+        for band in bands:
+            target = float((_closed_coherence(k1[band], j * spacing) * spectrum[:, band].mean(0)).sum())
+            target /= float(spectrum[:, band].mean(0).sum())
+            a, b = pair[:, band].sum(1), spectrum[:, band].sum(1)
+            found = float(a.sum() / b.sum())
+            error = float((a - found * b).std() / b.mean()) / math.sqrt(SEEDS)
+            if target > 0.2:
+                verdicts += 1
+                assert error < (0.035 if j == 8 else 0.01) * target
+                assert found == pytest.approx(target, rel=0.05)
+            else:
+                assert found == pytest.approx(target, abs=0.02)
+    assert verdicts == 9
 
 
 @pytest.mark.parametrize("gamma", [0.0, 3.9])

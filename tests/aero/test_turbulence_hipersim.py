@@ -54,4 +54,5 @@ def test_statistics_are_those_of_hipersim(gamma, cells, spacing):
         / torch.stack([one[1] for one in several]).mean(0)[[0, 1, 0, 1], 0]
         for several in (ours, theirs)
     )
-    assert (a - b).tolist() == pytest.approx([0.0] * 4, abs=0.1)
+    for one, other in zip(a.tolist(), b.tolist(), strict=True):
+        assert one == pytest.approx(other, rel=0.1) if other > 0.2 else one == pytest.approx(other, abs=0.02)

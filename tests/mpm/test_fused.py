@@ -1048,9 +1048,9 @@ def test_planes_and_boxes_are_a_part_of_the_kernel_of_the_nodes(kernel_device):
     for solver in (with_walls, with_pin):
         solver.init_state(points)
     batch.init_state(_points(kernel_device, count=12, batch=(2,)))
-    assert len(with_walls.fused().planes) == 7
-    assert with_pin.fused().planes == []
-    assert batch.fused().planes == []
+    assert len(with_walls.fused().solids.parts) == 7
+    assert with_pin.fused().solids.parts == []
+    assert batch.fused().solids.parts == []
 
 
 def test_a_plane_that_is_moved_in_place(kernel_device):

@@ -1,5 +1,7 @@
 """Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML."""
 
+import warnings
+
 import pytest
 import torch
 
@@ -8,6 +10,7 @@ from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.simulation.launch import parts_of
 from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -87,3 +90,38 @@ def test_a_typo_in_an_effect_is_an_error(tmp_path):
     (tmp_path / "wind.yaml").write_text(text + "[{class_path: LogProfile, init_args: {heigth: 3.0}}]}\n")
     with pytest.raises(ValueError, match="heigth"):
         Simulation.from_yaml(tmp_path / "wind.yaml", device="cpu")
+
+
+def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):
+    """As it is at its start, and without a change of the shelter that pictures of this frame may still read."""
+    simulation = make_simulation()
+    simulation.wind = _wind()
+    state, _ = simulation.advance(simulation.start())
+    shelter, parts = simulation.wind.effects[2], parts_of(simulation)
+    before = shelter.table.clone()
+    foreseen = simulation.wind_force.foreseen(state).samples(state, 0.01, 5)
+    assert torch.equal(shelter.table, before)
+    simulation.wind_force.refresh(state)
+    assert not torch.equal(shelter.table, before)
+    assert torch.equal(simulation.wind_force.samples(state, 0.01, 5), foreseen)
+    assert parts_of(simulation) == parts
+    simulation.wind.effects[1].table.mul_(2.0)
+    assert parts_of(simulation) != parts
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("uniform", [True, False])
+def test_the_host_waits_once_in_a_frame(make_simulation, uniform):
+    simulation = make_simulation(wind=WindField([4.0, 1.0, 0.0]) if uniform else _wind()).to("cuda")
+    assert simulation.foresees
+    state = simulation.start()
+    for _ in range(3):
+        state, _ = simulation.advance(state)
+    torch.cuda.set_sync_debug_mode("warn")
+    try:
+        with warnings.catch_warnings(record=True) as waits:
+            warnings.simplefilter("always")
+            state, _ = simulation.advance(state)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len([wait for wait in waits if "synchroniz" in str(wait.message)]) == 1

@@ -17,6 +17,8 @@ def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
     assert found["rows"][0]["ratio"] == 1.0
     assert all(row["ratio"] > 0 and row["path"] == "torch" for row in found["rows"])
     assert found["box"]["cells"] == [16, 8, 8]
+    assert [row["obstacle"] for row in found["obstacles"]] == list(winds.OBSTACLES)
+    assert len(tables.obstacles(found)) == 4 + len(winds.OBSTACLES)
     assert len(tables.rows(found)) == 4 + len(winds.KINDS)
     assert "at most 1.3 times" in tables.goals(found)[2]
 

@@ -14,7 +14,9 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
+from gaussian_swaying.viewer import page as page_module
 from gaussian_swaying.viewer.page import Page, allowed, check_address
+from gaussian_swaying.viewer.pictures import draw
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = [
@@ -172,6 +174,18 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     session.change({"wind.flow": [2.0, 0.0, 0.0]})
     window.get_by_role("button", name="Reset").click()
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
+
+
+def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, monkeypatch):
+    """What a picture with them looks like is tested in test_pictures.py."""
+    drawn = []
+    monkeypatch.setattr(page_module, "draw", lambda *args: drawn.append(args[4]) or draw(*args))
+    window.get_by_text("Picture", exact=True).click()
+    box = window.get_by_text("Streaks of air").locator("xpath=ancestor::*[.//input][1]").locator("input").last
+    for wanted in (True, False):
+        box.click()
+        until(lambda wanted=wanted: drawn and drawn[-1] == wanted)
+    assert window.problems == []
 
 
 @pytest.mark.slow

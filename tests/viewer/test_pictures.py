@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
+from gaussian_swaying.simulation.wind_picture import draw_wind
 from gaussian_swaying.viewer.controls import from_angles, to_angles
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, under_cursor
@@ -38,6 +39,24 @@ def test_everything_that_can_be_shown_is_different(session, shown):
     assert picture.shape == (36, 64, 3)
     others = [draw(session.snapshot, camera, other) for other in SHOWN if other != shown]
     assert all(np.abs(picture.astype(int) - other.astype(int)).max() > 30 for other in others)
+
+
+@pytest.mark.parametrize("shown", SHOWN)
+def test_streaks_of_air_are_those_of_the_render(session, shown):
+    """Over a paler picture of whatever is shown, as `renders: [wind]` draws them over the colours."""
+    wxyz, eye, fov, camera = _pose(session)
+    small = camera_of(wxyz, eye, fov, 192, 108)
+    with_air, without = (draw(session.snapshot, small, shown, streaks=air).astype(int) for air in (True, False))
+    drawn = np.abs(with_air - (0.75 * without + 0.25 * 255)).max(-1) > 3
+    assert 0.02 < drawn.mean() < 0.8
+    if shown == "colour":
+        simulation, state = session.snapshot.simulation, session.snapshot.state
+        with torch.inference_mode():
+            rendered = simulation.painter.render(state, 0)
+            wanted = draw_wind(simulation, state, camera, rendered)
+        found = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height), streaks=True)
+        apart = np.abs(found.astype(float) - 255 * wanted.clamp(0, 1).numpy()).max(-1)
+        assert (apart > 2.0).mean() < 1e-3  # the camera in float32: the ends of a few streaks
 
 
 def test_the_cursor_finds_what_is_under_it(session):

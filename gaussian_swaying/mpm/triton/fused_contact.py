@@ -14,6 +14,9 @@ from gaussian_swaying.mpm.contact.solve import PUSH, PUSH_CELLS, SLACK
 from gaussian_swaying.mpm.contact.stage import AHEAD, ARM, TOLERANCE, ContactStage, Lists
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import contact_kernels as kernels
+from gaussian_swaying.mpm.triton import obstacle_kernels
+from gaussian_swaying.mpm.triton.obstacles import Solids
+from gaussian_swaying.mpm.triton.obstacles import known as is_known
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.formulations.total import Total
@@ -104,6 +107,10 @@ class FusedContact:
         self.rounds, self.every = min(2 * FEWEST, most), 1
         self.buffers: Buffers | None = None
         self._lists: Lists | None = None
+        touched = [obstacle for _, obstacle in stage.obstacles if is_known(obstacle)]
+        self.solids = Solids([(obstacle, 0) for obstacle in touched], fields.device, steps=1)
+        self.numbers = [touched.index(o) if is_known(o) else None for _, o in stage.obstacles]
+        """Which of the solids each obstacle is; None for one that runs in torch."""
         self.late = 0
         """How often points moved farther between two looks than the lists allow."""
 
@@ -121,6 +128,7 @@ class FusedContact:
             dt: Substep [s].
         """
         stage = self.stage
+        self.solids.take()
         position, velocity = state.position.reshape(-1, 3), state.velocity.reshape(-1, 3)
         known = self._lists
         if known is not None:
@@ -244,7 +252,17 @@ class FusedContact:
                 held.first, held.second, held.place, self.radius, self.thickness, held.position, held.normal,
                 held.facing, held.gap, held.valid, held.pairs, BLOCK=wide, num_warps=4,
             )  # fmt: skip
-        for part, (_, obstacle) in zip(held.near, stage.obstacles, strict=True):
+        self.solids.prepare(time, dt, 1)
+        for part, number, (_, obstacle) in zip(held.near, self.numbers, stage.obstacles, strict=True):
+            if number is not None:
+                solids = self.solids
+                row_of, whole, window, pose, grids = solids.of(number)
+                obstacle_kernels.obstacle_places[(-(-(part.stop - part.start) // wide),)](
+                    held.first[part], held.place, held.position, self.thickness, held.gap[part], held.facing[part],
+                    held.drive[part], held.valid[part], part.stop - part.start, row_of, whole, window, pose, grids,
+                    time, KIND=solids.kinds[number], MOVES=solids.moves[number], BLOCK=wide, num_warps=4,
+                )  # fmt: skip
+                continue
             row = held.first[part].long()
             real, row = row >= 0, row.clamp(min=0)
             gap, normal, drive = obstacle.touch(held.position[row], time, dt)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gaussian_swaying.mpm.body import Held
-from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
-from gaussian_swaying.mpm.boundaries.plane import KINDS, Plane
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.triton import updated_kernels as kernels
 from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
+from gaussian_swaying.mpm.triton.obstacles import Solids, solids_of
 
 LEAST, MOST = 4, 64
 """Fewest and most substeps between two sorts of the particles by cell."""
@@ -48,10 +46,7 @@ class FusedUpdated(Fused):
         self.inverse_mass = torch.zeros(0, device=self.device)
         self.weight = torch.zeros(0, device=self.device)
         self.node_position: Tensor | None = None
-        self.planes = planes_of(bound.body.boundaries) if self.scenes == 1 else []
-        self.walls = torch.zeros(len(self.planes), kernels.WALL.value, device=self.device)
-        self.windows = torch.zeros(len(self.planes), 2, dtype=torch.float64, device=self.device)
-        self._walls_of: list[int] | None = None  # versions of the tensors that the tables were made from
+        self.solids = Solids(solids_of(bound.body.boundaries) if self.scenes == 1 else [], self.device)
         self.clock = torch.zeros(2, dtype=torch.float64, device=self.device)  # time at step 0, substep [s]
         self.crowd = crowd_of(points.position, bound.settings.dx)
         self.crossing = 1e-3  # how many cells a particle enters in a substep; measured by the rollouts
@@ -89,7 +84,8 @@ class FusedUpdated(Fused):
         self._take_grid(state.grid, 8 if options["IMPLICIT"] else 4)
         self.impulse.zero_()
         self.clock.copy_(torch.stack([self.time, self.dt]))
-        self._take_walls()
+        self.solids.take()
+        self.solids.prepare(self.time, self.dt, steps)
         self._load(state)
         self._start(options)
         done, every = 0, self._sorted_for()
@@ -126,19 +122,7 @@ class FusedUpdated(Fused):
     @property
     def _acting(self) -> bool:
         """Whether boundary conditions act in torch."""
-        return len(self.body.boundaries) > 0 and not self.planes
-
-    def _take_walls(self) -> None:
-        """Fill the tables of the planes, again if one of their tensors was written to; graphs know the addresses."""
-        tensors = [tensor for plane, _ in self.planes for tensor in (plane.point, plane.normal)]
-        known_versions = not any(tensor.is_inference() for tensor in tensors)
-        versions = [tensor._version for tensor in tensors] if known_versions else None
-        if not self.planes or (versions is not None and versions == self._walls_of):
-            return
-        self._walls_of, places = versions, torch.stack(tensors).to(self.device).reshape(-1, 6)
-        known = [[float(KINDS.index(plane.kind)), plane.friction, float(k)] for plane, k in self.planes]
-        self.walls.copy_(torch.cat([places, torch.tensor(known, device=self.device)], dim=1))
-        self.windows.copy_(torch.tensor([[plane.start, plane.end] for plane, _ in self.planes], dtype=torch.float64))
+        return len(self.body.boundaries) > 0 and not self.solids.parts
 
     def _start(self, options: dict[str, Any]) -> None:
         """The start of a substep without the end of the one before."""
@@ -224,12 +208,13 @@ class FusedUpdated(Fused):
     def _nodes(self, offset: int, options: dict[str, Any]) -> None:
         nodes = self.grid.node_count * self.scenes
         block = 256
-        acting, (_, ny, nz) = self._acting, self.grid.resolution
+        acting, (_, ny, nz), solids = self._acting, self.grid.resolution, self.solids
         kernels.updated_nodes[(-(-nodes // block),)](
             self.momentum, self.velocity, self.inverse_mass, nodes, self.schedule, self.first_step, offset,
-            *self.gravity, self.walls, self.windows, self.clock, self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
+            *self.gravity, solids.rows, solids.whole, solids.windows, solids.poses, solids.grids, self.clock,
+            self.impulse, *self.grid.offset, ny, nz, self.grid.dx,
             IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1], KEEP=acting,
-            WALLS=len(self.planes), BLOCK=block, num_warps=4,
+            SOLIDS=solids.options, MOVING=solids.moving, COUNT=len(solids.parts), BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()
@@ -341,14 +326,3 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
     best = math.sqrt(0.4 / max(crossing, 1e-9)) * max(8 / crowd, math.sqrt(crowd / 8))
     least = min(max(round(2e6 / max(count, 1)), LEAST), 32)
     return int(min(max(round(best), least), MOST))
-
-
-def planes_of(boundaries: Sequence[nn.Module]) -> list[tuple[Plane, int]]:
-    """The planes of all boundaries, each with the number of its boundary; none if not all boundaries are planes.
-
-    Args:
-        boundaries: The boundary conditions of a body.
-    """
-    if any(type(boundary) not in (Plane, EnclosingBox) for boundary in boundaries):
-        return []
-    return [(part, k) for k, one in enumerate(boundaries) for part in one.modules() if isinstance(part, Plane)]

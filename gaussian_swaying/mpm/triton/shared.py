@@ -49,7 +49,7 @@ def twin_force(
     """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]; with SPACE, by their place."""
     first = load3(values, count, index, mask)
     last = tl.load(values + 3 * count + index, mask, 0.0)
-    vector = vectors + (step * scenes + scene) * 8  # forces.TWIN_VECTOR
+    vector = vectors + (step * scenes + scene) * 16  # forces.TWIN_VECTOR
     value = (first[0], first[1], first[2], last)
     if SPACE:
         force, resistance = TWIN(F, velocity, position, value, vector, numbers, space, OPTIONS)

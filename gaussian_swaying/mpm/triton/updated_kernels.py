@@ -14,6 +14,7 @@ import triton.language as tl
 from gaussian_swaying.geometry.linalg_triton import axpy9, load3, load9, matmul, scale9, store3, store9, transpose
 from gaussian_swaying.mpm.laws.triton.body import ROW, kirchhoff
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_pk1
+from gaussian_swaying.mpm.triton.obstacle_kernels import NUMBERS, POSE, WHOLE, acts, stop_nodes
 from gaussian_swaying.mpm.triton.shared import (
     VARIES,
     account,
@@ -287,38 +288,18 @@ def updated_particles(
         store9(moving + 15 * count, count, index, C, mask)
 
 
-WALL = tl.constexpr(9)  # columns of the table of walls: point, normal, kind (in plane.KINDS), friction, boundary
-
-
-@triton.jit
-def _stop(v, x, wall):
-    """Velocity of a node at x in contact with a wall, as :func:`boundaries.plane.plane_velocity`, and where it is."""
-    p = (tl.load(wall), tl.load(wall + 1), tl.load(wall + 2))
-    n = (tl.load(wall + 3), tl.load(wall + 4), tl.load(wall + 5))
-    kind = tl.load(wall + 6)
-    friction = tl.load(wall + 7)
-    behind = ((x[0] - p[0]) * n[0] + (x[1] - p[1]) * n[1] + (x[2] - p[2]) * n[2]) <= 0
-    along = v[0] * n[0] + v[1] * n[1] + v[2] * n[2]
-    removed = tl.where(kind == 2, tl.minimum(along, 0.0), along)
-    t = (v[0] - along * n[0], v[1] - along * n[1], v[2] - along * n[2])
-    speed = tl.maximum(tl.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]), 1.1754944e-38)
-    left = tl.where(friction > 0, tl.maximum(1 - friction * tl.abs(removed) / speed, 0.0), 1.0)
-    left = tl.where(kind == 0, 0.0, left)
-    rest = tl.where(kind == 0, 0.0, along - removed)
-    return (left * t[0] + rest * n[0], left * t[1] + rest * n[1], left * t[2] + rest * n[2]), behind
-
-
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z, walls, windows, clock, impulse, ox, oy, oz, ny, nz, dx,
-    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, WALLS: tl.constexpr, BLOCK: tl.constexpr,
+    gravity_x, gravity_y, gravity_z, solids, whole, windows, poses, grids, clock, impulse, ox, oy, oz, ny, nz, dx,
+    IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, SOLIDS: tl.constexpr, MOVING: tl.constexpr,
+    COUNT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: nodal velocities from momenta and masses, which are set back to zero; KEEP for boundaries.
 
-    With WALLS, the number of planes, they are applied here, in order. ``walls`` has a row of :data:`WALL` numbers for
-    each, ``windows`` their first and last time [s], ``clock`` the time at step 0 and the substep [s], all float64 but
-    ``walls``; ``impulse`` (B, 3) collects the momentum that each boundary takes.
+    SOLIDS has twice the kind of each solid, plus one if it moves. All COUNT of them are applied here, in order; see
+    :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. With MOVING there are poses for every substep. ``clock`` has
+    the time at step 0 and the substep [s], float64; ``impulse`` (B, 3) collects the momentum that each boundary takes.
     """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
@@ -340,23 +321,25 @@ def updated_nodes(
         (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay,
         (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay,
     )
-    if WALLS > 0:
-        now = tl.load(clock) + step * tl.load(clock + 1) + 1e-9  # boundary.CLOCK
+    if COUNT > 0:
+        now = tl.load(clock) + step * tl.load(clock + 1)
+        pose = poses
+        if MOVING:
+            pose = poses + step * (COUNT * POSE)
         x = (
             (k // (ny * nz) + ox).to(tl.float32) * dx,
             (k // nz % ny + oy).to(tl.float32) * dx,
             (k % nz + oz).to(tl.float32) * dx,
         )
-        for w in tl.static_range(WALLS):
-            stopped, behind = _stop(v, x, walls + w * WALL)
-            begun = now >= tl.load(windows + 2 * w)
-            over = now >= tl.load(windows + 2 * w + 1)
-            hit = tl.where(begun, tl.where(over, False, behind & some & mask), False)
-            u = (
-                tl.where(hit, stopped[0], v[0]), tl.where(hit, stopped[1], v[1]), tl.where(hit, stopped[2], v[2])
+        for w in tl.static_range(COUNT):
+            held, behind = stop_nodes(
+                v, x, solids + w * NUMBERS, whole + w * WHOLE, pose + w * POSE, grids, some & mask, SOLIDS[w] // 2,
+                SOLIDS[w] % 2,
             )  # fmt: skip
-            if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a wall
-                to = impulse + 3 * tl.load(walls + w * WALL + 8).to(tl.int32)
+            hit = tl.where(acts(windows + 2 * w, now), behind & some & mask, False)
+            u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))
+            if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a solid
+                to = impulse + 3 * tl.load(solids + w * NUMBERS + 8).to(tl.int32)
                 for c in tl.static_range(3):
                     tl.atomic_add(to + c, tl.sum((mass * (v[c] - u[c])).to(tl.float64)), sem="relaxed")
             v = u

@@ -1,4 +1,4 @@
-"""The paper's scenes for ``bench.py gallery``: runs them, checks their motion, and makes pictures."""
+"""The paper's scenes and those of docs/wind.md: ``bench.py gallery`` runs them, checks motion, and makes pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,9 @@ SCENES = {
     "solid_surface_wind": "Solid, wind on its surface",
     "solid_all_wind": "Solid, wind on all Gaussians",
     "sand_to_foam": "Sand turned into white foam",
+    "flag_behind_pole": "Flag behind a pole",
+    "plant_row": "Row of plants in a boundary layer",
+    "ficus_behind_wall": "Ficus behind a wall",
 }
 """Name of the file in configs/sim, without suffix, and title."""
 
@@ -71,23 +74,25 @@ def _without_modules(value: Any) -> Any:
     return [_without_modules(v) for v in value] if isinstance(value, list) else value
 
 
-def strip(frames: Path, target: Path) -> None:
-    """Make a picture of five frames side by side."""
+def strip(folders: Sequence[Path], target: Path) -> None:
+    """Make a picture of five frames side by side, with a row for each folder of frames."""
     import numpy as np
     import torch
     from einops import rearrange
     from imageio.v3 import imread, imwrite
 
-    files = sorted(frames.glob("*.png"))
-    pictures = []
-    for share in _SHOWN:
-        pixels = torch.from_numpy(imread(files[min(round(share * len(files)), len(files) - 1)])).float()
-        height = round(pixels.shape[0] * _STRIP_WIDTH / pixels.shape[1])
-        size = (height, _STRIP_WIDTH)
-        small = torch.nn.functional.interpolate(rearrange(pixels, "h w c -> 1 c h w"), size, mode="area")
-        pictures.append(rearrange(small, "1 c h w -> h w c").round().to(torch.uint8).numpy())
+    rows = []
+    for folder in folders:
+        files, pictures = sorted(folder.glob("*.png")), []
+        for share in _SHOWN:
+            pixels = torch.from_numpy(imread(files[min(round(share * len(files)), len(files) - 1)])).float()
+            height = round(pixels.shape[0] * _STRIP_WIDTH / pixels.shape[1])
+            size = (height, _STRIP_WIDTH)
+            small = torch.nn.functional.interpolate(rearrange(pixels, "h w c -> 1 c h w"), size, mode="area")
+            pictures.append(rearrange(small, "1 c h w -> h w c").round().to(torch.uint8).numpy())
+        rows.append(np.concatenate(pictures, axis=1))
     target.parent.mkdir(parents=True, exist_ok=True)
-    imwrite(target, np.concatenate(pictures, axis=1))
+    imwrite(target, np.concatenate(rows))
 
 
 def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
@@ -105,7 +110,8 @@ def run_scene(name: str, options: argparse.Namespace, pictures: Path) -> Row:
             return {"failed": what_failed(done.stderr)}
         summary = json.loads((output / "summary.json").read_text())
         summary.pop("per_frame")
-        strip(output / "frames", pictures / f"gallery_{name}.png")
+        folders = [folder for folder in (output / "frames", output / "wind") if folder.is_dir()]
+        strip(folders, pictures / f"gallery_{name}.png")
     moved = summary["displacement_mean_max_m"]
     share = None if moved is None else moved / summary["size_m"]
     noted = {"preset": options.preset, "configuration": fingerprint(name, options.preset)}

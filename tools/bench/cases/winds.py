@@ -1,11 +1,14 @@
-"""What ``bench.py winds`` measures: substeps in winds that differ from place to place, and the time to make a box."""
+"""What ``bench.py winds`` measures: substeps in winds that differ from place to place and with obstacles, and a box."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import statistics
+import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +19,21 @@ from bench.clock import Clock, guarded
 from bench.problems import CUBE, sheet, waves, wind_load
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import LogProfile, WindEffect
-from gaussian_swaying.aero.obstacles import CylinderObstacle
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.turbulence_box import turbulence_box
 from gaussian_swaying.aero.wind import UniformGust, WindField
+from gaussian_swaying.geometry.keyed_path import KeyedPath
+from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
 from gaussian_swaying.mpm.solver import MPMSolver
 
 Row = dict[str, Any]
 
 DT = 1e-4  # s
 BOX = (256, 128, 128)
-COUNTS = {"cuda": (20_000, 100_000, 1_000_000), "cpu": (5_000, 20_000, 100_000)}
+COUNTS = {"cuda": (100_000, 1_000_000), "cpu": (5_000, 20_000, 100_000)}
 STEPS = {"cuda": 64, "cpu": 6}
 ROUNDS = {"cuda": 15, "cpu": 9}
 
@@ -41,23 +48,79 @@ def effects(name: str) -> list[WindEffect]:
         "profile, turbulence": [profile, turbulence],
         "profile, turbulence, shelter": [profile, turbulence, Shelter()],
         "cylinder": [CylinderObstacle([-0.5, 0.0, 0.0], 0.1, axis=[0.0, 1.0, 0.0])],
+        "ellipsoid": [EllipsoidObstacle([-0.5, 0.5, 0.0], [0.1, 0.5, 0.5])],
     }[name]
 
 
-KINDS = ("uniform", "turbulence", "profile, turbulence", "profile, turbulence, shelter", "cylinder")
+KINDS = ("uniform", "turbulence", "profile, turbulence", "profile, turbulence, shelter", "cylinder", "ellipsoid")
+OBSTACLES = ("none", "ball", "moving ball", "mesh")
+
+
+def solids(name: str, folder: Path) -> list[Boundary]:
+    """What the body meets: the ball and the mesh, an octahedron, reach just above the middle of the sheet."""
+    if name == "none":
+        return []
+    if name == "mesh":
+        corners = [[s * 0.2 if k == axis else 0.0 for k in range(3)] for axis in range(3) for s in (1, -1)]
+        faces = [(1, 3, 5), (3, 2, 5), (2, 4, 5), (4, 1, 5), (3, 1, 6), (2, 3, 6), (4, 2, 6), (1, 4, 6)]
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {b} {c}" for a, b, c in faces]
+        (folder / "octahedron.obj").write_text("\n".join(lines) + "\n")
+        return [MeshObstacle(str(folder / "octahedron.obj"), center=[0.5, 0.5, 0.33])]
+    path = KeyedPath([0.0, 10.0], [[0.0] * 3, [0.0, 0.0, 0.1]], [[0.0] * 3, [0.0, 0.0, 90.0]])
+    return [BallObstacle([0.5, 0.5, 0.33], 0.2, path=path if name == "moving ball" else None)]
+
+
+def in_turns(runs: dict[str, Callable[[], object]], device: torch.device, steps: int, rounds: int) -> dict[str, Row]:
+    """Milliseconds of a substep of several rollouts, in turns, so that other work disturbs all of them alike.
+
+    The ratio is the median over the rounds of the time to that of the first one in the same round.
+    """
+    for roll in runs.values():
+        for _ in range(3):
+            roll()
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds):
+        for name, roll in runs.items():
+            clock = Clock(device)
+            clock.mark()
+            roll()
+            clock.mark()
+            times[name] += [ms / steps for ms in clock.read()]
+    first = next(iter(times.values()))
+    ratios = {name: [a / b for a, b in zip(samples, first, strict=True)] for name, samples in times.items()}
+    return {
+        name: {"median_ms": statistics.median(samples), "ratio": statistics.median(ratios[name]), "rounds": rounds}
+        for name, samples in times.items()
+    }
+
+
+def measure_obstacles(count: int, formulation: str, device: torch.device, steps: int, rounds: int) -> list[Row]:
+    """Substeps of a sheet that lies on each of :data:`OBSTACLES`."""
+    points = sheet(count, device)
+    runs, solvers = {}, {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in OBSTACLES:
+            solver = MPMSolver(dx=CUBE.dx, formulation=formulation, boundaries=solids(name, Path(folder))).to(device)
+            state = solver.init_state(points, waves(points.position))
+            if formulation == "updated":
+                state = state.replace(grid=CUBE)
+            runs[name], solvers[name] = partial(solver.rollout, state, DT, steps), solver
+    rows = []
+    for name, found in in_turns(runs, device, steps, rounds).items():
+        fused = solvers[name].fused()
+        row: Row = {"particles": points.count, "formulation": formulation, "obstacle": name, "substeps": steps}
+        rows.append(row | found | {"path": "torch" if fused is None else "kernels"})
+    return rows
 
 
 def measure(count: int, formulation: str, device: torch.device, steps: int, rounds: int) -> list[Row]:
-    """Substeps of a sheet in each wind, in turns, so that a machine that others use disturbs all of them alike.
-
-    The ratio is the median over the rounds of the time in this wind to that in the uniform one of the same round.
-    """
+    """Substeps of a sheet in each wind."""
     points = sheet(count, device)
     winds = {
         name: WindField([2.0, 0.0, 1.0], modulations=[UniformGust()], effects=effects(name)).to(device)
         for name in KINDS
     }
-    runs = {}
+    runs, parts = {}, {}
     for name, wind in winds.items():
         solver = MPMSolver(dx=CUBE.dx, formulation=formulation)
         state = solver.init_state(points, waves(points.position))
@@ -65,25 +128,13 @@ def measure(count: int, formulation: str, device: torch.device, steps: int, roun
             state = state.replace(grid=CUBE)
         load = wind_load(points, wind)
         load.refresh(state)
-        for _ in range(3):
-            solver.rollout(state, DT, steps, load)
-        runs[name] = (solver, state, load)
-    times: dict[str, list[float]] = {name: [] for name in KINDS}
-    for _ in range(rounds):
-        for name, (solver, state, load) in runs.items():
-            clock = Clock(device)
-            clock.mark()
-            solver.rollout(state, DT, steps, load)
-            clock.mark()
-            times[name] += [ms / steps for ms in clock.read()]
+        runs[name], parts[name] = partial(solver.rollout, state, DT, steps, load), (solver, load)
     rows = []
-    for name, samples in times.items():
-        shares = [a / b for a, b in zip(samples, times["uniform"], strict=True)]
-        solver, _, load = runs[name]
+    for name, found in in_turns(runs, device, steps, rounds).items():
+        solver, load = parts[name]
         kernels = solver.fused() is not None and load.has_twin
         row: Row = {"particles": points.count, "formulation": formulation, "wind": name, "substeps": steps}
-        row |= {"median_ms": statistics.median(samples), "ratio": statistics.median(shares), "rounds": rounds}
-        rows.append(row | {"path": "kernels" if kernels else "torch"})
+        rows.append(row | found | {"path": "kernels" if kernels else "torch"})
     return rows
 
 
@@ -116,11 +167,13 @@ def run(options: argparse.Namespace) -> None:
     device, result = record.start(options.device)
     kind, folder = device.type, Path(options.results)
     counts = COUNTS[kind] if options.counts is None else [int(n) for n in options.counts.split(",")]
-    result |= {"box": measure_box(device), "rows": []}
-    for formulation in options.formulations.split(","):
-        for count in counts:
-            found = guarded(lambda c=count, f=formulation: {"rows": measure(c, f, device, STEPS[kind], ROUNDS[kind])})
-            failed = {"particles": count, "formulation": formulation, "wind": "-", "failed": found.get("failed")}
-            result["rows"] += found.get("rows", [failed])
-            print(json.dumps(result["rows"][-1]), flush=True)
-            record.write(folder, f"winds_{kind}", result, quiet=True)
+    result |= {"box": measure_box(device), "rows": [], "obstacles": []}
+    for count in counts:
+        for formulation in options.formulations.split(","):
+            for key, what, take in (("rows", "wind", measure), ("obstacles", "obstacle", measure_obstacles)):
+                work = partial(take, count, formulation, device, STEPS[kind], ROUNDS[kind])
+                found = guarded(lambda work=work: {"rows": work()})
+                failed = {"particles": count, "formulation": formulation, what: "-", "failed": found.get("failed")}
+                result[key] += found.get("rows", [failed])
+                print(json.dumps(result[key][-1]), flush=True)
+                record.write(folder, f"winds_{kind}", result, quiet=True)

@@ -33,6 +33,20 @@ def rows(result: Row) -> list[str]:
     return [source(result), "", *grid(head, found)]
 
 
+@table(PAGE, "winds.obstacles", "winds_*")
+def obstacles(result: Row) -> list[str]:
+    """Time of a substep of a sheet that lies on each obstacle."""
+    head = ["sheet", "obstacle", "runs in", "substep [ms]", "per that without"]
+    found = []
+    for row in result.get("obstacles", []):
+        name = f"`{row['formulation']}`, {row['particles']:,} points"
+        if "failed" in row:
+            found.append([name, f"failed: {row['failed']}", "-", "-", "-"])
+            continue
+        found.append([name, row["obstacle"], row["path"], f"{row['median_ms']:.3g}", f"{row['ratio']:.2f}"])
+    return [source(result), "", *grid(head, found)] if found else ["Not recorded yet."]
+
+
 @table(PAGE, "winds.goals", "winds_*")
 def goals(result: Row) -> list[str]:
     """The goals."""

@@ -1,0 +1,250 @@
+"""Flow round bodies in the wind as Triton functions, for the fused substep.
+
+The references are ``aero.obstacle_flow`` and ``aero.obstacles``; ``aero.effects_twin`` says what they read. They
+compute in float32.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.aero import obstacle_flow
+from gaussian_swaying.geometry.linalg_triton import cross3, dot3, read3
+
+PI = tl.constexpr(3.141592653589793)
+STREET_SPEED = tl.constexpr(obstacle_flow.STREET_SPEED)
+KARMAN_RATIO = tl.constexpr(obstacle_flow.KARMAN_RATIO)
+PLANE_GROWTH = tl.constexpr(obstacle_flow.PLANE_GROWTH)
+CORE = tl.constexpr(obstacle_flow.CORE)
+ROUND_GROWTH = tl.constexpr(obstacle_flow.ROUND_GROWTH)
+NEWTON = tl.constexpr(7)  # steps to the root for an ellipsoid: from two thirds of its distance to float32
+DUPLICATIONS = tl.constexpr(5)  # of Carlson's integral, to float32
+
+
+@triton.jit
+def _direction(flow):
+    """Unit vector of a flow, zero in still air, and its speed."""
+    speed = tl.sqrt(dot3(flow, flow))
+    scale = 1 / tl.maximum(speed, 1e-12)
+    return (flow[0] * scale, flow[1] * scale, flow[2] * scale), speed
+
+
+@triton.jit
+def _scaled(v, factor):
+    return v[0] * factor, v[1] * factor, v[2] * factor
+
+
+@triton.jit
+def _only(where, v):
+    """A vector, zero elsewhere."""
+    return tl.where(where, v[0], 0.0), tl.where(where, v[1], 0.0), tl.where(where, v[2], 0.0)
+
+
+@triton.jit
+def round_wake(behind, aside, width, drag, start):
+    """As ``obstacle_flow.round_wake``; ``start`` is its width at the body, per ``width``."""
+    sigma = ROUND_GROWTH * tl.maximum(behind, 0.0) / width + start
+    depth = 1 - tl.sqrt(tl.maximum(1 - drag / (8 * sigma * sigma), 0.0))
+    far = aside / (width * sigma)
+    return tl.where(behind > 0, depth * tl.exp(-0.5 * far * far), 0.0)
+
+
+@triton.jit
+def plane_wake(behind, aside, width, drag):
+    """As ``obstacle_flow.plane_wake``."""
+    thickness = 0.5 * drag * width
+    least = 2 * thickness / 1.7724538509055159  # the square root of pi
+    sigma = tl.maximum(PLANE_GROWTH * tl.sqrt(thickness * tl.maximum(behind, 0.0)), least)
+    depth = (1 - tl.sqrt(tl.maximum(1 - least / sigma, 0.0))) * 0.7071067811865476
+    far = aside / sigma
+    return tl.where(behind > 0, depth * tl.exp(-0.5 * far * far), 0.0)
+
+
+@triton.jit
+def vortex_street(behind, aside, width, turns, strouhal):
+    """As ``obstacle_flow.vortex_street``."""
+    length = STREET_SPEED * width / strouhal
+    strength = 0.5 * (1 - STREET_SPEED) * 2.8284271247461903
+    phase = 2 * PI * (behind / length - turns)
+    u = behind * 0
+    v = behind * 0
+    for row in tl.static_range(2):
+        sign = 1.0 - 2.0 * row
+        y = (2 * PI / length) * aside - sign * (PI * KARMAN_RATIO)
+        y = tl.minimum(tl.maximum(y, -20.0), 20.0)
+        up = tl.exp(y)
+        down = 1 / up
+        rise = 0.5 * (up + down) + CORE
+        steep = 0.5 * (up - down)
+        bottom = rise - sign * tl.cos(phase)
+        u += sign * steep * (1 / bottom - 1 / tl.sqrt(rise * rise - 1))
+        v -= tl.sin(phase) / bottom  # the other row has the opposite sign and half a turn more
+    along = tl.minimum(tl.maximum(behind / (2 * width), 0.0), 1.0)
+    fade = strength * along * along * (3 - 2 * along) * tl.exp(-tl.maximum(behind, 0.0) / (30 * width))
+    return u * fade, v * fade
+
+
+@triton.jit
+def past_sphere(v, x, head, vector, WAKE: tl.constexpr):
+    """As ``SphereObstacle``; ``head``: middle (3), radius, drag, start of the wake."""
+    middle = read3(head)
+    radius = tl.load(head + 3)
+    p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
+    square = dot3(p, p)
+    outside = square >= radius * radius
+    away = tl.maximum(square, radius * radius)
+    along = 3 * dot3(v, p) / away
+    share = 0.5 * radius * radius * radius / (away * tl.sqrt(away))
+    v = (
+        v[0] + share * (v[0] - along * p[0]), v[1] + share * (v[1] - along * p[1]), v[2] + share * (v[2] - along * p[2])
+    )  # fmt: skip
+    v = _only(outside, v)
+    if WAKE:
+        direction, _speed = _direction(read3(vector + 7))
+        behind = dot3(p, direction)
+        aside = tl.sqrt(tl.maximum(square - behind * behind, 0.0))
+        v = _scaled(v, 1 - round_wake(behind, aside, 2 * radius, tl.load(head + 4), tl.load(head + 5)))
+    return v
+
+
+@triton.jit
+def past_cylinder(v, x, head, vector, WAKE: tl.constexpr, STREET: tl.constexpr):
+    """As ``CylinderObstacle``; ``head``: middle (3), radius, drag, axis (3), Strouhal number.
+
+    ``STREET`` is which of the numbers in ``vector`` holds its turns, 0 without a street.
+    """
+    middle = read3(head)
+    radius = tl.load(head + 3)
+    axis = read3(head + 5)
+    p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
+    height = dot3(p, axis)
+    away = (p[0] - height * axis[0], p[1] - height * axis[1], p[2] - height * axis[2])
+    rising = dot3(v, axis)
+    across = (v[0] - rising * axis[0], v[1] - rising * axis[1], v[2] - rising * axis[2])
+    square = dot3(away, away)
+    outside = square >= radius * radius
+    square = tl.maximum(square, radius * radius)
+    along = 2 * dot3(across, away) / square
+    share = radius * radius / square
+    v = (
+        v[0] + share * (across[0] - along * away[0]),
+        v[1] + share * (across[1] - along * away[1]),
+        v[2] + share * (across[2] - along * away[2]),
+    )
+    v = _only(outside, v)
+    if WAKE:
+        flow = read3(vector + 7)
+        rising = dot3(flow, axis)
+        flow = (flow[0] - rising * axis[0], flow[1] - rising * axis[1], flow[2] - rising * axis[2])
+        direction, speed = _direction(flow)
+        left = cross3(axis, direction)
+        behind = dot3(p, direction)
+        aside = dot3(p, left)
+        v = _scaled(v, 1 - plane_wake(behind, aside, 2 * radius, tl.load(head + 4)))
+        if STREET > 0:
+            a, b = vortex_street(behind, aside, 2 * radius, tl.load(vector + STREET), tl.load(head + 8))
+            swirls = behind * behind + aside * aside >= radius * radius
+            a = tl.where(swirls, a, 0.0) * speed
+            b = tl.where(swirls, b, 0.0) * speed
+            v = (
+                v[0] + a * direction[0] + b * left[0],
+                v[1] + a * direction[1] + b * left[1],
+                v[2] + a * direction[2] + b * left[2],
+            )
+    return v
+
+
+@triton.jit
+def carlson_rd(x, y, z):
+    """As ``obstacle_flow.carlson_rd``, to float32."""
+    total = x * 0
+    factor = 1.0
+    for _step in range(DUPLICATIONS):
+        rx = tl.sqrt(x)
+        ry = tl.sqrt(y)
+        rz = tl.sqrt(z)
+        step = rx * ry + ry * rz + rz * rx
+        total += factor / (rz * (z + step))
+        factor *= 0.25
+        x = 0.25 * (x + step)
+        y = 0.25 * (y + step)
+        z = 0.25 * (z + step)
+    mean = (x + y + 3 * z) / 5
+    a = 1 - x / mean
+    b = 1 - y / mean
+    c = 1 - z / mean
+    e2 = a * b - 6 * c * c
+    e3 = (3 * a * b - 8 * c * c) * c
+    return 3 * total + factor * (1 - 3 / 14 * e2 + e3 / 6) / (mean * tl.sqrt(mean))
+
+
+@triton.jit
+def _over(x, a, root):
+    """The place per the squared half axes of the ellipsoid through it."""
+    return x[0] / (a[0] + root), x[1] / (a[1] + root), x[2] / (a[2] + root)
+
+
+@triton.jit
+def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
+    """As ``EllipsoidObstacle``.
+
+    ``head``: middle (3), size (its longest half axis), drag, start of the wake, axes (9), the half axes per ``size``
+    (3), and what its flow is strengthened by along each axis (3).
+    """
+    middle = read3(head)
+    size = tl.load(head + 3)
+    first = read3(head + 6)
+    second = read3(head + 9)
+    third = read3(head + 12)
+    r = read3(head + 15)
+    p = (x[0] - middle[0], x[1] - middle[1], x[2] - middle[2])
+    q = (dot3(first, p) / size, dot3(second, p) / size, dot3(third, p) / size)
+    w = (dot3(first, v), dot3(second, v), dot3(third, v))
+    a = (r[0] * r[0], r[1] * r[1], r[2] * r[2])
+    outside = q[0] * q[0] / a[0] + q[1] * q[1] / a[1] + q[2] * q[2] / a[2] >= 1
+    q = (tl.where(outside, q[0], r[0]), tl.where(outside, q[1], r[1]), tl.where(outside, q[2], r[2]))
+    sides = tl.maximum(tl.maximum(q[0] * q[0] - a[0], q[1] * q[1] - a[1]), q[2] * q[2] - a[2])
+    root = tl.maximum(tl.maximum(sides, dot3(q, q) - 1), 0.0)
+    for _step in range(NEWTON):
+        n = _over(q, a, root)
+        root = tl.maximum(root + (dot3(q, n) - 1) / dot3(n, n), 0.0)
+    s = (a[0] + root, a[1] + root, a[2] + root)
+    n = _over(q, a, root)
+    volume = r[0] * r[1] * r[2]
+    third_of = 2 / 3 * volume
+    strong = (tl.load(head + 18) * w[0], tl.load(head + 19) * w[1], tl.load(head + 20) * w[2])
+    along = strong[0] * q[0] / s[0] + strong[1] * q[1] / s[1] + strong[2] * q[2] / s[2]
+    steep = -2 * volume / tl.sqrt(s[0] * s[1] * s[2]) * along / dot3(n, n)
+    w = (
+        w[0] + strong[0] * third_of * carlson_rd(s[1], s[2], s[0]) + steep * n[0],
+        w[1] + strong[1] * third_of * carlson_rd(s[2], s[0], s[1]) + steep * n[1],
+        w[2] + strong[2] * third_of * carlson_rd(s[0], s[1], s[2]) + steep * n[2],
+    )
+    w = _only(outside, w)
+    v = (
+        first[0] * w[0] + second[0] * w[1] + third[0] * w[2],
+        first[1] * w[0] + second[1] * w[1] + third[1] * w[2],
+        first[2] * w[0] + second[2] * w[1] + third[2] * w[2],
+    )
+    if WAKE:
+        direction, _speed = _direction(read3(vector + 7))
+        flat = tl.maximum(tl.sqrt(direction[0] * direction[0] + direction[1] * direction[1]), 1e-12)
+        side = (-direction[1] / flat, direction[0] / flat, 0.0)
+        up = cross3(direction, side)
+        wide = _across(side, first, second, third, r) * size
+        high = _across(up, first, second, third, r) * size
+        mean = tl.sqrt(tl.maximum(wide * high, 1e-12))
+        left = dot3(p, side) * (mean / tl.maximum(wide, 1e-12))
+        above = dot3(p, up) * (mean / tl.maximum(high, 1e-12))
+        behind = dot3(p, direction) / mean
+        aside = tl.sqrt(left * left + above * above) / mean
+        v = _scaled(v, 1 - round_wake(behind, aside, 1.0, tl.load(head + 4), tl.load(head + 5)))
+    return v
+
+
+@triton.jit
+def _across(direction, first, second, third, r):
+    """Width of an ellipsoid in a direction."""
+    a = dot3(first, direction) * r[0]
+    b = dot3(second, direction) * r[1]
+    c = dot3(third, direction) * r[2]
+    return 2 * tl.sqrt(a * a + b * b + c * c)

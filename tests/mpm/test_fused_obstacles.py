@@ -1,0 +1,153 @@
+"""Obstacles in the kernels against torch; on a CPU in Triton's interpreter."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.distance import DistanceGrid
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.keyed_path import KeyedPath
+from gaussian_swaying.geometry.rotations import rotation_from_z
+from gaussian_swaying.mpm.boundaries.ball import BallObstacle
+from gaussian_swaying.mpm.boundaries.block import BoxObstacle
+from gaussian_swaying.mpm.boundaries.capsule import CapsuleObstacle
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
+from gaussian_swaying.mpm.boundaries.mesh import MeshObstacle
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.still_gaussians import StillGaussians
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
+from gaussian_swaying.mpm.triton import fused
+from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
+from gaussian_swaying.mpm.triton.obstacles import Solids
+
+DT = 1e-3
+MESH = str(Path(__file__).parent / "boundaries" / "octahedron.obj")
+
+
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    """Where the kernels run."""
+    if request.param == "interpreted" and not fused.INTERPRETED:
+        pytest.skip("on this machine the kernels are compiled")
+    return torch.device("cuda" if request.param == "cuda" else "cpu")
+
+
+def _path():
+    """Between two keys at DT and 30 DT, then at rest."""
+    return KeyedPath([DT, 30 * DT], [[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]], [[0.0, 10.0, 20.0], [50.0, -20.0, 90.0]])
+
+
+def _still():
+    found = StillGaussians()
+    axis = torch.linspace(-0.3, 0.3, 7, dtype=torch.float64)
+    place = torch.stack(torch.meshgrid(axis, axis, axis[:5], indexing="ij"), -1)
+    found.take(DistanceGrid(place.norm(dim=-1) - 0.2, place[0, 0, 0], 0.1))
+    return found
+
+
+SHAPES = {
+    "ball": lambda **more: BallObstacle([0.1, 0.0, 0.0], 0.2, **more),
+    "capsule": lambda **more: CapsuleObstacle([0.0, 0.0, 0.0], [0.2, 0.1, 0.1], 0.1, **more),
+    "capsule that is a ball": lambda **more: CapsuleObstacle([0.1, 0.0, 0.0], [0.1, 0.0, 0.0], 0.1, **more),
+    "box": lambda **more: BoxObstacle([-0.2, -0.1, -0.1], [0.2, 0.2, 0.1], [0.0, 20.0, 30.0], **more),
+    "half space": lambda **more: HalfSpaceObstacle([0.0, 0.0, 0.1], [0.2, 0.0, 1.0], **more),
+    "mesh": lambda **more: MeshObstacle(MESH, 12, [0.05, 0.0, 0.0], **more),
+    "still": lambda **more: _still(),
+}
+
+
+def _ask_kernel(obstacle, place, time, device):
+    """Gap, normal, velocity and whether it counts at places in the kernel of ``total``; the last place is no place."""
+    solids = Solids([(obstacle.to(device), 0)], device, steps=1)
+    solids.take()
+    solids.prepare(time, torch.full_like(time, DT), 1)
+    count = len(place)
+    first = torch.arange(count, dtype=torch.int32, device=device)
+    first[-1] = -1
+    gap, valid = (torch.full((count,), -7.0, device=device) for _ in range(2))
+    facing, drive = (torch.zeros(count, 3, device=device) for _ in range(2))
+    row, whole, window, pose, grids = solids.of(0)
+    kernels.obstacle_places[(-(-count // 32),)](
+        first, torch.arange(count, dtype=torch.int32, device=device), place, torch.full((count,), 0.02, device=device),
+        gap, facing, drive, valid, count, row, whole, window, pose, grids, time,
+        KIND=solids.kinds[0], MOVES=solids.moves[0], BLOCK=32,
+    )  # fmt: skip
+    return gap, facing, drive, valid
+
+
+@pytest.mark.parametrize("moment", [0.0, 7.3 * DT, 40 * DT])
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("name", SHAPES)
+def test_distance_normal_and_velocity(device, name, moves, moment):
+    more = {"path": _path()} if moves else {}
+    frame = SimFrame(torch.tensor([0.02, 0.0, 0.01], dtype=torch.float64), rotation_from_z([0, -1, 0]).T, 1.2)
+    obstacle = SHAPES[name](gap=0.01, start=DT, end=39 * DT, **more) if name != "still" else _still()
+    obstacle = obstacle.in_frame(frame)
+    place = (0.9 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.45).to(device)
+    time = torch.tensor(moment, dtype=torch.float64, device=device)
+    gap, facing, drive, valid = _ask_kernel(obstacle, place, time, device)
+    distance, normal, own = obstacle.touch(place.double(), time, DT)
+    keep = slice(0, -1)
+    torch.testing.assert_close(gap[keep].double(), distance[keep] - 0.01, rtol=0, atol=1e-6)
+    torch.testing.assert_close(facing[keep].double(), normal[keep], rtol=0, atol=2e-4)
+    torch.testing.assert_close(drive[keep].double(), own[keep], rtol=0, atol=2e-5)
+    assert bool((valid[keep] == float(obstacle.active(time))).all())
+    assert float(valid[-1]) == 0.0
+    assert float(gap[-1]) == -7.0
+
+
+def _bodies(device, boundaries):
+    """A small block of particles, in torch and in the kernels, after some substeps from the same start."""
+    draw = torch.Generator().manual_seed(1)
+    position = (0.06 + 0.18 * torch.rand(12, 3, generator=draw)).to(device)
+    points = MaterialPoints.create(position, volume=1e-4, density=50.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    velocity = torch.randn(12, 3, generator=draw).to(device)
+    ends = []
+    for transfer in ("torch", "triton"):
+        solver = MPMSolver(dx=0.1, formulation="updated", transfer=transfer, boundaries=boundaries())
+        solver = solver.to(device)
+        state = solver.init_state(points, velocity)
+        for _ in range(3):  # on a GPU the last one is replayed
+            state = solver.rollout(state, DT, 2)
+        ends.append(state)
+    return solver, ends
+
+
+SETS = {
+    "at rest": lambda: [
+        BallObstacle([0.1, 0.1, 0.05], 0.06, 0.4),
+        Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate", 0.2, end=3.5 * DT),
+        BoxObstacle([0.2, 0.05, 0.05], [0.3, 0.25, 0.15], [0.0, 0.0, 20.0], 0.3),
+    ],
+    "moving": lambda: [
+        CapsuleObstacle([0.05, 0.05, 0.1], [0.1, 0.2, 0.1], 0.05, path=_path(), start=1.5 * DT),
+        MeshObstacle(MESH, 8, [0.25, 0.25, 0.1], 0.5, path=_path()),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_nodes_are_stopped_as_in_torch(device, name):
+    solver, (expected, found) = _bodies(device, SETS[name])
+    assert len(solver.fused().solids.parts) == len(SETS[name]())
+    for field in ("position", "velocity", "F_total", "impulse"):
+        a, b = getattr(found, field), getattr(expected, field)
+        torch.testing.assert_close(a, b, rtol=0, atol=5e-5 * float(b.abs().max()))
+    free = _bodies(device, list)[1][0]
+    assert float((free.velocity - expected.velocity).abs().max()) > 0.05
+    assert bool((expected.impulse.abs().amax(-1) > 1e-5).all())
+
+
+def test_an_obstacle_of_a_user_runs_in_torch(device):
+    class Bumpy(BallObstacle):
+        def distance(self, place):
+            distance, normal = super().distance(place)
+            return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
+
+    solver, (expected, found) = _bodies(device, lambda: [Bumpy([0.1, 0.1, 0.05], 0.06)])
+    assert solver.fused().solids.parts == []
+    torch.testing.assert_close(found.velocity, expected.velocity, rtol=0, atol=1e-4)
