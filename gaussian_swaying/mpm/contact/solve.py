@@ -36,7 +36,7 @@ PUSH = 0.2
 PUSH_CELLS = 0.004
 """Most of an overlap that a substep removes [cells]."""
 
-CHECK = 4
+CHECK = 1
 """After how many iterations the impulses are checked."""
 
 SLACK = 0.02

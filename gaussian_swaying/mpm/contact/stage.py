@@ -114,6 +114,7 @@ class ContactStage:
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)
+        self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # place in its cell
         self.slope = basis[:, 1:4]
         self.weight = basis[:, 0] + (arm[:, :, None] * self.slope).sum(1)
         self.scene = torch.arange(len(self.weight), device=read.device) // max(each, 1)

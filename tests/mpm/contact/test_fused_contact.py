@@ -12,13 +12,6 @@ from gaussian_swaying.mpm.triton import fused_contact
 DT = 1.2e-3
 
 
-@pytest.fixture(autouse=True)
-def _small(monkeypatch):
-    """Little room, as each program takes long in the interpreter."""
-    if not torch.cuda.is_available():
-        monkeypatch.setattr(fused_contact, "LEAST_ROOM", 16)
-
-
 def _collision(sheet, device):
     """A small sheet that flies onto one that is held at two corners, beside a moving ball."""
     below, above = sheet(5, 5, dtype=torch.float32), sheet(3, 3, (0.023, 0.017, 0.1), dtype=torch.float32)
