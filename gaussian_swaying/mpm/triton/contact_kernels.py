@@ -161,11 +161,11 @@ def _constrain_pairs(
         a0 += b0
         a1 += b1
         a2 += b2
-        length = tl.sqrt(tl.maximum(a0 * a0 + a1 * a1 + a2 * a2, 1.2e-38))
-        sure = length > 1.1e-19
-        a0 = tl.where(sure, a0 / length, f0)
-        a1 = tl.where(sure, a1 / length, f1)
-        a2 = tl.where(sure, a2 / length, f2)
+        size = tl.sqrt(tl.maximum(a0 * a0 + a1 * a1 + a2 * a2, 1.2e-38))
+        sure = size > 1.1e-19
+        a0 = tl.where(sure, a0 / size, f0)
+        a1 = tl.where(sure, a1 / size, f1)
+        a2 = tl.where(sure, a2 / size, f2)
         keep = 0.5 * (tl.load(low + 3, real, 0.0) + tl.load(high + 3, real, 0.0))
         gap = d0 * a0 + d1 * a1 + d2 * a2 - keep
         low = moving + tl.minimum(p, q) * 4

@@ -28,8 +28,11 @@ LEAST_MARGIN = 0.1
 AHEAD = 8.0
 """For how many substeps of the fastest node lists are made, unless that is more than the reach of contact."""
 
-BLOCK, WIDE, TALL = 256, 8, 32
-"""Places of a program at a time; candidates of each that are looked at together; nodes of a program at a time."""
+BLOCK, TALL = 256, 32
+"""Places, and nodes, of a program at a time."""
+
+WIDE, WIDE_SEARCH = 8, 4
+"""How many candidates of each place are looked at together, in a substep and when lists are made; 8 would spill."""
 
 PER_PROCESSOR = 2
 """Programs on each multiprocessor; all of them must run at once."""
@@ -180,8 +183,7 @@ class FusedContact:
         strides = (ny * nz, nz, 1 / dx)
         now = (schedule, first_step, offset, *strides)
         where = (self.fields, self.base, self.fraction, self.arm, self.rest)
-        tiles: dict[str, Any] = {"BLOCK": BLOCK, "WIDE": WIDE, "TALL": TALL}
-        launch: dict[str, Any] = {"ARMS": self.arms, "PROGRAMS": self.programs, **tiles, **_LAUNCH}
+        launch: dict[str, Any] = {"ARMS": self.arms, "PROGRAMS": self.programs, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
         if self.programs > 1:
             launch["launch_cooperative_grid"] = True
         if pairs:
@@ -192,7 +194,7 @@ class FusedContact:
                 self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
                 len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
                 stage.apart, SLACK * dx, LEAST_MARGIN * dx, self.stretch, AHEAD, self.last, -(-chunk // BLOCK) * BLOCK,
-                **launch,
+                WIDE=WIDE_SEARCH, **launch,
             )  # fmt: skip
         if walls:
             kernels.contact_positions[(-(-self.places // BLOCK),)](
@@ -211,7 +213,7 @@ class FusedContact:
             self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.total,
             len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, self.stretch, PUSH,
             PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
-            stage.iterations, PAIRS=pairs, WALLS=walls, **launch,
+            stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **launch,
         )  # fmt: skip
         for k, (number, _) in enumerate(stage.obstacles):
             taken[:, number] -= self.pressed[k].view(stage.scenes, -1, 3).sum(1, dtype=torch.float64)
