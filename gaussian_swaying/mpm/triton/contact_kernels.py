@@ -324,11 +324,11 @@ def _impulses(
 @triton.jit
 def _count_nodes(
     entry_start, entry_place, entry_weight, reached, total, touched, nodes, many, PAIRS: tl.constexpr,
-    PROGRAMS: tl.constexpr, TALL: tl.constexpr,
+    programs, TALL: tl.constexpr,
 ):  # fmt: skip
     """How much unit impulses at all constraints move each node, at most; zero where there are none."""
     entry = tl.arange(0, 32)[None, :]
-    for first in range(tl.program_id(0) * TALL, nodes, PROGRAMS * TALL):
+    for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
         n = first + tl.arange(0, TALL)
         mask = n < nodes
         begin = tl.load(entry_start + n, mask, 0)
@@ -346,12 +346,12 @@ def _count_nodes(
 
 @triton.jit
 def _push_nodes(
-    entry_start, entry_place, entry_weight, total, touched, nodes, impulse, fields, PROGRAMS: tl.constexpr,
+    entry_start, entry_place, entry_weight, total, touched, nodes, impulse, fields, programs,
     TALL: tl.constexpr,
 ):  # fmt: skip
     """Give the impulses of the places to the nodes."""
     entry = tl.arange(0, 32)[None, :]
-    for first in range(tl.program_id(0) * TALL, nodes, PROGRAMS * TALL):
+    for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
         n = first + tl.arange(0, TALL)
         node = tl.load(touched + n, n < nodes, 0)
         mask = (n < nodes) & (tl.load(total + node, n < nodes, 0.0) > 0)
@@ -383,11 +383,12 @@ def contact_solve(
     peak, gate, status,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, stretch, push, most, tolerance, friction,
     iterations,
-    PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, PROGRAMS: tl.constexpr, BLOCK: tl.constexpr,
+    PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
     """The impulses of a substep, added to the velocities of the nodes; see ``resolve``."""
     pid = tl.program_id(0)
+    programs = tl.num_programs(0)
     lane = tl.arange(0, BLOCK)
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     listed = 1
@@ -395,11 +396,11 @@ def contact_solve(
     if WALLS == 0:
         listed = tl.load(status + LISTED)
     if PAIRS:
-        limit += slack + 2 * stretch * largest_of(peak + MOST_PROGRAMS, PROGRAMS)  # see `contact_lists`
+        limit += slack + 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
     if listed > 0:
         if pid == 0:
             tl.store(status + ACTING, 0)
-        for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+        for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
             mask = p < places
             some = 1
@@ -411,8 +412,8 @@ def contact_solve(
                     inverse_dx, ARMS,
                 )  # fmt: skip
                 _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
-        meet(gate, PROGRAMS)
-        for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+        meet(gate, programs)
+        for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
             mask = p < places
             some = 1
@@ -436,20 +437,20 @@ def contact_solve(
                     tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
                 tl.atomic_add(status + ACTING, tl.sum(count))
                 tl.atomic_max(status + NEEDED_SLOTS, tl.max(needed) + WALLS)
-        meet(gate, PROGRAMS)
+        meet(gate, programs)
         if tl.load(status + ACTING) > 0:
             _count_nodes(
                 entry_start, entry_place, entry_weight, reached, total, touched, touched_nodes, many,
-                PAIRS & (WALLS == 0), PROGRAMS, TALL,
+                PAIRS & (WALLS == 0), programs, TALL,
             )  # fmt: skip
-            meet(gate, PROGRAMS)
-            for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+            meet(gate, programs)
+            for first in range(pid * BLOCK, places, programs * BLOCK):
                 p = first + lane
                 mask = p < places
                 mask = mask & (tl.load(many + p, mask, 0) > 0)
                 if tl.max(mask.to(tl.int32)) > 0:
                     _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
-            meet(gate, PROGRAMS)
+            meet(gate, programs)
             k = 0
             going = 1
             theta = dt * 0 + 1.0
@@ -462,7 +463,7 @@ def contact_solve(
                 theta = tl.where(wrong > 0, 1.0, following)
                 worst = tl.zeros([BLOCK], tl.float32)
                 back = tl.zeros([BLOCK], tl.float32)
-                for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+                for first in range(pid * BLOCK, places, programs * BLOCK):
                     p = first + lane
                     mask = p < places
                     count = tl.load(many + p, mask, 0)
@@ -475,26 +476,26 @@ def contact_solve(
                         back += turned
                 tl.store(peak + 2 * MOST_PROGRAMS + pid, tl.max(worst))
                 tl.store(peak + 3 * MOST_PROGRAMS + pid, tl.sum(back))
-                meet(gate, PROGRAMS)
-                done = (k > 0) & (dt * largest_of(peak + 2 * MOST_PROGRAMS, PROGRAMS) < tolerance) & (k + 1 < iterations)
+                meet(gate, programs)
+                done = (k > 0) & (dt * largest_of(peak + 2 * MOST_PROGRAMS, programs) < tolerance) & (k + 1 < iterations)
                 o = tl.arange(0, MOST_PROGRAMS)
-                turned_all = tl.sum(tl.load(peak + 3 * MOST_PROGRAMS + o, o < PROGRAMS, 0.0))
+                turned_all = tl.sum(tl.load(peak + 3 * MOST_PROGRAMS + o, o < programs, 0.0))
                 wrong = tl.where(turned_all > 0, 1, 0)
                 shift = tl.where(done, 4, 0)
                 _push_nodes(
                     entry_start, entry_place, entry_weight, total, touched, touched_nodes, impulse + shift, fields,
-                    PROGRAMS, TALL,
+                    programs, TALL,
                 )  # fmt: skip
                 going = tl.where(done | last, 0, 1)
                 k += 1
                 if going > 0:
-                    meet(gate, PROGRAMS)
-                    for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+                    meet(gate, programs)
+                    for first in range(pid * BLOCK, places, programs * BLOCK):
                         p = first + lane
                         mask = p < places
                         mask = mask & (tl.load(many + p, mask, 0) > 0)
                         if tl.max(mask.to(tl.int32)) > 0:
                             _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
-                    meet(gate, PROGRAMS)
+                    meet(gate, programs)
             if pid == 0:
                 tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)

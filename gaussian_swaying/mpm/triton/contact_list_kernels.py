@@ -23,14 +23,14 @@ constraints; how often lists were made; iterations of all substeps; constraints 
 
 
 @triton.jit
-def meet(gate, PROGRAMS: tl.constexpr):
+def meet(gate, programs):
     """Wait until all programs are here, and see what they wrote.
 
     Each adds one and the first one adds what is missing to 2^31, so that the sign changes when all have come.
     """
     tl.debug_barrier()
-    if PROGRAMS > 1:
-        mine = tl.where(tl.program_id(0) == 0, 2147483649 - PROGRAMS, 1).to(tl.int32)
+    if programs > 1:
+        mine = tl.where(tl.program_id(0) == 0, 2147483647 - (programs - 2), 1)
         before = tl.atomic_add(gate, mine, sem="release", scope="gpu")
         now = before
         while (before ^ now) >= 0:
@@ -39,10 +39,10 @@ def meet(gate, PROGRAMS: tl.constexpr):
 
 
 @triton.jit
-def largest_of(peak, PROGRAMS: tl.constexpr):
+def largest_of(peak, programs):
     """The largest of the entries that the programs wrote."""
     o = tl.arange(0, MOST_PROGRAMS)
-    return tl.max(tl.load(peak + o, o < PROGRAMS, 0.0))
+    return tl.max(tl.load(peak + o, o < programs, 0.0))
 
 
 @triton.jit
@@ -86,23 +86,23 @@ def _own_bucket(position, p, mask, inverse_size, last):
 @triton.jit
 def _sort_places(
     position, counts, start, rank, item, ordered, sorted_, places, sums, gate, inverse_size, last, chunk,
-    PROGRAMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+    programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
     """Sort the places by cell, and those of a cell by their number; ``chunk`` cells to a program."""
     pid = tl.program_id(0)
     lane = tl.arange(0, BLOCK)
-    for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+    for first in range(pid * BLOCK, places, programs * BLOCK):
         p = first + lane
         mask = p < places
         _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
         tl.store(rank + p, tl.atomic_add(counts + bucket, 1, mask), mask)
-    meet(gate, PROGRAMS)
+    meet(gate, programs)
     own = tl.zeros([BLOCK], tl.int32)
     for first in range(0, chunk, BLOCK):
         b = pid * chunk + first + lane
         own += tl.load(counts + b, b <= last, 0)
     tl.store(sums + pid, tl.sum(own))
-    meet(gate, PROGRAMS)
+    meet(gate, programs)
     o = tl.arange(0, MOST_PROGRAMS)
     before = tl.sum(tl.load(sums + o, o < pid, 0))
     for first in range(0, chunk, BLOCK):
@@ -110,15 +110,15 @@ def _sort_places(
         many = tl.load(counts + b, b <= last, 0)
         tl.store(start + b, before + tl.cumsum(many, 0) - many, b <= last)
         before += tl.sum(many)
-    meet(gate, PROGRAMS)
-    for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+    meet(gate, programs)
+    for first in range(pid * BLOCK, places, programs * BLOCK):
         p = first + lane
         mask = p < places
         _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
         tl.store(item + tl.load(start + bucket, mask, 0) + tl.load(rank + p, mask, 0), p, mask)
-    meet(gate, PROGRAMS)
+    meet(gate, programs)
     wide = tl.arange(0, WIDE)[None, :]
-    for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+    for first in range(pid * BLOCK, places, programs * BLOCK):
         p = first + lane
         mask = p < places
         _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
@@ -133,18 +133,18 @@ def _sort_places(
         tl.store(ordered + to, p, mask)
         for c in tl.static_range(3):
             tl.store(sorted_ + to * 4 + c, tl.load(position + p * 4 + c, mask, 0.0), mask)
-    meet(gate, PROGRAMS)
+    meet(gate, programs)
 
 
 @triton.jit
 def _search(
     position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, inverse_size, last,
-    PROGRAMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+    programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
     """The places closer than ``limit`` to each that were at least ``apart`` from it at rest."""
     lane = tl.arange(0, BLOCK)
     wide = tl.arange(0, WIDE)[None, :]
-    for first in range(tl.program_id(0) * BLOCK, places, PROGRAMS * BLOCK):
+    for first in range(tl.program_id(0) * BLOCK, places, programs * BLOCK):
         p = first + lane
         mask = p < places
         x, y, z, _b = _own_bucket(position, p, mask, inverse_size, last)
@@ -203,7 +203,7 @@ def contact_lists(
     position, counts, start, rank, item, ordered, sorted_, candidates, near, room, many, impulse,
     entry_start, entry_place, reached, touched_nodes, peak, sums, gate, status, margin,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, stretch, ahead, last, chunk,
-    ARMS: tl.constexpr, PROGRAMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr, TALL: tl.constexpr,
+    ARMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
     """Make the lists again if a node may have moved too far since they were made.
 
@@ -213,10 +213,11 @@ def contact_lists(
     """
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     pid = tl.program_id(0)
+    programs = tl.num_programs(0)
     lane = tl.arange(0, BLOCK)
     moved = tl.zeros([BLOCK], tl.float32)
     fast = tl.zeros([BLOCK], tl.float32)
-    for first in range(pid * BLOCK, nodes, PROGRAMS * BLOCK):
+    for first in range(pid * BLOCK, nodes, programs * BLOCK):
         k = first + lane
         mask = k < nodes
         at = fields + tl.load(active + k, mask, 0) * 8
@@ -233,24 +234,24 @@ def contact_lists(
     tl.store(peak + pid, tl.max(moved))
     tl.store(peak + MOST_PROGRAMS + pid, tl.max(fast))
     known = tl.load(margin)
-    meet(gate, PROGRAMS)
-    farthest = largest_of(peak, PROGRAMS)
+    meet(gate, programs)
+    farthest = largest_of(peak, programs)
     if (2 * stretch * farthest + slack > known) & (farthest < 1e9):  # a run that diverges keeps its lists
-        step = 2 * stretch * largest_of(peak + MOST_PROGRAMS, PROGRAMS)
+        step = 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)
         wider = slack + tl.maximum(least, tl.minimum(ahead * step, tl.maximum(reach, 2 * step)))
         if pid == 0:
             tl.store(margin, wider)
             tl.store(status + LISTED, 0)
             tl.store(status + MADE, tl.load(status + MADE) + 1)
-        for first in range(pid * BLOCK, nodes, PROGRAMS * BLOCK):
+        for first in range(pid * BLOCK, nodes, programs * BLOCK):
             k = first + lane
             mask = k < nodes
             at = fields + tl.load(active + k, mask, 0) * 8
             for c in tl.static_range(3):
                 tl.store(before + k * 4 + c, tl.load(at + c, mask, 0.0), mask)
-        for first in range(pid * BLOCK, last + 1, PROGRAMS * BLOCK):
+        for first in range(pid * BLOCK, last + 1, programs * BLOCK):
             tl.store(counts + first + lane, tl.zeros([BLOCK], tl.int32), first + lane <= last)
-        for first in range(pid * BLOCK, places, PROGRAMS * BLOCK):
+        for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
             mask = p < places
             x, _G = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS)
@@ -259,20 +260,20 @@ def contact_lists(
                 tl.store(position + p * 4 + c, x[c], mask)
             for c in tl.static_range(8):
                 tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
-        meet(gate, PROGRAMS)
+        meet(gate, programs)
         limit = reach + wider
         _sort_places(
             position, counts, start, rank, item, ordered, sorted_, places, sums, gate, 1 / limit, last, chunk,
-            PROGRAMS, BLOCK, WIDE,
+            programs, BLOCK, WIDE,
         )  # fmt: skip
         _search(
             position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, 1 / limit,
-            last, PROGRAMS, BLOCK, WIDE,
+            last, programs, BLOCK, WIDE,
         )  # fmt: skip
-        meet(gate, PROGRAMS)
+        meet(gate, programs)
         tall = tl.arange(0, TALL)
         entry = tl.arange(0, 32)[None, :]
-        for first in range(pid * TALL, touched_nodes, PROGRAMS * TALL):
+        for first in range(pid * TALL, touched_nodes, programs * TALL):
             n = first + tall
             mask = n < touched_nodes
             begin = tl.load(entry_start + n, mask, 0)

@@ -183,7 +183,7 @@ class FusedContact:
         strides = (ny * nz, nz, 1 / dx)
         now = (schedule, first_step, offset, *strides)
         where = (self.fields, self.base, self.fraction, self.arm, self.rest)
-        launch: dict[str, Any] = {"ARMS": self.arms, "PROGRAMS": self.programs, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
+        launch: dict[str, Any] = {"ARMS": self.arms, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
         if self.programs > 1:
             launch["launch_cooperative_grid"] = True
         if pairs:
