@@ -16,12 +16,12 @@ from gaussian_swaying.mpm.triton.contact_list_kernels import (
     MOST_PROGRAMS,
     NEEDED_SLOTS,
     ROUNDS,
+    interpolate,
     largest_of,
     meet,
     place_now,
 )
 from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
-from gaussian_swaying.mpm.triton.total_kernels import gather
 
 PLANES = tl.constexpr(10)
 """Numbers of a constraint: normal, wanted velocity, and its impulse with and without the momentum of the iteration."""
@@ -34,49 +34,44 @@ def contact_positions(
     """Where all places are now, shape (C, 3)."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < places
-    x, _G = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS)
+    x, _a, _b, _c = place_now(
+        fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+    )
     for c in tl.static_range(3):
         tl.store(position + p * 3 + c, x[c], mask)
 
 
 @triton.jit
-def _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr):
+def _velocity(
+    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
     """Read the velocity of places."""
-    f = load3(fraction, places, p, mask)
-    wz, gz = axis_weights(f[2], inverse_dx)
-    node = tl.load(base + p, mask, 0)
-    v, G, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
-    v0 = v[0]
-    v1 = v[1]
-    v2 = v[2]
+    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
     if ARMS:
         a = load3(arm, places, p, mask)
-        v0 += G[0] * a[0] + G[1] * a[1] + G[2] * a[2]
-        v1 += G[3] * a[0] + G[4] * a[1] + G[5] * a[2]
-        v2 += G[6] * a[0] + G[7] * a[1] + G[8] * a[2]
-    tl.store(moving + p * 4, v0, mask)
-    tl.store(moving + p * 4 + 1, v1, mask)
-    tl.store(moving + p * 4 + 2, v2, mask)
+        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    column = tl.arange(0, 4)[None, :]
+    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
 
 
 @triton.jit
 def _place(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy, inverse_dx,
-    ARMS: tl.constexpr,
+    ARMS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Position, thickness, normal and radius of places now."""
-    x, G = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS)
+    x, a, b, c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
     f = load3(facing, places, p, mask)
-    a0 = 1 + G[0]
-    b1 = 1 + G[4]
-    c2 = 1 + G[8]
-    n0 = (b1 * c2 - G[7] * G[5]) * f[0] + (G[5] * G[6] - c2 * G[3]) * f[1] + (G[3] * G[7] - G[6] * b1) * f[2]
-    n1 = (G[7] * G[2] - G[1] * c2) * f[0] + (c2 * a0 - G[2] * G[6]) * f[1] + (G[6] * G[1] - a0 * G[7]) * f[2]
-    n2 = (G[1] * G[5] - b1 * G[2]) * f[0] + (G[2] * G[3] - G[5] * a0) * f[1] + (a0 * b1 - G[3] * G[1]) * f[2]
+    a0 = 1 + a[0]
+    b1 = 1 + b[1]
+    c2 = 1 + c[2]
+    n0 = (b1 * c2 - b[2] * c[1]) * f[0] + (c[1] * a[2] - c2 * a[1]) * f[1] + (a[1] * b[2] - a[2] * b1) * f[2]
+    n1 = (b[2] * c[0] - b[0] * c2) * f[0] + (c2 * a0 - c[0] * a[2]) * f[1] + (a[2] * b[0] - a0 * b[2]) * f[2]
+    n2 = (b[0] * c[1] - b1 * c[0]) * f[0] + (c[0] * a[1] - c[1] * a0) * f[1] + (a0 * b1 - a[1] * b[0]) * f[2]
     length = tl.maximum(tl.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-12)
     to = row + p * 8
-    for c in tl.static_range(3):
-        tl.store(to + c, x[c], mask)
+    for k in tl.static_range(3):
+        tl.store(to + k, x[k], mask)
     tl.store(to + 3, tl.load(thickness + p, mask, 0.0), mask)
     tl.store(to + 4, n0 / length, mask)
     tl.store(to + 5, n1 / length, mask)
@@ -357,21 +352,15 @@ def _push_nodes(
         mask = (n < nodes) & (tl.load(total + node, n < nodes, 0.0) > 0)
         begin = tl.load(entry_start + n, mask, 0)
         length = tl.load(entry_start + n + 1, mask, 0) - begin
-        j0 = tl.zeros([TALL, 32], tl.float32)
-        j1 = tl.zeros([TALL, 32], tl.float32)
-        j2 = tl.zeros([TALL, 32], tl.float32)
+        found = tl.zeros([TALL, 32, 4], tl.float32)
         for k in range(0, tl.max(length), 32):
             real = (k + entry) < length[:, None]
             e = begin[:, None] + k + entry
             at = impulse + tl.load(entry_place + e, real, 0) * 8
             w = tl.load(entry_weight + e, real, 0.0)
-            j0 += w * tl.load(at, real, 0.0)
-            j1 += w * tl.load(at + 1, real, 0.0)
-            j2 += w * tl.load(at + 2, real, 0.0)
-        to = fields + node * 8 + 4
-        tl.store(to, tl.load(to, mask, 0.0) + tl.sum(j0, 1), mask)
-        tl.store(to + 1, tl.load(to + 1, mask, 0.0) + tl.sum(j1, 1), mask)
-        tl.store(to + 2, tl.load(to + 2, mask, 0.0) + tl.sum(j2, 1), mask)
+            found += w[:, :, None] * tl.load(at[:, :, None] + tl.arange(0, 4)[None, None, :], real[:, :, None], 0.0)
+        to = fields + node[:, None] * 8 + 4 + tl.arange(0, 4)[None, :]
+        tl.store(to, tl.load(to, mask[:, None], 0.0) + tl.sum(found, 1), mask[:, None])
 
 
 @triton.jit(do_not_specialize=CHANGES)
@@ -409,9 +398,9 @@ def contact_solve(
             if some > 0:
                 _place(
                     fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy,
-                    inverse_dx, ARMS,
+                    inverse_dx, ARMS, BLOCK,
                 )  # fmt: skip
-                _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
+                _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
         meet(gate, programs)
         for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
@@ -455,6 +444,7 @@ def contact_solve(
             going = 1
             theta = dt * 0 + 1.0
             wrong = 0
+            jumped = 0
             while going > 0:
                 last = k + 1 >= iterations
                 following = 0.5 * (1 + tl.sqrt(1 + 4 * theta * theta))
@@ -477,15 +467,19 @@ def contact_solve(
                 tl.store(peak + 2 * MOST_PROGRAMS + pid, tl.max(worst))
                 tl.store(peak + 3 * MOST_PROGRAMS + pid, tl.sum(back))
                 meet(gate, programs)
-                done = (k > 0) & (dt * largest_of(peak + 2 * MOST_PROGRAMS, programs) < tolerance) & (k + 1 < iterations)
+                done = (
+                    (k > 0) & (dt * largest_of(peak + 2 * MOST_PROGRAMS, programs) < tolerance) & (k + 1 < iterations)
+                )
                 o = tl.arange(0, MOST_PROGRAMS)
                 turned_all = tl.sum(tl.load(peak + 3 * MOST_PROGRAMS + o, o < programs, 0.0))
                 wrong = tl.where(turned_all > 0, 1, 0)
-                shift = tl.where(done, 4, 0)
-                _push_nodes(
-                    entry_start, entry_place, entry_weight, total, touched, touched_nodes, impulse + shift, fields,
-                    programs, TALL,
-                )  # fmt: skip
+                if (done == 0) | (jumped > 0):  # without momentum there is nothing to take back
+                    shift = tl.where(done, 4, 0)
+                    _push_nodes(
+                        entry_start, entry_place, entry_weight, total, touched, touched_nodes, impulse + shift, fields,
+                        programs, TALL,
+                    )  # fmt: skip
+                jumped = tl.where(momentum != 0, 1, 0)
                 going = tl.where(done | last, 0, 1)
                 k += 1
                 if going > 0:
@@ -495,7 +489,9 @@ def contact_solve(
                         mask = p < places
                         mask = mask & (tl.load(many + p, mask, 0) > 0)
                         if tl.max(mask.to(tl.int32)) > 0:
-                            _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
+                            _velocity(
+                                fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                            )
                     meet(gate, programs)
             if pid == 0:
                 tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)

@@ -9,8 +9,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import load3
-from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights
-from gaussian_swaying.mpm.triton.total_kernels import gather
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight
 
 CHANGES = (*VARIES, "places", "room", "slots", "touched_nodes", "last", "chunk", "iterations")
 
@@ -46,22 +45,63 @@ def largest_of(peak, programs):
 
 
 @triton.jit
-def place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr):
-    """Where places are now, and the derivatives of the displacement there [component, axis]."""
-    node = tl.load(base + p, mask, 0)
+def interpolate(
+    field, base, fraction, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Four columns of the nodes at places, and their derivatives along the axes [1/m], of shape (BLOCK, 4) each.
+
+    As ``total_kernels.gather``, but a row of four columns is one load.
+    """
+    column = tl.arange(0, 4)[None, :]
     f = load3(fraction, places, p, mask)
+    node = tl.load(base + p, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
-    u, G, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False)
-    x = load3(rest, places, p, mask)
-    x0 = x[0] + u[0]
-    x1 = x[1] + u[1]
-    x2 = x[2] + u[2]
+    value = tl.zeros([BLOCK, 4], tl.float32)
+    d0, d1, d2 = value, value, value
+    for i in range(3):
+        wx, gx = node_weight(f[0], i, inverse_dx)
+        for j in range(3):
+            wy, gy = node_weight(f[1], j, inverse_dx)
+            at = field + (node + i * sx + j * sy)[:, None] * 8 + column
+            s = tl.zeros([BLOCK, 4], tl.float32)
+            t = s
+            for k in tl.static_range(3):
+                q = tl.load(at + k * 8, mask[:, None], 0.0)
+                s += wz[k][:, None] * q
+                if DERIVATIVES:
+                    t += gz[k][:, None] * q
+            w = (wx * wy)[:, None]
+            value += w * s
+            if DERIVATIVES:
+                d0 += (gx * wy)[:, None] * s
+                d1 += (wx * gy)[:, None] * s
+                d2 += w * t
+    return value, d0, d1, d2
+
+
+@triton.jit
+def three(x):
+    """The first three columns of a tile of four."""
+    column = tl.arange(0, 4)[None, :]
+    return (
+        tl.sum(tl.where(column == 0, x, 0.0), 1),
+        tl.sum(tl.where(column == 1, x, 0.0), 1),
+        tl.sum(tl.where(column == 2, x, 0.0), 1),
+    )
+
+
+@triton.jit
+def place_now(
+    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Where places are now, and the derivatives of the displacement there, along each axis."""
+    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, True, BLOCK)
     if ARMS:
         a = load3(arm, places, p, mask)
-        x0 += G[0] * a[0] + G[1] * a[1] + G[2] * a[2]
-        x1 += G[3] * a[0] + G[4] * a[1] + G[5] * a[2]
-        x2 += G[6] * a[0] + G[7] * a[1] + G[8] * a[2]
-    return (x0, x1, x2), G
+        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    x = load3(rest, places, p, mask)
+    u0, u1, u2 = three(u)
+    return (x[0] + u0, x[1] + u1, x[2] + u2), three(d0), three(d1), three(d2)
 
 
 @triton.jit
@@ -254,7 +294,9 @@ def contact_lists(
         for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
             mask = p < places
-            x, _G = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS)
+            x, _a, _b, _c = place_now(
+                fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+            )
             tl.store(many + p, tl.zeros([BLOCK], tl.int32), mask)
             for c in tl.static_range(3):
                 tl.store(position + p * 4 + c, x[c], mask)

@@ -120,8 +120,8 @@ class FusedContact:
         places, planes = self.places, int(kernels.PLANES.value)
         if max(self.room, planes * self.slots) * places > MOST_ENTRIES:
             raise ValueError(
-                f"A place of the surface is close to {max(self.room, self.slots):,} others: the material has collapsed; "
-                "lower `contact.thickness`, or coarsen `solver.dx`."
+                f"A place of the surface is close to {max(self.room, self.slots):,} others: the material has "
+                "collapsed; lower `contact.thickness`, or coarsen `solver.dx`."
             )
         self.candidates = self._zeros(places, self.room, dtype=torch.int32)
         self.other = self._zeros(self.slots, places, dtype=torch.int32)
