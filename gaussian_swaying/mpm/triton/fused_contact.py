@@ -198,7 +198,7 @@ class FusedContact:
             )  # fmt: skip
         if walls:
             kernels.contact_positions[(-(-self.places // BLOCK),)](
-                *where, self.places, self.position, *strides, ARMS=self.arms, BLOCK=BLOCK, num_warps=4
+                *where, self.places, self.position, *strides, ARMS=self.arms, BLOCK=BLOCK, num_warps=8
             )
             for k, (_, obstacle) in enumerate(stage.obstacles):
                 gap, normal, drive = obstacle.touch(self.position, time, dt)
