@@ -136,19 +136,18 @@ class ContactStage:
     # ---- lists
 
     @torch.no_grad()
-    def update(self, state: MPMState, dt: float, ahead: float = AHEAD) -> None:
+    def update(self, state: MPMState, dt: float) -> None:
         """Make the lists again if something may have come close since they were made; the host waits.
 
         Args:
             state: The state at the start of a substep.
             dt: Substep [s].
-            ahead: For how many substeps points are followed ahead.
         """
         position, velocity = state.position.reshape(-1, 3), state.velocity.reshape(-1, 3)
         known, now = self.lists, float(state.time)
         if known is not None:
-            far = float((position + ahead * dt * velocity - known.before).square().sum(-1).amax()) ** 0.5
-            if 2 * ARM * far + known.fastest * abs(now + ahead * dt - known.time) < known.margin:
+            far = float((position + AHEAD * dt * velocity - known.before).square().sum(-1).amax()) ** 0.5
+            if 2 * ARM * far + known.fastest * abs(now + AHEAD * dt - known.time) < known.margin:
                 return
         step = dt * float(velocity.square().sum(-1).amax()) ** 0.5
         assert state.node_displacement is not None
@@ -156,15 +155,15 @@ class ContactStage:
         if not math.isfinite(step):
             return  # the run is about to end with an error that says why
         with torch.inference_mode(False):
-            self.lists = self._make(position.clone(), moved, state.time, dt, step, ahead)
+            self.lists = self._make(position.clone(), moved, state.time, dt, step)
         self.made += 1
 
-    def _make(self, before: Tensor, displacement: Tensor, time: Tensor, dt: float, step: float, ahead: float) -> Lists:
+    def _make(self, before: Tensor, displacement: Tensor, time: Tensor, dt: float, step: float) -> Lists:
         position = self.positions(displacement)
         farthest = [float((position - b.pose(time)[0].to(position)).norm(dim=-1).amax()) for _, b in self.obstacles]
         fastest = max([0.0, *(b.fastest(far) for (_, b), far in zip(self.obstacles, farthest, strict=True))])
         thickest = float(self.surface.thickness.amax())
-        margin = max(LEAST_MARGIN * self.dx, thickest, 4 * (1 + ahead) * ARM * step + 4 * fastest * dt)
+        margin = max(LEAST_MARGIN * self.dx, thickest, 4 * (1 + AHEAD) * ARM * step + 4 * fastest * dt)
         none = torch.zeros(0, dtype=torch.long, device=position.device)
         first = second = none
         if self.contact is not None:
