@@ -34,9 +34,7 @@ def contact_positions(
     """Where all places are now, shape (C, 3)."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < places
-    x, _a, _b, _c = place_now(
-        fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
-    )
+    x, _a, _b, _c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
     for c in tl.static_range(3):
         tl.store(position + p * 3 + c, x[c], mask)
 
