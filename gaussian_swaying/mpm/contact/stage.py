@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torch import Tensor
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.pairs import close_pairs
-from gaussian_swaying.mpm.contact.solve import Constraints, Rows, acting, pair_gaps, resolve, weighted
+from gaussian_swaying.mpm.contact.solve import SLACK, Constraints, Rows, acting, pair_gaps, resolve, weighted
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.transfer import bspline_stencil
@@ -40,6 +40,9 @@ class Lists:
 
     Attributes:
         place: The places that occur, shape (A,).
+        touched: The nodes around them, shape (T,).
+        rows: Those places on those nodes.
+        slope: Derivatives of their weights along the axes [1/m], shape (3, A, 27), or none without pairs.
         walls: For each obstacle, the rows of the places near it, shape (N,).
         first: Rows of the first place of each pair, shape (M,).
         second: Rows of the second.
@@ -50,6 +53,9 @@ class Lists:
     """
 
     place: Tensor
+    touched: Tensor
+    rows: Rows
+    slope: Tensor
     walls: list[Tensor]
     first: Tensor
     second: Tensor
@@ -114,6 +120,7 @@ class ContactStage:
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)
+        self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # place in its cell
         self.slope = basis[:, 1:4]
         self.weight = basis[:, 0] + (arm[:, :, None] * self.slope).sum(1)
         self.scene = torch.arange(len(self.weight), device=read.device) // max(each, 1)
@@ -129,19 +136,18 @@ class ContactStage:
     # ---- lists
 
     @torch.no_grad()
-    def update(self, state: MPMState, dt: float, ahead: float = AHEAD) -> None:
+    def update(self, state: MPMState, dt: float) -> None:
         """Make the lists again if something may have come close since they were made; the host waits.
 
         Args:
             state: The state at the start of a substep.
             dt: Substep [s].
-            ahead: For how many substeps points are followed ahead.
         """
         position, velocity = state.position.reshape(-1, 3), state.velocity.reshape(-1, 3)
         known, now = self.lists, float(state.time)
         if known is not None:
-            far = float((position + ahead * dt * velocity - known.before).square().sum(-1).amax()) ** 0.5
-            if 2 * ARM * far + known.fastest * abs(now + ahead * dt - known.time) < known.margin:
+            far = float((position + AHEAD * dt * velocity - known.before).square().sum(-1).amax()) ** 0.5
+            if 2 * ARM * far + known.fastest * abs(now + AHEAD * dt - known.time) < known.margin:
                 return
         step = dt * float(velocity.square().sum(-1).amax()) ** 0.5
         assert state.node_displacement is not None
@@ -149,16 +155,15 @@ class ContactStage:
         if not math.isfinite(step):
             return  # the run is about to end with an error that says why
         with torch.inference_mode(False):
-            self.lists = self._make(position.clone(), moved, state.time, dt, step, ahead)
+            self.lists = self._make(position.clone(), moved, state.time, dt, step)
         self.made += 1
 
-    def _make(self, before: Tensor, displacement: Tensor, time: Tensor, dt: float, step: float, ahead: float) -> Lists:
-        everything = Rows(self.node, self.weight, self.weight)
-        position = self.surface.place + everything.read(displacement)
+    def _make(self, before: Tensor, displacement: Tensor, time: Tensor, dt: float, step: float) -> Lists:
+        position = self.positions(displacement)
         farthest = [float((position - b.pose(time)[0].to(position)).norm(dim=-1).amax()) for _, b in self.obstacles]
         fastest = max([0.0, *(b.fastest(far) for (_, b), far in zip(self.obstacles, farthest, strict=True))])
         thickest = float(self.surface.thickness.amax())
-        margin = max(LEAST_MARGIN * self.dx, thickest, 4 * (1 + ahead) * ARM * step + 4 * fastest * dt)
+        margin = max(LEAST_MARGIN * self.dx, thickest, 4 * (1 + AHEAD) * ARM * step + 4 * fastest * dt)
         none = torch.zeros(0, dtype=torch.long, device=position.device)
         first = second = none
         if self.contact is not None:
@@ -170,8 +175,24 @@ class ContactStage:
         place = torch.cat([first, second, *near]).unique()
         rank = torch.zeros(len(position), dtype=torch.long, device=position.device)
         rank[place] = torch.arange(len(place), device=position.device)
+        known = torch.zeros(len(self.inverse_mass), dtype=torch.bool, device=position.device)
+        node = self.node[place]
+        known[node.reshape(-1)] = True
+        touched = known.nonzero()[:, 0]
+        rows = Rows.of((known.cumsum(0) - 1)[node], self.weight[place], self.inverse_mass[touched])
+        slope = self.slope[place[: len(place) if len(first) else 0]].transpose(0, 1).contiguous()
         return Lists(
-            place, [rank[index] for index in near], rank[first], rank[second], before, float(time), margin, fastest
+            place,
+            touched,
+            rows,
+            slope,
+            [rank[index] for index in near],
+            rank[first],
+            rank[second],
+            before,
+            float(time),
+            margin,
+            fastest,
         )
 
     # ---- a substep
@@ -193,41 +214,42 @@ class ContactStage:
         taken = torch.zeros(self.scenes, self.count, 3, dtype=torch.float64, device=velocity.device)
         if lists is None or len(lists.place) == 0:
             return velocity, taken
-        flat = velocity.reshape(-1, 3)
-        rows = self._rows(lists.place)
-        held, owner = self._constraints(lists, rows, displacement.reshape(-1, 3), time, dt)
-        index = acting(rows, held, flat, dt, self.dx).nonzero()[:, 0]
+        flat, rows = velocity.reshape(-1, 3), lists.rows
+        if self.inverse_mass.requires_grad:
+            rows = replace(rows, inverse_mass=self.inverse_mass[lists.touched])
+        local = flat[lists.touched]
+        moving = rows.read(local.detach())
+        held, owner = self._constraints(lists, displacement.reshape(-1, 3)[lists.touched], moving, time, dt)
+        index = acting(moving, held, dt, self.dx).nonzero()[:, 0]
         if len(index) == 0:
             return velocity, taken
         held, owner = held.select(index), owner[index]
-        used, places = torch.unique(torch.cat([held.first, held.second]), return_inverse=True)
-        if len(used) and int(used[-1]) < len(lists.place):  # the last row stands for obstacles
-            used = torch.cat([used, used.new_tensor([len(lists.place)])])
-        first, second = places.reshape(2, -1)
-        rows = Rows(rows.node[used], rows.weight[used], rows.inverse[used])
-        held = Constraints(first, second, held.normal, held.gap, held.drive, held.friction, held.valid)
         with in_fixed_order(self.deterministic and flat.is_cuda):
-            flat, impulse = resolve(flat, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
-        with torch.no_grad(), in_fixed_order(self.deterministic and flat.is_cuda):
-            real = torch.cat([lists.place, lists.place.new_zeros(1)])[used]
-            flat_owner = self.scene[real[first]] * (self.count + 1) + owner  # the last one for pairs
-            sums = taken.new_zeros(self.scenes * (self.count + 1), 3).index_add_(0, flat_owner, -impulse.double())
-            taken = sums.reshape(self.scenes, -1, 3)[:, :-1]
+            local, impulse = resolve(local, rows, held, dt, self.dx, self.iterations, TOLERANCE * self.dx)
+            flat = flat.index_copy(0, lists.touched, local)
+        if self.obstacles:
+            with torch.no_grad(), in_fixed_order(self.deterministic and flat.is_cuda):
+                flat_owner = self.scene[lists.place[held.first]] * (self.count + 1) + owner  # the last one for pairs
+                sums = taken.new_zeros(self.scenes * (self.count + 1), 3).index_add_(0, flat_owner, -impulse.double())
+                taken = sums.reshape(self.scenes, -1, 3)[:, :-1]
         return flat.reshape(velocity.shape), taken
 
-    def _rows(self, place: Tensor) -> Rows:
-        """Some places, and the one that stands for obstacles."""
-        node, weight = self.node[place], self.weight[place]
-        node = torch.cat([node, node.new_zeros(1, 27)])
-        weight = torch.cat([weight, weight.new_zeros(1, 27)])
-        return Rows(node, weight, weight * self.inverse_mass[node])
-
     def _constraints(
-        self, lists: Lists, rows: Rows, displacement: Tensor, time: Tensor, dt: float | Tensor
+        self, lists: Lists, displacement: Tensor, moving: Tensor, time: Tensor, dt: float | Tensor
     ) -> tuple[Constraints, Tensor]:
-        """All listed constraints as they are now, and the boundary of each; the number of boundaries for a pair."""
+        """Listed constraints as they are now, and the boundary of each; the number of boundaries for a pair.
+
+        Pairs are left out that are too far from each other to touch in this substep.
+
+        Args:
+            lists: What may touch.
+            displacement: Of the nodes around the listed places [m], shape (T, 3).
+            moving: Velocity of the listed places [m/s], shape (A + 1, 3).
+            time: Time now [s].
+            dt: Substep [s].
+        """
         surface = self.surface
-        position = surface.place[lists.place] + rows.read(displacement)[:-1]
+        position = surface.place[lists.place] + lists.rows.read(displacement)[:-1]
         thickness = surface.thickness[lists.place]
         obstacle_row = len(lists.place)
         parts: list[tuple[Tensor, ...]] = []
@@ -249,8 +271,14 @@ class ContactStage:
                 )
             )
         if self.contact is not None and len(lists.first):
-            first, second = lists.first, lists.second
-            normals, radius = self.normals(lists.place, displacement), surface.radius[lists.place]
+            with torch.no_grad():
+                fastest = moving.square().sum(-1).amax().sqrt()
+                limit = self.reach + SLACK * self.dx + 2 * dt * fastest
+                far = position[lists.first] - position[lists.second]
+                close = (far.square().sum(-1) < limit * limit).nonzero()[:, 0]
+            first, second = lists.first[close], lists.second[close]
+            normals = self._normals(lists.rows.node[:-1], lists.slope, lists.place, displacement)
+            radius = surface.radius[lists.place]
             normal, gap, above = pair_gaps(
                 position[first] - position[second],
                 (normals[first], normals[second]),
@@ -265,13 +293,15 @@ class ContactStage:
 
     def positions(self, displacement: Tensor) -> Tensor:
         """Where the places are now [m], shape (C, 3), from the node displacement (..., G, 3)."""
-        return self.surface.place + Rows(self.node, self.weight, self.weight).read(displacement.reshape(-1, 3))
+        return self.surface.place + weighted(displacement.reshape(-1, 3), self.node, self.weight)
 
     def normals(self, place: Tensor, displacement: Tensor) -> Tensor:
         """Unit normals of some places (A,) now, shape (A, 3), from the node displacement (G, 3)."""
-        node, slope = self.node[place], self.slope[place].unbind(1)
-        gradient = torch.stack([weighted(displacement, node, part) for part in slope], dim=1)  # [axis, component]
-        F = gradient.mT + torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        return self._normals(self.node[place], self.slope[place].transpose(0, 1), place, displacement)
+
+    def _normals(self, node: Tensor, slope: Tensor, place: Tensor, displacement: Tensor) -> Tensor:
+        gradient = torch.stack([weighted(displacement, node, part) for part in slope.unbind(0)], dim=1)
+        F = gradient.mT + torch.eye(3, dtype=gradient.dtype, device=gradient.device)  # gradient: [axis, component]
         a, b, c = F.unbind(-1)
         cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
         return torch.nn.functional.normalize((cofactor * self.surface.normal[place][:, None]).sum(-1), dim=-1)

@@ -1,265 +1,495 @@
 """Kernels of contact; the reference is :mod:`~gaussian_swaying.mpm.contact.solve`.
 
-A place is a row of 27 weights on the nodes. Lists have room for more than they hold: an index of -1 stands for nothing.
-Sums over places and nodes are atomic, so their order differs between runs.
+One launch does a whole substep: its programs run all at once and wait for each other between the parts, so that the
+number of iterations is not fixed when it is recorded. Each place has its own constraints, so a pair is kept at both of
+its places; the sums at places and nodes have the same order in every run.
 """
 
 import triton
 import triton.language as tl
 
-from gaussian_swaying.mpm.triton.shared import VARIES
+from gaussian_swaying.geometry.linalg_triton import load3
+from gaussian_swaying.mpm.triton.contact_list_kernels import (
+    ACTING,
+    CHANGES,
+    LISTED,
+    MOST_PROGRAMS,
+    NEEDED_SLOTS,
+    ROUNDS,
+    interpolate,
+    largest_of,
+    meet,
+    place_now,
+)
+from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
 
-CHANGES = (*VARIES, "pairs", "round_")
-
-
-@triton.jit
-def _row(place, table, a, rows, BLOCK: tl.constexpr):
-    """The row of a table (C, 27) for each listed place: where its entries are, and which of them exist."""
-    p = tl.load(place + a, a < rows, -1)
-    o = tl.arange(0, 32)[None, :]
-    known = (p >= 0)[:, None] & (o < 27)
-    return p, table + p[:, None] * 27 + o, known
+PLANES = tl.constexpr(10)
+"""Numbers of a constraint: normal, wanted velocity, and its impulse with and without the momentum of the iteration."""
 
 
 @triton.jit(do_not_specialize=CHANGES)
-def contact_places(
-    place, rest, facing, node, weight, slope, fields, position, normal, moving, many_of, impulse, rows,
-    NORMALS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Position, velocity and normal of each listed place now; no constraints and no impulse yet."""
-    a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    p, at, known = _row(place, node, a, rows, BLOCK)
-    mask = p >= 0
-    row = fields + tl.load(at, known, 0) * 8
-    o = tl.arange(0, 32)[None, :]
-    w = tl.load(weight + p[:, None] * 27 + o, known, 0.0)
-    u0 = tl.load(row, known, 0.0)
-    u1 = tl.load(row + 1, known, 0.0)
-    u2 = tl.load(row + 2, known, 0.0)
-    tl.store(position + a * 3, tl.load(rest + p * 3, mask, 0.0) + tl.sum(w * u0, 1), mask)
-    tl.store(position + a * 3 + 1, tl.load(rest + p * 3 + 1, mask, 0.0) + tl.sum(w * u1, 1), mask)
-    tl.store(position + a * 3 + 2, tl.load(rest + p * 3 + 2, mask, 0.0) + tl.sum(w * u2, 1), mask)
+def contact_positions(
+    fields, base, fraction, arm, rest, places, position, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Where all places are now, shape (C, 3)."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < places
+    x, _a, _b, _c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
     for c in tl.static_range(3):
-        tl.store(moving + a * 3 + c, tl.sum(w * tl.load(row + 4 + c, known, 0.0), 1), mask)
-        tl.store(impulse + a * 3 + c, tl.zeros([BLOCK], tl.float32), mask)
-    tl.store(many_of + a, tl.zeros([BLOCK], tl.float32), mask)
-    if NORMALS:
-        s0 = tl.load(slope + p[:, None] * 81 + o, known, 0.0)
-        s1 = tl.load(slope + p[:, None] * 81 + 27 + o, known, 0.0)
-        s2 = tl.load(slope + p[:, None] * 81 + 54 + o, known, 0.0)
-        a0 = 1 + tl.sum(s0 * u0, 1)
-        a1 = tl.sum(s0 * u1, 1)
-        a2 = tl.sum(s0 * u2, 1)
-        b0 = tl.sum(s1 * u0, 1)
-        b1 = 1 + tl.sum(s1 * u1, 1)
-        b2 = tl.sum(s1 * u2, 1)
-        c0 = tl.sum(s2 * u0, 1)
-        c1 = tl.sum(s2 * u1, 1)
-        c2 = 1 + tl.sum(s2 * u2, 1)
-        x = tl.load(facing + p * 3, mask, 0.0)
-        y = tl.load(facing + p * 3 + 1, mask, 0.0)
-        z = tl.load(facing + p * 3 + 2, mask, 0.0)
-        n0 = (b1 * c2 - b2 * c1) * x + (c1 * a2 - c2 * a1) * y + (a1 * b2 - a2 * b1) * z
-        n1 = (b2 * c0 - b0 * c2) * x + (c2 * a0 - c0 * a2) * y + (a2 * b0 - a0 * b2) * z
-        n2 = (b0 * c1 - b1 * c0) * x + (c0 * a1 - c1 * a0) * y + (a0 * b1 - a1 * b0) * z
-        length = tl.maximum(tl.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-12)
-        tl.store(normal + a * 3, n0 / length, mask)
-        tl.store(normal + a * 3 + 1, n1 / length, mask)
-        tl.store(normal + a * 3 + 2, n2 / length, mask)
+        tl.store(position + p * 3 + c, x[c], mask)
 
 
 @triton.jit
-def _over(d0, d1, d2, squared, normal, radius, place, mine, mask):
+def _velocity(
+    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Read the velocity of places."""
+    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    column = tl.arange(0, 4)[None, :]
+    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
+
+
+@triton.jit
+def _place(
+    fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy, inverse_dx,
+    ARMS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Position, thickness, normal and radius of places now."""
+    x, a, b, c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    f = load3(facing, places, p, mask)
+    a0 = 1 + a[0]
+    b1 = 1 + b[1]
+    c2 = 1 + c[2]
+    n0 = (b1 * c2 - b[2] * c[1]) * f[0] + (c[1] * a[2] - c2 * a[1]) * f[1] + (a[1] * b[2] - a[2] * b1) * f[2]
+    n1 = (b[2] * c[0] - b[0] * c2) * f[0] + (c2 * a0 - c[0] * a[2]) * f[1] + (a[2] * b[0] - a0 * b[2]) * f[2]
+    n2 = (b[0] * c[1] - b1 * c[0]) * f[0] + (c[0] * a[1] - c[1] * a0) * f[1] + (a0 * b1 - a[1] * b[0]) * f[2]
+    length = tl.maximum(tl.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-12)
+    to = row + p * 8
+    for k in tl.static_range(3):
+        tl.store(to + k, x[k], mask)
+    tl.store(to + 3, tl.load(thickness + p, mask, 0.0), mask)
+    tl.store(to + 4, n0 / length, mask)
+    tl.store(to + 5, n1 / length, mask)
+    tl.store(to + 6, n2 / length, mask)
+    tl.store(to + 7, tl.load(radius + p, mask, 0.0), mask)
+
+
+@triton.jit
+def _over(d0, d1, d2, squared, at, mask):
     """The height of the other above a disc times its normal, zero beside the disc, and whether it is above."""
-    p = tl.load(place + mine, mask, 0)
-    r = tl.load(radius + p, mask, 0.0)
-    n0 = tl.load(normal + mine * 3, mask, 0.0)
-    n1 = tl.load(normal + mine * 3 + 1, mask, 0.0)
-    n2 = tl.load(normal + mine * 3 + 2, mask, 0.0)
+    n0 = tl.load(at + 4, mask, 0.0)
+    n1 = tl.load(at + 5, mask, 0.0)
+    n2 = tl.load(at + 6, mask, 0.0)
+    r = tl.load(at + 7, mask, 0.0)
     height = d0 * n0 + d1 * n1 + d2 * n2
     over = squared - height * height < r * r
     height = tl.where(over, height, 0.0)
-    return height * n0, height * n1, height * n2, over, p, n0, n1, n2
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact_pairs(
-    first, second, place, radius, thickness, position, normal, out_normal, out_gap, out_valid, pairs,
-    BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Normal and gap of each listed pair, as ``pair_gaps``."""
-    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    i = tl.load(first + k, k < pairs, -1)
-    j = tl.load(second + k, k < pairs, -1)
-    mask = i >= 0
-    d0 = tl.load(position + i * 3, mask, 0.0) - tl.load(position + j * 3, mask, 0.0)
-    d1 = tl.load(position + i * 3 + 1, mask, 0.0) - tl.load(position + j * 3 + 1, mask, 0.0)
-    d2 = tl.load(position + i * 3 + 2, mask, 0.0) - tl.load(position + j * 3 + 2, mask, 0.0)
-    squared = d0 * d0 + d1 * d1 + d2 * d2
-    a0, a1, a2, over_a, pa, _x, _y, _z = _over(d0, d1, d2, squared, normal, radius, place, i, mask)
-    b0, b1, b2, over_b, pb, f0, f1, f2 = _over(d0, d1, d2, squared, normal, radius, place, j, mask)
-    a0 += b0
-    a1 += b1
-    a2 += b2
-    length = tl.sqrt(tl.maximum(a0 * a0 + a1 * a1 + a2 * a2, 1.2e-38))
-    real = length > 1.1e-19
-    a0 = tl.where(real, a0 / length, f0)
-    a1 = tl.where(real, a1 / length, f1)
-    a2 = tl.where(real, a2 / length, f2)
-    keep = 0.5 * (tl.load(thickness + pa, mask, 0.0) + tl.load(thickness + pb, mask, 0.0))
-    tl.store(out_normal + k * 3, a0, mask)
-    tl.store(out_normal + k * 3 + 1, a1, mask)
-    tl.store(out_normal + k * 3 + 2, a2, mask)
-    tl.store(out_gap + k, d0 * a0 + d1 * a1 + d2 * a2 - keep, mask)
-    tl.store(out_valid + k, tl.where(over_a | over_b, 1.0, 0.0), mask)
+    return height * n0, height * n1, height * n2, over, n0, n1, n2
 
 
 @triton.jit
-def _velocity(moving, drive, k, i, j, mask, c: tl.constexpr):
-    """One component of the relative velocity of a constraint; an obstacle has -1 in place of the second place."""
-    mine = tl.load(moving + i * 3 + c, mask, 0.0)
-    other = tl.load(moving + j * 3 + c, mask & (j >= 0), 0.0)
-    return mine - other - tl.load(drive + k * 3 + c, mask, 0.0)
+def _keep(data, other, slots, places, p, many, acts, q, n0, n1, n2, target):
+    """Write a constraint to the next slot of each place."""
+    at = many * places + p
+    acts = acts & (many < slots)
+    tl.store(other + at, q, acts)
+    plane = slots * places
+    tl.store(data + at, n0, acts)
+    tl.store(data + plane + at, n1, acts)
+    tl.store(data + 2 * plane + at, n2, acts)
+    tl.store(data + 3 * plane + at, target, acts)
+    return many + acts.to(tl.int32)
 
 
-@triton.jit(do_not_specialize=CHANGES)
-def contact_acting(
-    first, second, moving, drive, normal, gap, valid, applied, found, many_of, schedule, first_step, step_offset, slack,
-    pairs, BLOCK: tl.constexpr,
+@triton.jit
+def _target(gap, push, most, dt):
+    """The least velocity along the normal after the substep."""
+    return tl.where(gap > 0, -gap, tl.minimum(-gap * push, most)) / dt
+
+
+@triton.jit
+def _constrain_pairs(
+    row, moving, candidates, near, room, data, other, slots, places, p, mask, dt, limit, slack, push, most,
+    BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Keep the constraints that this substep comes close to, and count those of each place."""
-    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
-    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    i = tl.load(first + k, k < pairs, -1)
-    j = tl.load(second + k, k < pairs, -1)
-    mask = i >= 0
-    along = tl.zeros([BLOCK], tl.float32)
-    for c in tl.static_range(3):
-        relative = _velocity(moving, drive, k, i, j, mask, c)
-        along += relative * tl.load(normal + k * 3 + c, mask, 0.0)
-        tl.store(applied + k * 3 + c, tl.zeros([BLOCK], tl.float32), mask)
-        tl.store(found + k * 3 + c, tl.zeros([BLOCK], tl.float32), mask)
-    g = tl.load(gap + k, mask, 0.0)
-    acts = (tl.load(valid + k, mask, 0.0) > 0) & (tl.minimum(g, g + dt * along) < slack) & mask
-    tl.store(valid + k, tl.where(acts, 1.0, 0.0), mask)
-    one = tl.full([BLOCK], 1.0, tl.float32)
-    tl.atomic_add(many_of + i, one, acts)
-    tl.atomic_add(many_of + j, one, acts & (j >= 0))
+    """The pairs of places that this substep comes close to, as ``pair_gaps`` and ``acting``.
+
+    Returns how many there are for each place, and how many slots it needed.
+    """
+    length = tl.load(near + p, mask, 0)
+    wide = tl.arange(0, WIDE)[None, :]
+    own = row + p * 8
+    x0 = tl.load(own, mask, 0.0)
+    x1 = tl.load(own + 1, mask, 0.0)
+    x2 = tl.load(own + 2, mask, 0.0)
+    close = tl.zeros([BLOCK], tl.int32)
+    for k in range(0, tl.max(length), WIDE):  # first those that are close
+        known = (k + wide) < length[:, None]
+        q = tl.load(candidates + p[:, None] * room + k + wide, known, 0)
+        d0 = tl.load(row + q * 8, known, 0.0) - x0[:, None]
+        d1 = tl.load(row + q * 8 + 1, known, 0.0) - x1[:, None]
+        d2 = tl.load(row + q * 8 + 2, known, 0.0) - x2[:, None]
+        known = known & (d0 * d0 + d1 * d1 + d2 * d2 < limit * limit)
+        hit = known.to(tl.int32)
+        slot = close[:, None] + tl.cumsum(hit, 1) - hit
+        tl.store(other + slot * places + p[:, None], q, known & (slot < slots))
+        close += tl.sum(hit, 1)
+    tl.debug_barrier()  # another thread of this program may have written what is read next
+    many = tl.zeros([BLOCK], tl.int32)
+    for s in range(0, tl.max(tl.minimum(close, slots))):
+        real = (s < close) & mask
+        q = tl.load(other + s * places + p, real, 0)
+        # in the order of their numbers, so that both places of a pair find the same, to the last bit
+        low = row + tl.minimum(p, q) * 8
+        high = row + tl.maximum(p, q) * 8
+        d0 = tl.load(low, real, 0.0) - tl.load(high, real, 0.0)
+        d1 = tl.load(low + 1, real, 0.0) - tl.load(high + 1, real, 0.0)
+        d2 = tl.load(low + 2, real, 0.0) - tl.load(high + 2, real, 0.0)
+        squared = d0 * d0 + d1 * d1 + d2 * d2
+        a0, a1, a2, over_a, _x, _y, _z = _over(d0, d1, d2, squared, low, real)
+        b0, b1, b2, over_b, f0, f1, f2 = _over(d0, d1, d2, squared, high, real)
+        a0 += b0
+        a1 += b1
+        a2 += b2
+        size = tl.sqrt(tl.maximum(a0 * a0 + a1 * a1 + a2 * a2, 1.2e-38))
+        sure = size > 1.1e-19
+        a0 = tl.where(sure, a0 / size, f0)
+        a1 = tl.where(sure, a1 / size, f1)
+        a2 = tl.where(sure, a2 / size, f2)
+        keep = 0.5 * (tl.load(low + 3, real, 0.0) + tl.load(high + 3, real, 0.0))
+        gap = d0 * a0 + d1 * a1 + d2 * a2 - keep
+        low = moving + tl.minimum(p, q) * 4
+        high = moving + tl.maximum(p, q) * 4
+        along = (tl.load(low, real, 0.0) - tl.load(high, real, 0.0)) * a0
+        along += (tl.load(low + 1, real, 0.0) - tl.load(high + 1, real, 0.0)) * a1
+        along += (tl.load(low + 2, real, 0.0) - tl.load(high + 2, real, 0.0)) * a2
+        acts = real & (over_a | over_b) & (tl.minimum(gap, gap + dt * along) < slack)
+        many = _keep(data, other, slots, places, p, many, acts, q, a0, a1, a2, _target(gap, push, most, dt))
+    return many, close
 
 
-@triton.jit(do_not_specialize=CHANGES)
-def contact_spread(place, node, inverse, many_of, total, rows, BLOCK: tl.constexpr):
-    """Sum the counts of the places to the nodes."""
-    a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    p, at, known = _row(place, node, a, rows, BLOCK)
-    many = tl.load(many_of + a, p >= 0, 0.0)
-    known = known & (many > 0)[:, None]
-    w = tl.load(inverse + p[:, None] * 27 + tl.arange(0, 32)[None, :], known, 0.0)
-    tl.atomic_add(total + tl.load(at, known, 0), tl.abs(w) * many[:, None], known)
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact_mobility(place, node, weight, many_of, total, mobility, rows, BLOCK: tl.constexpr):
-    """Bound of how much unit impulses at all constraints move each place."""
-    a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    p, at, known = _row(place, node, a, rows, BLOCK)
-    mask = p >= 0
-    known = known & (tl.load(many_of + a, mask, 0.0) > 0)[:, None]
-    w = tl.load(weight + p[:, None] * 27 + tl.arange(0, 32)[None, :], known, 0.0)
-    tl.store(mobility + a, tl.sum(tl.abs(w) * tl.load(total + tl.load(at, known, 0), known, 0.0), 1), mask)
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact_read(place, node, weight, many_of, fields, moving, rows, BLOCK: tl.constexpr):
-    """The velocity of each place that has a constraint."""
-    a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    p, at, known = _row(place, node, a, rows, BLOCK)
-    mask = (p >= 0) & (tl.load(many_of + a, p >= 0, 0.0) > 0)
-    known = known & mask[:, None]
-    row = fields + tl.load(at, known, 0) * 8 + 4
-    w = tl.load(weight + p[:, None] * 27 + tl.arange(0, 32)[None, :], known, 0.0)
-    for c in tl.static_range(3):
-        tl.store(moving + a * 3 + c, tl.sum(w * tl.load(row + c, known, 0.0), 1), mask)
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact_impulses(
-    first, second, moving, drive, normal, gap, friction, valid, mobility, applied, found, impulse, theta, turned,
-    schedule, first_step, step_offset, push, most, pairs, round_,
-    LAST: tl.constexpr, BLOCK: tl.constexpr,
+@triton.jit
+def _constrain_walls(
+    moving, wall_gap, wall_normal, wall_drive, wall_valid, pressed, data, other, slots, places, p, mask, many, dt,
+    slack, push, most, WALLS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One iteration of ``resolve``: the impulse of each constraint, and its change summed at the places."""
-    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
-    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    acts = (k < pairs) & (tl.load(valid + k, k < pairs, 0.0) > 0)
-    i = tl.load(first + k, acts, 0)
-    j = tl.load(second + k, acts, -1)
-    other = acts & (j >= 0)
-    n0 = tl.load(normal + k * 3, acts, 0.0)
-    n1 = tl.load(normal + k * 3 + 1, acts, 0.0)
-    n2 = tl.load(normal + k * 3 + 2, acts, 0.0)
-    r0 = _velocity(moving, drive, k, i, j, acts, 0)
-    r1 = _velocity(moving, drive, k, i, j, acts, 1)
-    r2 = _velocity(moving, drive, k, i, j, acts, 2)
-    along = r0 * n0 + r1 * n1 + r2 * n2
-    both = tl.load(mobility + i, acts, 0.0) + tl.load(mobility + j, other, 0.0)
-    step = tl.where(both > 0, 1 / tl.where(both > 0, both, 1.0), 0.0)
-    g = tl.load(gap + k, acts, 0.0)
-    target = tl.where(g > 0, -g, tl.minimum(-g * push, most)) / dt
-    y0 = tl.load(applied + k * 3, acts, 0.0)
-    y1 = tl.load(applied + k * 3 + 1, acts, 0.0)
-    y2 = tl.load(applied + k * 3 + 2, acts, 0.0)
-    ahead = y0 * n0 + y1 * n1 + y2 * n2
-    press = tl.maximum(ahead + step * (target - along), 0.0)
-    t0 = y0 - ahead * n0 - step * (r0 - along * n0)
-    t1 = y1 - ahead * n1 - step * (r1 - along * n1)
-    t2 = y2 - ahead * n2 - step * (r2 - along * n2)
-    length = tl.sqrt(tl.maximum(t0 * t0 + t1 * t1 + t2 * t2, 1.2e-38))
-    share = tl.minimum(tl.load(friction + k, acts, 0.0) * press / length, 1.0)
-    t0 = press * n0 + share * t0
-    t1 = press * n1 + share * t1
-    t2 = press * n2 + share * t2
-    old = found + k * 3
-    g0 = t0 - tl.load(old, acts, 0.0)
-    g1 = t1 - tl.load(old + 1, acts, 0.0)
-    g2 = t2 - tl.load(old + 2, acts, 0.0)
-    back = tl.where(acts, (y0 - t0) * g0 + (y1 - t1) * g1 + (y2 - t2) * g2, 0.0)
-    tl.atomic_add(turned + round_ + 1, tl.sum(back))
-    now = tl.load(theta + round_)
-    following = 0.5 * (1 + tl.sqrt(1 + 4 * now * now))
-    wrong = tl.load(turned + round_) > 0
-    momentum = tl.where(wrong, 0.0, (now - 1) / following)
-    if LAST:
-        momentum = 0.0
-    tl.store(theta + round_ + 1, tl.where(wrong, 1.0, following))
-    tl.store(old, t0, acts)
-    tl.store(old + 1, t1, acts)
-    tl.store(old + 2, t2, acts)
-    t0 += momentum * g0
-    t1 += momentum * g1
-    t2 += momentum * g2
-    to = applied + k * 3
-    tl.store(to, t0, acts)
-    tl.store(to + 1, t1, acts)
-    tl.store(to + 2, t2, acts)
-    tl.atomic_add(impulse + i * 3, t0 - y0, acts)
-    tl.atomic_add(impulse + i * 3 + 1, t1 - y1, acts)
-    tl.atomic_add(impulse + i * 3 + 2, t2 - y2, acts)
-    tl.atomic_add(impulse + j * 3, y0 - t0, other)
-    tl.atomic_add(impulse + j * 3 + 1, y1 - t1, other)
-    tl.atomic_add(impulse + j * 3 + 2, y2 - t2, other)
+    """The obstacles that this substep brings places close to; -1 less their number is in place of the other place."""
+    for wall in range(WALLS):
+        at = wall * places + p
+        n0 = tl.load(wall_normal + at * 3, mask, 0.0)
+        n1 = tl.load(wall_normal + at * 3 + 1, mask, 0.0)
+        n2 = tl.load(wall_normal + at * 3 + 2, mask, 0.0)
+        along = (tl.load(moving + p * 4, mask, 0.0) - tl.load(wall_drive + at * 3, mask, 0.0)) * n0
+        along += (tl.load(moving + p * 4 + 1, mask, 0.0) - tl.load(wall_drive + at * 3 + 1, mask, 0.0)) * n1
+        along += (tl.load(moving + p * 4 + 2, mask, 0.0) - tl.load(wall_drive + at * 3 + 2, mask, 0.0)) * n2
+        gap = tl.load(wall_gap + at, mask, 0.0)
+        acts = mask & (tl.load(wall_valid + at, mask, 0.0) > 0) & (tl.minimum(gap, gap + dt * along) < slack)
+        number = tl.full([BLOCK], -1, tl.int32) - wall
+        many = _keep(data, other, slots, places, p, many, acts, number, n0, n1, n2, _target(gap, push, most, dt))
+        for c in tl.static_range(3):
+            tl.store(pressed + at * 3 + c, tl.zeros([BLOCK], tl.float32), mask)
+    return many
+
+
+@triton.jit
+def _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr):
+    """Bound of how much unit impulses at all constraints move each place, as ``Rows.mobility``."""
+    f = load3(fraction, places, p, mask)
+    node = tl.load(base + p, mask, 0)
+    wz, gz = axis_weights(f[2], inverse_dx)
+    a = (f[0] * 0, f[0] * 0, f[0] * 0)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+    found = f[0] * 0
+    for i in range(3):
+        wx, gx = node_weight(f[0], i, inverse_dx)
+        for j in range(3):
+            wy, gy = node_weight(f[1], j, inverse_dx)
+            at = total + node + i * sx + j * sy
+            w = wx * wy
+            g = gx * wy * a[0] + wx * gy * a[1]
+            for k in tl.static_range(3):
+                found += tl.abs((w + g) * wz[k] + w * gz[k] * a[2]) * tl.load(at + k, mask, 0.0)
+    tl.store(moving + p * 4 + 3, found, mask)
+
+
+@triton.jit
+def _impulses(
+    moving, many, other, data, slots, impulse, wall_drive, wall_friction, pressed, places, p, mask, count, momentum,
+    friction, later, final,
+    WALLS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """One iteration of ``resolve``: the impulses of the constraints of each place, and their change summed there.
+
+    Also summed is the change that ends the iterations here: back from the momentum to what was found before.
+
+    Returns the velocity that each place lacks, and its part of the sum that says whether the momentum led the wrong
+    way.
+    """
+    plane = slots * places
+    v0 = tl.load(moving + p * 4, mask, 0.0)
+    v1 = tl.load(moving + p * 4 + 1, mask, 0.0)
+    v2 = tl.load(moving + p * 4 + 2, mask, 0.0)
+    own = tl.load(moving + p * 4 + 3, mask, 0.0)
+    zero = tl.zeros([BLOCK], tl.float32)
+    d0, d1, d2, e0, e1, e2, worst, back = zero, zero, zero, zero, zero, zero, zero, zero
+    for s in range(0, tl.max(count)):
+        acts = s < count
+        at = s * places + p
+        q = tl.load(other + at, acts, 0)
+        pair = acts & (q >= 0)
+        to = moving + tl.maximum(q, 0) * 4
+        sign = tl.where((q >= 0) & (p > q), -1.0, 1.0)
+        n0 = tl.load(data + at, acts, 0.0)
+        n1 = tl.load(data + plane + at, acts, 0.0)
+        n2 = tl.load(data + 2 * plane + at, acts, 0.0)
+        r0 = sign * (v0 - tl.load(to, pair, 0.0))
+        r1 = sign * (v1 - tl.load(to + 1, pair, 0.0))
+        r2 = sign * (v2 - tl.load(to + 2, pair, 0.0))
+        both = own + tl.load(to + 3, pair, 0.0)
+        mu = friction
+        if WALLS > 0:
+            held = acts & (q < 0)
+            wall = tl.where(held, -1 - q, 0)
+            drive = wall_drive + (wall * places + p) * 3
+            r0 -= tl.load(drive, held, 0.0)
+            r1 -= tl.load(drive + 1, held, 0.0)
+            r2 -= tl.load(drive + 2, held, 0.0)
+            mu = tl.where(held, tl.load(wall_friction + wall, held, 0.0), friction)
+        along = r0 * n0 + r1 * n1 + r2 * n2
+        step = tl.where(both > 0, 1 / tl.where(both > 0, both, 1.0), 0.0)
+        lacking = tl.where(acts, tl.load(data + 3 * plane + at, acts, 0.0) - along, 0.0)
+        worst = tl.maximum(worst, lacking)
+        y = data + 4 * plane + at
+        t = data + 7 * plane + at
+        y0 = tl.load(y, acts & later, 0.0)
+        y1 = tl.load(y + plane, acts & later, 0.0)
+        y2 = tl.load(y + 2 * plane, acts & later, 0.0)
+        o0 = tl.load(t, acts & later, 0.0)
+        o1 = tl.load(t + plane, acts & later, 0.0)
+        o2 = tl.load(t + 2 * plane, acts & later, 0.0)
+        ahead = y0 * n0 + y1 * n1 + y2 * n2
+        press = tl.maximum(ahead + step * lacking, 0.0)
+        t0 = y0 - ahead * n0 - step * (r0 - along * n0)
+        t1 = y1 - ahead * n1 - step * (r1 - along * n1)
+        t2 = y2 - ahead * n2 - step * (r2 - along * n2)
+        length = tl.sqrt(tl.maximum(t0 * t0 + t1 * t1 + t2 * t2, 1.2e-38))
+        share = tl.minimum(mu * press / length, 1.0)
+        t0 = press * n0 + share * t0
+        t1 = press * n1 + share * t1
+        t2 = press * n2 + share * t2
+        turned = (y0 - t0) * (t0 - o0) + (y1 - t1) * (t1 - o1) + (y2 - t2) * (t2 - o2)
+        back += tl.where(acts & (sign > 0), turned, 0.0)  # a pair once
+        tl.store(t, t0, acts)
+        tl.store(t + plane, t1, acts)
+        tl.store(t + 2 * plane, t2, acts)
+        if WALLS > 0:
+            press_to = pressed + (wall * places + p) * 3
+            tl.store(press_to, tl.where(final, t0, o0), held)
+            tl.store(press_to + 1, tl.where(final, t1, o1), held)
+            tl.store(press_to + 2, tl.where(final, t2, o2), held)
+        sign = tl.where(acts, sign, 0.0)
+        e0 += sign * (o0 - y0)
+        e1 += sign * (o1 - y1)
+        e2 += sign * (o2 - y2)
+        t0 += momentum * (t0 - o0)
+        t1 += momentum * (t1 - o1)
+        t2 += momentum * (t2 - o2)
+        tl.store(y, t0, acts)
+        tl.store(y + plane, t1, acts)
+        tl.store(y + 2 * plane, t2, acts)
+        d0 += sign * (t0 - y0)
+        d1 += sign * (t1 - y1)
+        d2 += sign * (t2 - y2)
+    to = impulse + p * 8
+    tl.store(to, d0, mask)
+    tl.store(to + 1, d1, mask)
+    tl.store(to + 2, d2, mask)
+    tl.store(to + 4, e0, mask)
+    tl.store(to + 5, e1, mask)
+    tl.store(to + 6, e2, mask)
+    return worst, back
+
+
+@triton.jit
+def _count_nodes(
+    entry_start, entry_place, entry_weight, reached, total, touched, nodes, many, PAIRS: tl.constexpr,
+    programs, TALL: tl.constexpr,
+):  # fmt: skip
+    """How much unit impulses at all constraints move each node, at most; zero where there are none."""
+    entry = tl.arange(0, 32)[None, :]
+    for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
+        n = first + tl.arange(0, TALL)
+        mask = n < nodes
+        begin = tl.load(entry_start + n, mask, 0)
+        length = tl.load(entry_start + n + 1, mask, 0) - begin
+        if PAIRS:
+            length = tl.where(tl.load(reached + n, mask, 0) > 0, length, 0)
+        found = tl.zeros([TALL, 32], tl.float32)
+        for k in range(0, tl.max(length), 32):
+            real = (k + entry) < length[:, None]
+            e = begin[:, None] + k + entry
+            count = tl.load(many + tl.load(entry_place + e, real, 0), real, 0)
+            found += tl.abs(tl.load(entry_weight + e, real, 0.0)) * count.to(tl.float32)
+        tl.store(total + tl.load(touched + n, mask, 0), tl.sum(found, 1), mask)
+
+
+@triton.jit
+def _push_nodes(
+    entry_start, entry_place, entry_weight, total, touched, nodes, impulse, fields, programs,
+    TALL: tl.constexpr,
+):  # fmt: skip
+    """Give the impulses of the places to the nodes."""
+    entry = tl.arange(0, 32)[None, :]
+    for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
+        n = first + tl.arange(0, TALL)
+        node = tl.load(touched + n, n < nodes, 0)
+        mask = (n < nodes) & (tl.load(total + node, n < nodes, 0.0) > 0)
+        begin = tl.load(entry_start + n, mask, 0)
+        length = tl.load(entry_start + n + 1, mask, 0) - begin
+        found = tl.zeros([TALL, 32, 4], tl.float32)
+        for k in range(0, tl.max(length), 32):
+            real = (k + entry) < length[:, None]
+            e = begin[:, None] + k + entry
+            at = impulse + tl.load(entry_place + e, real, 0) * 8
+            w = tl.load(entry_weight + e, real, 0.0)
+            found += w[:, :, None] * tl.load(at[:, :, None] + tl.arange(0, 4)[None, None, :], real[:, :, None], 0.0)
+        to = fields + node[:, None] * 8 + 4 + tl.arange(0, 4)[None, :]
+        tl.store(to, tl.load(to, mask[:, None], 0.0) + tl.sum(found, 1), mask[:, None])
 
 
 @triton.jit(do_not_specialize=CHANGES)
-def contact_push(place, node, inverse, many_of, impulse, fields, rows, BLOCK: tl.constexpr):
-    """Give the impulses of the places to the nodes, and clear them."""
-    a = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    p, at, known = _row(place, node, a, rows, BLOCK)
-    mask = (p >= 0) & (tl.load(many_of + a, p >= 0, 0.0) > 0)
-    known = known & mask[:, None]
-    row = fields + tl.load(at, known, 0) * 8 + 4
-    w = tl.load(inverse + p[:, None] * 27 + tl.arange(0, 32)[None, :], known, 0.0)
-    for c in tl.static_range(3):
-        j = tl.load(impulse + a * 3 + c, mask, 0.0)
-        tl.atomic_add(row + c, w * j[:, None], known)
-        tl.store(impulse + a * 3 + c, tl.zeros([BLOCK], tl.float32), mask)
+def contact_solve(
+    fields, base, fraction, arm, rest, facing, radius, thickness, places, candidates, near, room,
+    wall_gap, wall_normal, wall_drive, wall_valid, wall_friction, pressed,
+    row, moving, many, other, data, slots, impulse,
+    touched, entry_start, entry_place, entry_weight, reached, total, touched_nodes,
+    peak, gate, status,
+    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, stretch, push, most, tolerance, friction,
+    iterations,
+    PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, BLOCK: tl.constexpr,
+    WIDE: tl.constexpr, TALL: tl.constexpr,
+):  # fmt: skip
+    """The impulses of a substep, added to the velocities of the nodes; see ``resolve``."""
+    pid = tl.program_id(0)
+    programs = tl.num_programs(0)
+    lane = tl.arange(0, BLOCK)
+    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
+    listed = 1
+    limit = reach
+    if WALLS == 0:
+        listed = tl.load(status + LISTED)
+    if PAIRS:
+        limit += slack + 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
+    if listed > 0:
+        if pid == 0:
+            tl.store(status + ACTING, 0)
+        for first in range(pid * BLOCK, places, programs * BLOCK):
+            p = first + lane
+            mask = p < places
+            some = 1
+            if WALLS == 0:
+                some = tl.max(tl.load(near + p, mask, 0))
+            if some > 0:
+                _place(
+                    fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy,
+                    inverse_dx, ARMS, BLOCK,
+                )  # fmt: skip
+                _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+        meet(gate, programs)
+        for first in range(pid * BLOCK, places, programs * BLOCK):
+            p = first + lane
+            mask = p < places
+            some = 1
+            if WALLS == 0:
+                some = tl.max(tl.load(near + p, mask, 0))
+            if some > 0:
+                count = tl.zeros([BLOCK], tl.int32)
+                needed = tl.zeros([BLOCK], tl.int32)
+                if PAIRS:
+                    count, needed = _constrain_pairs(
+                        row, moving, candidates, near, room, data, other, slots, places, p, mask, dt, limit, slack,
+                        push, most, BLOCK, WIDE,
+                    )  # fmt: skip
+                if WALLS > 0:
+                    count = _constrain_walls(
+                        moving, wall_gap, wall_normal, wall_drive, wall_valid, pressed, data, other, slots, places, p,
+                        mask, count, dt, slack, push, most, WALLS, BLOCK,
+                    )  # fmt: skip
+                tl.store(many + p, count, mask)
+                for c in tl.static_range(8):
+                    tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
+                tl.atomic_add(status + ACTING, tl.sum(count))
+                tl.atomic_max(status + NEEDED_SLOTS, tl.max(needed) + WALLS)
+        meet(gate, programs)
+        if tl.load(status + ACTING) > 0:
+            _count_nodes(
+                entry_start, entry_place, entry_weight, reached, total, touched, touched_nodes, many,
+                PAIRS & (WALLS == 0), programs, TALL,
+            )  # fmt: skip
+            meet(gate, programs)
+            for first in range(pid * BLOCK, places, programs * BLOCK):
+                p = first + lane
+                mask = p < places
+                mask = mask & (tl.load(many + p, mask, 0) > 0)
+                if tl.max(mask.to(tl.int32)) > 0:
+                    _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS)
+            meet(gate, programs)
+            k = 0
+            going = 1
+            theta = dt * 0 + 1.0
+            wrong = 0
+            jumped = 0
+            while going > 0:
+                last = k + 1 >= iterations
+                following = 0.5 * (1 + tl.sqrt(1 + 4 * theta * theta))
+                momentum = tl.where(wrong > 0, 0.0, (theta - 1) / following)
+                momentum = tl.where(last, 0.0, momentum)
+                theta = tl.where(wrong > 0, 1.0, following)
+                worst = tl.zeros([BLOCK], tl.float32)
+                back = tl.zeros([BLOCK], tl.float32)
+                for first in range(pid * BLOCK, places, programs * BLOCK):
+                    p = first + lane
+                    mask = p < places
+                    count = tl.load(many + p, mask, 0)
+                    if tl.max(count) > 0:
+                        lacking, turned = _impulses(
+                            moving, many, other, data, slots, impulse, wall_drive, wall_friction, pressed, places, p,
+                            mask, count, momentum, friction, k > 0, last, WALLS, BLOCK,
+                        )  # fmt: skip
+                        worst = tl.maximum(worst, lacking)
+                        back += turned
+                tl.store(peak + 2 * MOST_PROGRAMS + pid, tl.max(worst))
+                tl.store(peak + 3 * MOST_PROGRAMS + pid, tl.sum(back))
+                meet(gate, programs)
+                done = (
+                    (k > 0) & (dt * largest_of(peak + 2 * MOST_PROGRAMS, programs) < tolerance) & (k + 1 < iterations)
+                )
+                o = tl.arange(0, MOST_PROGRAMS)
+                turned_all = tl.sum(tl.load(peak + 3 * MOST_PROGRAMS + o, o < programs, 0.0))
+                wrong = tl.where(turned_all > 0, 1, 0)
+                if (done == 0) | (jumped > 0):  # without momentum there is nothing to take back
+                    shift = tl.where(done, 4, 0)
+                    _push_nodes(
+                        entry_start, entry_place, entry_weight, total, touched, touched_nodes, impulse + shift, fields,
+                        programs, TALL,
+                    )  # fmt: skip
+                jumped = tl.where(momentum != 0, 1, 0)
+                going = tl.where(done | last, 0, 1)
+                k += 1
+                if going > 0:
+                    meet(gate, programs)
+                    for first in range(pid * BLOCK, places, programs * BLOCK):
+                        p = first + lane
+                        mask = p < places
+                        mask = mask & (tl.load(many + p, mask, 0) > 0)
+                        if tl.max(mask.to(tl.int32)) > 0:
+                            _velocity(
+                                fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                            )
+                    meet(gate, programs)
+            if pid == 0:
+                tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)

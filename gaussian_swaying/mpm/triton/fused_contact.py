@@ -1,230 +1,179 @@
-"""Runs contact in the substep of ``total`` with its kernels; the lists are made in torch, from time to time."""
+"""Runs contact in the substep of ``total`` with its kernels; the lists are made on the device."""
 
 from __future__ import annotations
 
-import math
-import warnings
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.contact.solve import PUSH, PUSH_CELLS, SLACK
-from gaussian_swaying.mpm.contact.stage import AHEAD, ARM, TOLERANCE, ContactStage, Lists
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.contact.stage import TOLERANCE, ContactStage
 from gaussian_swaying.mpm.triton import contact_kernels as kernels
+from gaussian_swaying.mpm.triton import contact_list_kernels as list_kernels
 from gaussian_swaying.mpm.triton import obstacle_kernels
+from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_INDEX
 from gaussian_swaying.mpm.triton.obstacles import Solids
 from gaussian_swaying.mpm.triton.obstacles import known as is_known
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.formulations.total import Total
 
-FEWEST, MOST = 4, 64
-"""Fewest iterations of a substep; most substeps between two looks at the lists."""
+ROOM, SLOTS = 64, 16
+"""First room for the candidates of a place, and for its constraints."""
 
-LEAST_ROOM = 256
-"""Least room of a list."""
+MOST_ENTRIES = MAX_INDEX // 2
+"""Most entries of a buffer of candidates or constraints."""
 
-BLOCK = 16
-"""Places of a program."""
+LEAST_MARGIN = 0.1
+"""Least distance beyond contact within which pairs are listed [cells]."""
 
+AHEAD = 8.0
+"""For how many substeps of the fastest node lists are made, unless that is more than the reach of contact."""
 
-@dataclass(frozen=True, slots=True)
-class Buffers:
-    """Lists and constraints with room for more; an index of -1 stands for nothing.
+BLOCK, TALL = 256, 32
+"""Places, and nodes, of a program at a time."""
 
-    Attributes:
-        place: The listed places, shape (A,), int32.
-        first: Rows of the first places: of the pairs, then of the places near each obstacle, shape (K,), int32.
-        second: Rows of the second places, -1 for an obstacle, shape (K,), int32.
-        near: For each obstacle, the part of ``first`` with the places near it.
-        position, normal, moving, impulse: Of the places, shape (A, 3).
-        count, mobility: Of the places, shape (A,).
-        facing, drive, applied, found: Of the constraints, shape (K, 3).
-        gap, valid, friction: Of the constraints, shape (K,).
-        pairs: Room for pairs.
-    """
+WIDE, WIDE_SEARCH = 8, 4
+"""How many candidates of each place are looked at together, in a substep and when lists are made; 8 would spill."""
 
-    place: Tensor
-    first: Tensor
-    second: Tensor
-    near: list[slice]
-    position: Tensor
-    normal: Tensor
-    moving: Tensor
-    impulse: Tensor
-    count: Tensor
-    mobility: Tensor
-    facing: Tensor
-    drive: Tensor
-    applied: Tensor
-    found: Tensor
-    gap: Tensor
-    valid: Tensor
-    friction: Tensor
-    pairs: int
+PER_PROCESSOR = 2
+"""Programs on each multiprocessor; all of them must run at once."""
 
-    @property
-    def room(self) -> tuple[int, ...]:
-        """Sizes of its lists."""
-        return (len(self.place), self.pairs, *(part.stop - part.start for part in self.near))
-
-
-def room_for(entries: int) -> int:
-    """Room for some entries, a power of two."""
-    return max(LEAST_ROOM, 1 << max(entries - 1, 0).bit_length())
+_LAUNCH: dict[str, Any] = {"num_warps": 8, "maxnreg": 128}
 
 
 class FusedContact:
     """Contact of a body with buffers that stay where they are, so that substeps can be recorded.
 
+    The lists are made on the device when they are too old. If the room for them is too small, :meth:`fits` says so
+    after the rollout, and makes more.
+
     Args:
         bound: The formulation, bound to its material, with a contact.
         fields: Displacement and velocity of the nodes, shape (nodes, 8), which the kernels change.
+        active: The nodes that have mass, int32.
 
     Attributes:
-        every: Substeps until the lists must be looked at again.
-        rounds: Iterations in each substep.
+        room: Room for the candidates of each place.
+        slots: Room for the constraints of each place.
     """
 
-    def __init__(self, bound: Total, fields: Tensor) -> None:
+    def __init__(self, bound: Total, fields: Tensor, active: Tensor) -> None:
         assert bound.contact is not None
         stage = bound.contact
         self.stage: ContactStage = stage
-        self.fields = fields
+        self.fields, self.active, self.device = fields, active, fields.device
         surface = stage.surface
-        self.rest, self.facing = surface.place.contiguous(), surface.normal.contiguous()
+        self.places = len(surface.place)
+        self.position = torch.zeros_like(surface.place)
+        self.rest, self.facing = surface.place.T.contiguous(), surface.normal.T.contiguous()
         self.radius, self.thickness = surface.radius.contiguous(), surface.thickness.contiguous()
-        self.node, self.weight = stage.node.int().contiguous(), stage.weight.contiguous()
-        self.inverse = (stage.weight * stage.inverse_mass[stage.node]).contiguous()
-        self.slope = stage.slope.contiguous()
-        self.total = torch.zeros(len(fields), device=fields.device)
-        most = stage.iterations
-        self.theta = torch.ones(most + 2, device=fields.device)
-        self.turned = torch.zeros(most + 2, device=fields.device)
-        self.rounds, self.every = min(2 * FEWEST, most), 1
-        self.buffers: Buffers | None = None
-        self._lists: Lists | None = None
+        self.base, self.fraction = stage.first.int(), stage.fraction.contiguous()
+        arm = surface.place - surface.read
+        self.arms = bool((arm != 0).any())
+        self.arm = arm.T.contiguous()
+        # all weights of a node are together, in the order of the places
+        real = stage.inverse_mass[stage.node] > 0
+        node, order = stage.node[real].sort(stable=True)
+        self.touched, sizes = (part.int() for part in torch.unique_consecutive(node, return_counts=True))
+        ends = sizes.cumsum(0)
+        self.entry_start = torch.cat([ends.new_zeros(1), ends]).int()
+        self.entry_place = real.nonzero()[:, 0][order].int()
+        self.entry_weight = (stage.weight * stage.inverse_mass[stage.node])[real][order].contiguous()
+        self.stretch = float(stage.weight.abs().sum(1).amax()) if self.places else 1.0
+        """No place moves farther than this times the node that moves farthest."""
+        many, walls = self.places, len(stage.obstacles)
+        self.walls = walls
+        whole = {"dtype": torch.int32}
+        self.before = self._zeros(len(active), 4)
+        self.last = (1 << max(many - 1, 0).bit_length()) - 1
+        self.counts, self.rank = self._zeros(self.last + 1, **whole), self._zeros(many, **whole)
+        self.start = torch.full((self.last + 2,), many, device=self.device, **whole)
+        self.item, self.ordered = self._zeros(many, **whole), self._zeros(many, **whole)
+        self.now, self.sorted = self._zeros(many, 4), self._zeros(many, 4)
+        self.near, self.many = self._zeros(many, **whole), self._zeros(many, **whole)
+        self.reached, self.total = self._zeros(len(self.touched), **whole), self._zeros(len(fields))
+        self.row, self.moving, self.impulse = self._zeros(many, 8), self._zeros(many, 4), self._zeros(many, 8)
+        most = int(list_kernels.MOST_PROGRAMS.value)
+        self.peak, self.sums = self._zeros(4, most), self._zeros(most, **whole)
+        self.gate, self.status = self._zeros(1, **whole), self._zeros(8, **whole)
+        self.margin = torch.full((1,), -1.0, device=self.device)
+        self.wall_gap, self.wall_valid = self._zeros(max(walls, 1), many), self._zeros(max(walls, 1), many)
+        self.wall_normal, self.wall_drive = self._zeros(max(walls, 1), many, 3), self._zeros(max(walls, 1), many, 3)
+        self.pressed = self._zeros(max(walls, 1), many, 3)
+        self.friction = torch.tensor([float(b.friction) for _, b in stage.obstacles] or [0.0], device=self.device)
         touched = [obstacle for _, obstacle in stage.obstacles if is_known(obstacle)]
-        self.solids = Solids([(obstacle, 0) for obstacle in touched], fields.device, steps=1)
+        self.solids = Solids([(obstacle, 0) for obstacle in touched], self.device, steps=1)
         self.numbers = [touched.index(o) if is_known(o) else None for _, o in stage.obstacles]
         """Which of the solids each obstacle is; None for one that runs in torch."""
-        self.late = 0
-        """How often points moved farther between two looks than the lists allow."""
+        self.programs = self._programs()
+        self.room, self.slots = ROOM if stage.contact is not None else 1, SLOTS if stage.contact is not None else walls
+        self._take_room()
+
+    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.zeros(shape, dtype=dtype, device=self.device)
+
+    def _programs(self) -> int:
+        """Programs that meet: one in the interpreter, which runs them one after the other."""
+        if INTERPRETED or self.device.type != "cuda":
+            return 1
+        room = PER_PROCESSOR * torch.cuda.get_device_properties(self.device).multi_processor_count
+        needed = max(-(-max(self.places, len(self.active)) // BLOCK), -(-len(self.touched) // TALL))
+        return max(1, min(room, needed, int(list_kernels.MOST_PROGRAMS.value)))
+
+    def _take_room(self) -> None:
+        """Make the buffers whose size depends on how crowded the surface is."""
+        places, planes = self.places, int(kernels.PLANES.value)
+        if max(self.room, planes * self.slots) * places > MOST_ENTRIES:
+            raise ValueError(
+                f"A place of the surface is close to {max(self.room, self.slots):,} others: the material has "
+                "collapsed; lower `contact.thickness`, or coarsen `solver.dx`."
+            )
+        self.candidates = self._zeros(places, self.room, dtype=torch.int32)
+        self.other = self._zeros(self.slots, places, dtype=torch.int32)
+        self.data = self._zeros(planes, self.slots, places)
+        self.margin.fill_(-1.0)
 
     @property
     def key(self) -> tuple[object, ...]:
         """What recorded substeps depend on."""
-        buffers = self.buffers
-        return () if buffers is None else (self.rounds, buffers.place.data_ptr(), *buffers.room)
+        return (self.room, self.slots, self.data.data_ptr(), self.candidates.data_ptr())
 
-    def look(self, state: MPMState, dt: float) -> None:
-        """Bring the lists, the iterations and the time of the next look up to date; the host waits.
+    @property
+    def pairs(self) -> int:
+        """Pairs that are listed; the host waits."""
+        return int(self.status[int(list_kernels.LISTED.value)]) // 2
 
-        Args:
-            state: The state of the particles now, with the displacement of the nodes.
-            dt: Substep [s].
+    @property
+    def made(self) -> int:
+        """How often the lists were made; the host waits."""
+        return int(self.status[int(list_kernels.MADE.value)])
+
+    @property
+    def rounds(self) -> int:
+        """Iterations of all substeps so far; the host waits."""
+        return int(self.status[int(list_kernels.ROUNDS.value)])
+
+    def fits(self) -> bool:
+        """Whether the room was large enough for all lists so far; the host waits. If it was not, there is more now.
+
+        Raises:
+            ValueError: If the lists are too long for any buffer.
         """
-        stage = self.stage
+        if self.stage.contact is None:  # the room is exact
+            return True
+        _, room, slots, *_ = self.status.tolist()
+        if room <= self.room and slots <= self.slots:
+            return True
+        self.room = max(self.room, 1 << (room - 1).bit_length())
+        self.slots = max(self.slots, 1 << (slots - 1).bit_length())
+        self._take_room()
+        return False
+
+    def take(self) -> None:
+        """Bring the tables of the obstacles up to date before a rollout; not recorded."""
         self.solids.take()
-        position, velocity = state.position.reshape(-1, 3), state.velocity.reshape(-1, 3)
-        known = self._lists
-        if known is not None:
-            far = float((position - known.before).square().sum(-1).amax()) ** 0.5
-            if 2 * ARM * far > known.margin * (1 + 1e-6):
-                self.late += 1
-                if self.late == 1:
-                    warnings.warn(
-                        "Points moved farther than contact had looked ahead, so some may have passed through each "
-                        "other: lower `solver.cfl`.",
-                        stacklevel=2,
-                    )
-            self._adapt(dt)
-        stage.update(state, dt, MOST / 4)
-        lists = stage.lists
-        if lists is None:
-            self.every = 1
-            return
-        if lists is not self._lists:
-            self._take(lists)
-        step = dt * float(velocity.square().sum(-1).amax()) ** 0.5
-        left = lists.margin
-        if known is lists:
-            left -= 2 * ARM * float((position - lists.before).square().sum(-1).amax()) ** 0.5
-        ahead = left / max(1.5 * (2 * ARM * step + lists.fastest * dt), 1e-30)
-        self.every = max(1, min(MOST, math.floor(min(ahead, MOST)) - int(AHEAD)))
-
-    def _adapt(self, dt: float) -> None:
-        """Change the number of iterations if the last substep violated a constraint by much, or by little."""
-        held = self.buffers
-        if held is None or len(held.first) == 0:
-            return
-        self._read(held)
-        first, second = held.first.long(), held.second.long()
-        other = torch.where((second >= 0)[:, None], held.moving[second.clamp(min=0)], 0.0)
-        along = ((held.moving[first.clamp(min=0)] - other - held.drive) * held.facing).sum(-1)
-        overlap = (-held.gap * PUSH).clamp(max=PUSH_CELLS * self.stage.dx)
-        lacking = torch.where(held.gap > 0, -held.gap, overlap) - dt * along
-        worst = float(torch.where((held.valid > 0) & (first >= 0), lacking, 0.0).amax())
-        tolerance = TOLERANCE * self.stage.dx
-        if worst > tolerance:
-            self.rounds = min(2 * self.rounds, self.stage.iterations)
-        elif worst < 0.1 * tolerance:
-            self.rounds = max(self.rounds // 2, min(FEWEST, self.stage.iterations))
-
-    def _take(self, lists: Lists) -> None:
-        """Fill the buffers with new lists; make larger ones if needed."""
-        self._lists = lists
-        sizes = (len(lists.place), len(lists.first), *map(len, lists.walls))
-        held = self.buffers
-        if held is None or any(size > room for size, room in zip(sizes, held.room, strict=True)):
-            held = self.buffers = self._make([room_for(size) for size in sizes])
-        held.place.fill_(-1)
-        held.first.fill_(-1)
-        held.second.fill_(-1)
-        held.valid.zero_()
-        held.place[: sizes[0]] = lists.place.int()
-        held.first[: sizes[1]] = lists.first.int()
-        held.second[: sizes[1]] = lists.second.int()
-        for part, near in zip(held.near, lists.walls, strict=True):
-            held.first[part.start : part.start + len(near)] = near.int()
-
-    def _make(self, room: list[int]) -> Buffers:
-        device, stage = self.fields.device, self.stage
-        places, pairs, *walls = room
-        ends = [pairs + sum(walls[: k + 1]) for k in range(len(walls))]
-        near = [slice(end - size, end) for end, size in zip(ends, walls, strict=True)]
-        held = pairs + sum(walls)
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(shape, dtype=dtype, device=device)
-
-        friction = zeros(held)
-        if stage.contact is not None:
-            friction[:pairs] = stage.contact.friction
-        for part, (_, obstacle) in zip(near, stage.obstacles, strict=True):
-            friction[part] = obstacle.friction
-        whole = {"dtype": torch.int32}
-        return Buffers(
-            place=zeros(places, **whole),
-            first=zeros(held, **whole),
-            second=zeros(held, **whole),
-            near=near,
-            **{name: zeros(places, 3) for name in ("position", "normal", "moving", "impulse")},
-            **{name: zeros(places) for name in ("count", "mobility")},
-            **{name: zeros(held, 3) for name in ("facing", "drive", "applied", "found")},
-            **{name: zeros(held) for name in ("gap", "valid")},
-            friction=friction,
-            pairs=pairs,
-        )
-
-    def _read(self, held: Buffers) -> None:
-        rows = len(held.place)
-        kernels.contact_read[(-(-rows // BLOCK),)](
-            held.place, self.node, self.weight, held.count, self.fields, held.moving, rows, BLOCK=BLOCK, num_warps=4
-        )
 
     def apply(self, schedule: Tensor, first_step: Tensor, offset: int, time: Tensor, dt: Tensor, taken: Tensor) -> None:
         """Change the velocities of the nodes by the impulses of a substep; can be recorded.
@@ -237,69 +186,53 @@ class FusedContact:
             dt: Substep [s], scalar float64 tensor.
             taken: What each boundary took [N s], shape (scenes, B, 3), float64; it is added to.
         """
-        held, stage = self.buffers, self.stage
-        if held is None:
+        stage = self.stage
+        if self.places == 0:
             return
-        places, constraints, block, wide = len(held.place), len(held.first), BLOCK, 128
-        each, all_of = (-(-places // block),), (-(-constraints // wide),)
-        kernels.contact_places[each](
-            held.place, self.rest, self.facing, self.node, self.weight, self.slope, self.fields, held.position,
-            held.normal, held.moving, held.count, held.impulse, places, NORMALS=stage.contact is not None, BLOCK=block,
-            num_warps=4,
+        pairs, walls, dx = stage.contact is not None, self.walls, stage.dx
+        _, ny, nz = stage.grid.resolution
+        strides = (ny * nz, nz, 1 / dx)
+        now = (schedule, first_step, offset, *strides)
+        where = (self.fields, self.base, self.fraction, self.arm, self.rest)
+        launch: dict[str, Any] = {"ARMS": self.arms, "BLOCK": BLOCK, "TALL": TALL, **_LAUNCH}
+        if self.programs > 1:
+            launch["launch_cooperative_grid"] = True
+        if pairs:
+            chunk = -(-(self.last + 1) // self.programs)
+            list_kernels.contact_lists[(self.programs,)](
+                self.active, self.before, len(self.active), *where, self.places,
+                self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
+                self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
+                len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
+                stage.apart, SLACK * dx, LEAST_MARGIN * dx, self.stretch, AHEAD, self.last, -(-chunk // BLOCK) * BLOCK,
+                WIDE=WIDE_SEARCH, **launch,
+            )  # fmt: skip
+        if walls:
+            kernels.contact_positions[(-(-self.places // BLOCK),)](
+                *where, self.places, self.position, *strides, ARMS=self.arms, BLOCK=BLOCK, num_warps=8
+            )
+            self.solids.prepare(time, dt, 1)
+            for k, (number, (_, obstacle)) in enumerate(zip(self.numbers, stage.obstacles, strict=True)):
+                if number is not None:
+                    obstacle_kernels.obstacle_places[(-(-self.places // BLOCK),)](
+                        self.position, self.thickness, self.wall_gap[k], self.wall_normal[k], self.wall_drive[k],
+                        self.wall_valid[k], self.places, *self.solids.of(number), time,
+                        KIND=self.solids.kinds[number], MOVES=self.solids.moves[number], BLOCK=BLOCK, num_warps=4,
+                    )  # fmt: skip
+                    continue
+                gap, normal, drive = obstacle.touch(self.position, time, dt)
+                self.wall_gap[k].copy_(gap - 0.5 * self.thickness)
+                self.wall_normal[k].copy_(normal)
+                self.wall_drive[k].copy_(drive)
+                self.wall_valid[k].copy_(obstacle.active(time).expand(self.places))
+        kernels.contact_solve[(self.programs,)](
+            *where, self.facing, self.radius, self.thickness, self.places, self.candidates, self.near, self.room,
+            self.wall_gap, self.wall_normal, self.wall_drive, self.wall_valid, self.friction, self.pressed,
+            self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
+            self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.total,
+            len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, self.stretch, PUSH,
+            PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
+            stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **launch,
         )  # fmt: skip
-        if stage.contact is not None:
-            kernels.contact_pairs[(-(-held.pairs // wide),)](
-                held.first, held.second, held.place, self.radius, self.thickness, held.position, held.normal,
-                held.facing, held.gap, held.valid, held.pairs, BLOCK=wide, num_warps=4,
-            )  # fmt: skip
-        self.solids.prepare(time, dt, 1)
-        for part, number, (_, obstacle) in zip(held.near, self.numbers, stage.obstacles, strict=True):
-            if number is not None:
-                solids = self.solids
-                row_of, whole, window, pose, grids = solids.of(number)
-                obstacle_kernels.obstacle_places[(-(-(part.stop - part.start) // wide),)](
-                    held.first[part], held.place, held.position, self.thickness, held.gap[part], held.facing[part],
-                    held.drive[part], held.valid[part], part.stop - part.start, row_of, whole, window, pose, grids,
-                    time, KIND=solids.kinds[number], MOVES=solids.moves[number], BLOCK=wide, num_warps=4,
-                )  # fmt: skip
-                continue
-            row = held.first[part].long()
-            real, row = row >= 0, row.clamp(min=0)
-            gap, normal, drive = obstacle.touch(held.position[row], time, dt)
-            half = 0.5 * self.thickness[held.place[row].long().clamp(min=0)]
-            held.gap[part].copy_(gap - half)
-            held.facing[part].copy_(normal)
-            held.drive[part].copy_(drive)
-            held.valid[part].copy_(real & obstacle.active(time))
-        now = (schedule, first_step, offset)
-        kernels.contact_acting[all_of](
-            held.first, held.second, held.moving, held.drive, held.facing, held.gap, held.valid, held.applied,
-            held.found, held.count, *now, SLACK * stage.dx, constraints, BLOCK=wide, num_warps=4,
-        )  # fmt: skip
-        self.total.zero_()
-        self.turned.zero_()
-        kernels.contact_spread[each](
-            held.place, self.node, self.inverse, held.count, self.total, places, BLOCK=block, num_warps=4
-        )
-        kernels.contact_mobility[each](
-            held.place, self.node, self.weight, held.count, self.total, held.mobility, places, BLOCK=block, num_warps=4
-        )
-        for k in range(self.rounds):
-            if k > 0:
-                self._read(held)
-            kernels.contact_impulses[all_of](
-                held.first, held.second, held.moving, held.drive, held.facing, held.gap, held.friction, held.valid,
-                held.mobility, held.applied, held.found, held.impulse, self.theta, self.turned, *now, PUSH,
-                PUSH_CELLS * stage.dx, constraints, k, LAST=k == self.rounds - 1, BLOCK=wide, num_warps=4,
-            )  # fmt: skip
-            kernels.contact_push[each](
-                held.place, self.node, self.inverse, held.count, held.impulse, self.fields, places, BLOCK=block,
-                num_warps=4,
-            )  # fmt: skip
-        for part, (k, _) in zip(held.near, stage.obstacles, strict=True):
-            pressed = torch.where((held.valid[part] > 0)[:, None], held.found[part], 0.0)
-            if stage.scenes == 1:
-                taken[0, k] -= pressed.sum(0, dtype=torch.float64)
-            else:
-                scene = stage.scene[held.place[held.first[part].long().clamp(min=0)].long().clamp(min=0)]
-                taken[:, k].index_add_(0, scene, -pressed.double())
+        for k, (number, _) in enumerate(stage.obstacles):
+            taken[:, number] -= self.pressed[k].view(stage.scenes, -1, 3).sum(1, dtype=torch.float64)

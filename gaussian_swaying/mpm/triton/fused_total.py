@@ -40,11 +40,6 @@ class FusedTotal(Fused):
 
     fixed_order = True
 
-    @property
-    def recordable(self) -> bool:
-        """Whether substeps can be recorded: contact in a fixed order makes the host wait."""
-        return super().recordable and (self.touching is not None or self.bound.contact is None)
-
     def __init__(self, bound: Formulation) -> None:
         super().__init__(bound)
         assert isinstance(bound, Total)
@@ -90,13 +85,15 @@ class FusedTotal(Fused):
         self.found = torch.zeros(self.room if self.count <= RECORDED else 0, device=self.device)
         self.taken_and_done = torch.zeros(self.impulse.numel() + self.scenes, dtype=torch.float64, device=self.device)
         pins = (PinnedRegion, PinnedPoints)
-        held = all(type(b) in pins and b.start <= 0 and b.end == math.inf for b in body.boundaries)
-        self.plain = held and bound.contact is None
+        self.plain = all(
+            kind == "surface" or (type(b) in pins and b.start <= 0 and b.end == math.inf)
+            for b, kind in zip(body.boundaries, bound.kinds, strict=True)
+        )
+        """Whether the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
         self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
-        fixed = self.settings.deterministic
-        self.touching = None if bound.contact is None or fixed else FusedContact(bound, self.fields)
+        self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
         self._partial: dict[tuple[int, int], Tensor] = {}
         width = 8 if self.position else 4
@@ -148,11 +145,24 @@ class FusedTotal(Fused):
         return self._partial[rows, width]
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
+        if self.touching is None:
+            return self._run_once(state, part)
+        fastest = self.speed.clone()
+        while True:
+            changes = self._run_once(state, part)
+            if self.touching.fits():
+                return changes
+            self.speed.copy_(fastest)  # again, with more room
+            self.time.copy_(state.time)
+
+    def _run_once(self, state: MPMState, part: Part) -> dict[str, Any]:
         assert state.node_displacement is not None
         assert state.node_velocity is not None
         self.displacement[:, :3].copy_(state.node_displacement.reshape(-1, 3))
         self.velocity[:, :3].copy_(state.node_velocity.reshape(-1, 3))
         options = part.options
+        if self.touching is not None:
+            self.touching.take()
 
         def begin(_: int) -> None:
             part.begin(len(self.vectors))
@@ -161,10 +171,11 @@ class FusedTotal(Fused):
 
         key = (part.loaded, self.numbers.data_ptr(), part.key)
         self.repeater.run(1, ("begin", *key), begin, part.key is not None)
+        same = (*options.values(), *(() if self.touching is None else self.touching.key))
         done = 0
         for mark in sorted({*part.looks, part.steps}):
-            while done < mark:
-                done += self._some(mark - done, options)
+            self._repeat(mark - done, same, lambda offset: self._substep(offset, options))
+            done = mark
             if mark in part.looks:
                 self.repeater.run(1, "look", lambda _: self._look())
         if self.count > RECORDED:
@@ -173,15 +184,6 @@ class FusedTotal(Fused):
             return self._fields(found, self.taken_and_done.clone(), part)
         self.repeater.run(1, ("read", part.loaded, options["IMPLICIT"]), lambda _: self._read(self.found, part))
         return self._fields(self.found.clone(), self.taken_and_done.clone(), part)
-
-    def _some(self, steps: int, options: dict[str, Any]) -> int:
-        """Run up to some substeps, as many as the lists of what touches are good for; how many they were."""
-        key = tuple(options.values())
-        if self.touching is not None:
-            self.touching.look(self._look_at(), float(self.dt))
-            key, steps = (*key, *self.touching.key), min(steps, self.touching.every)
-        self._repeat(steps, key, lambda offset: self._substep(offset, options))
-        return steps
 
     def _look(self) -> None:
         _, ny, nz = self.grid.resolution
@@ -214,19 +216,28 @@ class FusedTotal(Fused):
                 pieces, partial, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
             )
         block = 64
-        nodes = len(self.active)
+        nodes, held = len(self.active), self.plain and "nodes" in self.bound.kinds
+        moves = self.plain and self.touching is None
         kernels.total_nodes[(-(-nodes // block),)](
             self.active, self.source, len(self.source), self.inverse_mass, self.held, nodes, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
-            HELD=self.plain and "nodes" in self.bound.kinds, MOVE=self.plain, BLOCK=block,
+            HELD=moves and held, MOVE=moves, BLOCK=block,
             SOURCES=triton.next_power_of_2(len(self.source)), num_warps=4,
         )  # fmt: skip
+        if self.touching is not None:
+            taken = self.impulse.view(self.scenes, -1, 3)
+            self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt, taken)
+        if self.plain and not moves:
+            kernels.total_end[(-(-nodes // block),)](
+                self.active, self.inverse_mass, self.held, nodes, self.fields, self.schedule, self.first_step, offset,
+                self.taken, HELD=held, BLOCK=block, num_warps=4,
+            )  # fmt: skip
         if self.points is not None:
             self._hold_points(self.points, offset)
         if not self.plain:
-            self._constrain(offset)
-        if not self.plain or self.asked:
+            self._constrain()
+        if not self.plain or self.asked or (self.touching is not None and self.touching.walls):
             self.time.add_(self.dt)
 
     def _hold_points(self, points: DenseHolds, offset: int) -> None:
@@ -252,13 +263,10 @@ class FusedTotal(Fused):
             total += self.points.share @ self.residual[1, :, :3].double().reshape(self.scenes, -1, 3)
         return total.reshape(self.impulse.shape)
 
-    def _constrain(self, offset: int) -> None:
+    def _constrain(self) -> None:
         """Apply the boundary conditions that the kernels do not support, and update the displacements."""
         bound, inverse = self.bound, self.bound.node_inverse_mass
         shape = (*inverse.shape, 3)
-        if self.touching is not None:
-            taken = self.impulse.view(self.scenes, -1, 3)
-            self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt, taken)
         # nodes without mass keep no velocity from a boundary
         velocity = torch.where(inverse[..., None] > 0, self.velocity[:, :3].reshape(shape), 0.0)
         position = lattice = None
@@ -267,13 +275,7 @@ class FusedTotal(Fused):
         if self.lattice is not None:
             lattice = self.lattice + self.displacement[:, :3].reshape(shape)
         displacement = self.displacement[:, :3].reshape(shape)
-        pressed = None
-        if bound.contact is not None and self.touching is None:
-            bound.contact.update(self._look_at(), float(self.dt))
-            velocity, pressed = bound.touch(velocity, displacement, self.time, self.dt)
         velocity, taken = bound.hold(velocity, displacement, position, lattice, self.time, self.dt)
-        if pressed is not None:
-            taken = taken + pressed
         self.impulse.add_(taken)
         self.velocity[:, :3].copy_(velocity.reshape(-1, 3))
         self.displacement.addcmul_(self.velocity, self.dt.float())

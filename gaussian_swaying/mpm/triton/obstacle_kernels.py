@@ -268,24 +268,17 @@ def acts(window, now):
 
 @triton.jit(do_not_specialize=VARIES)
 def obstacle_places(
-    first, place, position, thickness, gap, facing, drive, valid, rows, row, whole, window, pose, grids, time,
+    position, thickness, gap, facing, drive, valid, places, row, whole, window, pose, grids, time,
     KIND: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Constraints of the places near one obstacle in ``total``: gap, normal, velocity, and whether each counts.
-
-    ``first`` has the row of each place, -1 for none; ``position`` is that of the row, and ``thickness`` that of the
-    place.
-    """
+    """Constraints of all places with one obstacle in ``total``: gap, normal, velocity, and whether it acts."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mine = tl.load(first + k, k < rows, -1)
-    mask = mine >= 0
-    at = position + mine * 3
+    mask = k < places
+    at = position + k * 3
     x = (tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0))
     distance, normal, own = touch(x, row, whole, pose, grids, mask, KIND, MOVES)
-    half = 0.5 * tl.load(thickness + tl.load(place + mine, mask, 0), mask, 0.0)
-    on = tl.where(acts(window, tl.load(time)), 1.0, 0.0)
-    tl.store(gap + k, distance - half, mask)
-    tl.store(valid + k, tl.where(mask, on, 0.0), k < rows)
+    tl.store(gap + k, distance - 0.5 * tl.load(thickness + k, mask, 0.0), mask)
+    tl.store(valid + k, tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance), mask)
     for c in tl.static_range(3):
         tl.store(facing + k * 3 + c, normal[c], mask)
         tl.store(drive + k * 3 + c, own[c], mask)

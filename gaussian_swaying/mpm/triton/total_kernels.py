@@ -211,6 +211,30 @@ def total_pieces(pieces_in, partial, first_piece, cells, pieces, WIDTH: tl.const
     tl.store(partial + out[:, None] + column, total, mask[:, None])
 
 
+@triton.jit
+def _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr):
+    """Stop the held nodes and count what that takes, write the velocities, and move the nodes."""
+    if HELD:
+        free = tl.load(held + k, mask, 0) == 0
+        stopped = mask & (free == 0)
+        mass = 1.0 / tl.where(stopped, inverse, 1.0)
+        to = taken + k * 4
+        tl.store(to, tl.load(to, stopped, 0.0) + mass * v0, stopped)
+        tl.store(to + 1, tl.load(to + 1, stopped, 0.0) + mass * v1, stopped)
+        tl.store(to + 2, tl.load(to + 2, stopped, 0.0) + mass * v2, stopped)
+        v0 = tl.where(free, v0, 0.0)
+        v1 = tl.where(free, v1, 0.0)
+        v2 = tl.where(free, v2, 0.0)
+    to = fields + node * 8
+    tl.store(to + 4, v0, mask)
+    tl.store(to + 5, v1, mask)
+    tl.store(to + 6, v2, mask)
+    if MOVE:
+        tl.store(to, tl.load(to, mask, 0.0) + dt * v0, mask)
+        tl.store(to + 1, tl.load(to + 1, mask, 0.0) + dt * v1, mask)
+        tl.store(to + 2, tl.load(to + 2, mask, 0.0) + dt * v2, mask)
+
+
 @triton.jit(do_not_specialize=VARIES)
 def total_nodes(
     active, source, sources, inverse_mass, held, nodes, partial, fields, shift,
@@ -250,30 +274,30 @@ def total_nodes(
     v0 = (tl.load(place, mask, 0.0) + push * (f0 * inverse + gravity_x)) * decay
     v1 = (tl.load(place + 1, mask, 0.0) + push * (f1 * inverse + gravity_y)) * decay
     v2 = (tl.load(place + 2, mask, 0.0) + push * (f2 * inverse + gravity_z)) * decay
-    if HELD:
-        free = tl.load(held + k, mask, 0) == 0
-        stopped = mask & (free == 0)
-        mass = 1.0 / tl.where(stopped, inverse, 1.0)
-        to = taken + k * 4
-        tl.store(to, tl.load(to, stopped, 0.0) + mass * v0, stopped)
-        tl.store(to + 1, tl.load(to + 1, stopped, 0.0) + mass * v1, stopped)
-        tl.store(to + 2, tl.load(to + 2, stopped, 0.0) + mass * v2, stopped)
-        v0 = tl.where(free, v0, 0.0)
-        v1 = tl.where(free, v1, 0.0)
-        v2 = tl.where(free, v2, 0.0)
-    tl.store(place, v0, mask)
-    tl.store(place + 1, v1, mask)
-    tl.store(place + 2, v2, mask)
-    if MOVE:
-        to = fields + node * 8
-        tl.store(to, tl.load(to, mask, 0.0) + dt * v0, mask)
-        tl.store(to + 1, tl.load(to + 1, mask, 0.0) + dt * v1, mask)
-        tl.store(to + 2, tl.load(to + 2, mask, 0.0) + dt * v2, mask)
+    _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD, MOVE)
     if POSITION:
         out = shift + node * 4
         tl.store(out, m0 * inverse, mask)
         tl.store(out + 1, m1 * inverse, mask)
         tl.store(out + 2, m2 * inverse, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def total_end(
+    active, inverse_mass, held, nodes, fields, schedule, first_step, step_offset, taken,
+    HELD: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """``total``: the end of a substep after contact, which comes between ``total_nodes`` and it."""
+    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = k < nodes
+    node = tl.load(active + k, mask, 0)
+    inverse = tl.load(inverse_mass + k, mask, 0.0)
+    place = fields + node * 8 + 4
+    v0 = tl.load(place, mask, 0.0)
+    v1 = tl.load(place + 1, mask, 0.0)
+    v2 = tl.load(place + 2, mask, 0.0)
+    _end(node, k, mask, v0, v1, v2, inverse, held, taken, fields, dt, HELD, True)
 
 
 @triton.jit(do_not_specialize=VARIES)

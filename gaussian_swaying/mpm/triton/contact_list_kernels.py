@@ -1,0 +1,328 @@
+"""Kernel that lists which places of a surface are close, without the host; it does nothing while the lists are good.
+
+The programs of a kernel here run all at once and wait for each other (:func:`meet`), so a substep needs few launches.
+Places are sorted by the cells of a grid that is stored as a hash table, and each looks at the 27 cells around it. Sums
+and lists have the same order in every run: the counts are atomic, but each cell is sorted afterwards.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.geometry.linalg_triton import load3
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight
+
+CHANGES = (*VARIES, "places", "room", "slots", "touched_nodes", "last", "chunk", "iterations")
+
+MOST_PROGRAMS = tl.constexpr(1024)
+"""Most programs that meet; a row of ``peak`` has as many entries."""
+
+LISTED, NEEDED_ROOM, NEEDED_SLOTS, MADE, ROUNDS, ACTING = (tl.constexpr(k) for k in range(6))
+"""Entries of ``status``: candidates of all places; room that is needed for the candidates of a place, and for its
+constraints; how often lists were made; iterations of all substeps; constraints of this substep."""
+
+
+@triton.jit
+def meet(gate, programs):
+    """Wait until all programs are here, and see what they wrote.
+
+    Each adds one and the first one adds what is missing to 2^31, so that the sign changes when all have come.
+    """
+    tl.debug_barrier()
+    if programs > 1:
+        mine = tl.where(tl.program_id(0) == 0, 2147483647 - (programs - 2), 1)
+        before = tl.atomic_add(gate, mine, sem="release", scope="gpu")
+        now = before
+        while (before ^ now) >= 0:
+            now = tl.atomic_add(gate, 0, sem="acquire", scope="gpu")
+        tl.debug_barrier()
+
+
+@triton.jit
+def largest_of(peak, programs):
+    """The largest of the entries that the programs wrote."""
+    o = tl.arange(0, MOST_PROGRAMS)
+    return tl.max(tl.load(peak + o, o < programs, 0.0))
+
+
+@triton.jit
+def interpolate(
+    field, base, fraction, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Four columns of the nodes at places, and their derivatives along the axes [1/m], of shape (BLOCK, 4) each.
+
+    As ``total_kernels.gather``, but a row of four columns is one load.
+    """
+    column = tl.arange(0, 4)[None, :]
+    f = load3(fraction, places, p, mask)
+    node = tl.load(base + p, mask, 0)
+    wz, gz = axis_weights(f[2], inverse_dx)
+    value = tl.zeros([BLOCK, 4], tl.float32)
+    d0, d1, d2 = value, value, value
+    for i in range(3):
+        wx, gx = node_weight(f[0], i, inverse_dx)
+        for j in range(3):
+            wy, gy = node_weight(f[1], j, inverse_dx)
+            at = field + (node + i * sx + j * sy)[:, None] * 8 + column
+            s = tl.zeros([BLOCK, 4], tl.float32)
+            t = s
+            for k in tl.static_range(3):
+                q = tl.load(at + k * 8, mask[:, None], 0.0)
+                s += wz[k][:, None] * q
+                if DERIVATIVES:
+                    t += gz[k][:, None] * q
+            w = (wx * wy)[:, None]
+            value += w * s
+            if DERIVATIVES:
+                d0 += (gx * wy)[:, None] * s
+                d1 += (wx * gy)[:, None] * s
+                d2 += w * t
+    return value, d0, d1, d2
+
+
+@triton.jit
+def three(x):
+    """The first three columns of a tile of four."""
+    column = tl.arange(0, 4)[None, :]
+    return (
+        tl.sum(tl.where(column == 0, x, 0.0), 1),
+        tl.sum(tl.where(column == 1, x, 0.0), 1),
+        tl.sum(tl.where(column == 2, x, 0.0), 1),
+    )
+
+
+@triton.jit
+def place_now(
+    fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Where places are now, and the derivatives of the displacement there, along each axis."""
+    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, True, BLOCK)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    x = load3(rest, places, p, mask)
+    u0, u1, u2 = three(u)
+    return (x[0] + u0, x[1] + u1, x[2] + u2), three(d0), three(d1), three(d2)
+
+
+@triton.jit
+def _cell(x, inverse_size):
+    return tl.floor(x * inverse_size).to(tl.int32)
+
+
+@triton.jit
+def _bucket(x, y, z, last):
+    """Where a cell of the grid is in a table of ``last + 1`` entries, a power of two."""
+    return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & last
+
+
+@triton.jit
+def _own_bucket(position, p, mask, inverse_size, last):
+    x = _cell(tl.load(position + p * 4, mask, 0.0), inverse_size)
+    y = _cell(tl.load(position + p * 4 + 1, mask, 0.0), inverse_size)
+    z = _cell(tl.load(position + p * 4 + 2, mask, 0.0), inverse_size)
+    return x, y, z, _bucket(x, y, z, last)
+
+
+@triton.jit
+def _sort_places(
+    position, counts, start, rank, item, ordered, sorted_, places, sums, gate, inverse_size, last, chunk,
+    programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+):  # fmt: skip
+    """Sort the places by cell, and those of a cell by their number; ``chunk`` cells to a program."""
+    pid = tl.program_id(0)
+    lane = tl.arange(0, BLOCK)
+    for first in range(pid * BLOCK, places, programs * BLOCK):
+        p = first + lane
+        mask = p < places
+        _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
+        tl.store(rank + p, tl.atomic_add(counts + bucket, 1, mask), mask)
+    meet(gate, programs)
+    own = tl.zeros([BLOCK], tl.int32)
+    for first in range(0, chunk, BLOCK):
+        b = pid * chunk + first + lane
+        own += tl.load(counts + b, b <= last, 0)
+    tl.store(sums + pid, tl.sum(own))
+    meet(gate, programs)
+    o = tl.arange(0, MOST_PROGRAMS)
+    before = tl.sum(tl.load(sums + o, o < pid, 0))
+    for first in range(0, chunk, BLOCK):
+        b = pid * chunk + first + lane
+        many = tl.load(counts + b, b <= last, 0)
+        tl.store(start + b, before + tl.cumsum(many, 0) - many, b <= last)
+        before += tl.sum(many)
+    meet(gate, programs)
+    for first in range(pid * BLOCK, places, programs * BLOCK):
+        p = first + lane
+        mask = p < places
+        _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
+        tl.store(item + tl.load(start + bucket, mask, 0) + tl.load(rank + p, mask, 0), p, mask)
+    meet(gate, programs)
+    wide = tl.arange(0, WIDE)[None, :]
+    for first in range(pid * BLOCK, places, programs * BLOCK):
+        p = first + lane
+        mask = p < places
+        _x, _y, _z, bucket = _own_bucket(position, p, mask, inverse_size, last)
+        begin = tl.load(start + bucket, mask, 0)
+        many = tl.load(start + bucket + 1, mask, 0) - begin
+        smaller = tl.zeros([BLOCK], tl.int32)
+        for k in range(0, tl.max(many), WIDE):
+            known = (k + wide) < many[:, None]
+            q = tl.load(item + begin[:, None] + k + wide, known, 0)
+            smaller += tl.sum((known & (q < p[:, None])).to(tl.int32), 1)
+        to = begin + smaller
+        tl.store(ordered + to, p, mask)
+        for c in tl.static_range(3):
+            tl.store(sorted_ + to * 4 + c, tl.load(position + p * 4 + c, mask, 0.0), mask)
+    meet(gate, programs)
+
+
+@triton.jit
+def _search(
+    position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, inverse_size, last,
+    programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+):  # fmt: skip
+    """The places closer than ``limit`` to each that were at least ``apart`` from it at rest."""
+    lane = tl.arange(0, BLOCK)
+    wide = tl.arange(0, WIDE)[None, :]
+    for first in range(tl.program_id(0) * BLOCK, places, programs * BLOCK):
+        p = first + lane
+        mask = p < places
+        x, y, z, _b = _own_bucket(position, p, mask, inverse_size, last)
+        p0 = tl.load(position + p * 4, mask, 0.0)[:, None]
+        p1 = tl.load(position + p * 4 + 1, mask, 0.0)[:, None]
+        p2 = tl.load(position + p * 4 + 2, mask, 0.0)[:, None]
+        r = load3(rest, places, p, mask)
+        found = tl.zeros([BLOCK], tl.int32)
+        for column in range(9):
+            cx = x + column // 3 - 1
+            cy = y + column % 3 - 1
+            below = _bucket(cx, cy, z - 1, last)
+            level = _bucket(cx, cy, z, last)
+            above = _bucket(cx, cy, z + 1, last)
+            s0 = tl.load(start + below, mask, 0)
+            s1 = tl.load(start + level, mask, 0)
+            s2 = tl.load(start + above, mask, 0)
+            l0 = tl.load(start + below + 1, mask, 0) - s0
+            l1 = tl.load(start + level + 1, mask, 0) - s1 + l0
+            l2 = tl.load(start + above + 1, mask, 0) - s2 + l1
+            for k in range(0, tl.max(l2), WIDE):
+                e = k + wide
+                known = e < l2[:, None]
+                in0 = e < l0[:, None]
+                in1 = e < l1[:, None]
+                at = tl.where(in0, s0[:, None] + e, tl.where(in1, (s1 - l0)[:, None] + e, (s2 - l1)[:, None] + e))
+                q0 = tl.load(sorted_ + at * 4, known, 0.0)
+                q1 = tl.load(sorted_ + at * 4 + 1, known, 0.0)
+                q2 = tl.load(sorted_ + at * 4 + 2, known, 0.0)
+                # other cells may share the entry of the table
+                cz = z[:, None] + tl.where(in0, -1, tl.where(in1, 0, 1))
+                known = known & (_cell(q0, inverse_size) == cx[:, None]) & (_cell(q1, inverse_size) == cy[:, None])
+                known = known & (_cell(q2, inverse_size) == cz)
+                q0 -= p0
+                q1 -= p1
+                q2 -= p2
+                known = known & (q0 * q0 + q1 * q1 + q2 * q2 < limit * limit)
+                q = tl.load(ordered + at, known, 0)
+                q0 = tl.load(rest + q, known, 0.0) - r[0][:, None]
+                q1 = tl.load(rest + places + q, known, 0.0) - r[1][:, None]
+                q2 = tl.load(rest + 2 * places + q, known, 0.0) - r[2][:, None]
+                known = known & (q != p[:, None]) & (q0 * q0 + q1 * q1 + q2 * q2 >= apart * apart)
+                hit = known.to(tl.int32)
+                to = found[:, None] + tl.cumsum(hit, 1) - hit
+                tl.store(candidates + p[:, None] * room + to, q, known & (to < room))
+                found += tl.sum(hit, 1)
+        tl.store(near + p, tl.minimum(found, room), mask)
+        found = tl.where(mask, found, 0)
+        tl.atomic_max(status + NEEDED_ROOM, tl.max(found))
+        tl.atomic_add(status + LISTED, tl.sum(found))
+
+
+@triton.jit(do_not_specialize=CHANGES)
+def contact_lists(
+    active, before, nodes, fields, base, fraction, arm, rest, places,
+    position, counts, start, rank, item, ordered, sorted_, candidates, near, room, many, impulse,
+    entry_start, entry_place, reached, touched_nodes, peak, sums, gate, status, margin,
+    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, stretch, ahead, last, chunk,
+    ARMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr, TALL: tl.constexpr,
+):  # fmt: skip
+    """Make the lists again if a node may have moved too far since they were made.
+
+    Places that come close in this substep must be listed. No place moves farther than ``stretch`` times the node that
+    moves farthest, so lists of places closer than the reach of a contact and a margin are complete while twice that,
+    with the motion of this substep, is less than the margin.
+    """
+    dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
+    pid = tl.program_id(0)
+    programs = tl.num_programs(0)
+    lane = tl.arange(0, BLOCK)
+    moved = tl.zeros([BLOCK], tl.float32)
+    fast = tl.zeros([BLOCK], tl.float32)
+    for first in range(pid * BLOCK, nodes, programs * BLOCK):
+        k = first + lane
+        mask = k < nodes
+        at = fields + tl.load(active + k, mask, 0) * 8
+        far = tl.zeros([BLOCK], tl.float32)
+        speed = tl.zeros([BLOCK], tl.float32)
+        for c in tl.static_range(3):
+            u = tl.load(at + c, mask, 0.0) - tl.load(before + k * 4 + c, mask, 0.0)
+            v = tl.load(at + 4 + c, mask, 0.0)
+            far += u * u
+            speed += v * v
+        speed = dt * tl.sqrt(speed)
+        moved = tl.maximum(moved, tl.sqrt(far) + speed)
+        fast = tl.maximum(fast, speed)
+    tl.store(peak + pid, tl.max(moved))
+    tl.store(peak + MOST_PROGRAMS + pid, tl.max(fast))
+    known = tl.load(margin)
+    meet(gate, programs)
+    farthest = largest_of(peak, programs)
+    if (2 * stretch * farthest + slack > known) & (farthest < 1e9):  # a run that diverges keeps its lists
+        step = 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)
+        wider = slack + tl.maximum(least, tl.minimum(ahead * step, tl.maximum(reach, 2 * step)))
+        if pid == 0:
+            tl.store(margin, wider)
+            tl.store(status + LISTED, 0)
+            tl.store(status + MADE, tl.load(status + MADE) + 1)
+        for first in range(pid * BLOCK, nodes, programs * BLOCK):
+            k = first + lane
+            mask = k < nodes
+            at = fields + tl.load(active + k, mask, 0) * 8
+            for c in tl.static_range(3):
+                tl.store(before + k * 4 + c, tl.load(at + c, mask, 0.0), mask)
+        for first in range(pid * BLOCK, last + 1, programs * BLOCK):
+            tl.store(counts + first + lane, tl.zeros([BLOCK], tl.int32), first + lane <= last)
+        for first in range(pid * BLOCK, places, programs * BLOCK):
+            p = first + lane
+            mask = p < places
+            x, _a, _b, _c = place_now(
+                fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+            )
+            tl.store(many + p, tl.zeros([BLOCK], tl.int32), mask)
+            for c in tl.static_range(3):
+                tl.store(position + p * 4 + c, x[c], mask)
+            for c in tl.static_range(8):
+                tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
+        meet(gate, programs)
+        limit = reach + wider
+        _sort_places(
+            position, counts, start, rank, item, ordered, sorted_, places, sums, gate, 1 / limit, last, chunk,
+            programs, BLOCK, WIDE,
+        )  # fmt: skip
+        _search(
+            position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, 1 / limit,
+            last, programs, BLOCK, WIDE,
+        )  # fmt: skip
+        meet(gate, programs)
+        tall = tl.arange(0, TALL)
+        entry = tl.arange(0, 32)[None, :]
+        for first in range(pid * TALL, touched_nodes, programs * TALL):
+            n = first + tall
+            mask = n < touched_nodes
+            begin = tl.load(entry_start + n, mask, 0)
+            length = tl.load(entry_start + n + 1, mask, 0) - begin
+            found = tl.zeros([TALL], tl.int32)
+            for k in range(0, tl.max(length), 32):
+                real = (k + entry) < length[:, None]
+                q = tl.load(entry_place + begin[:, None] + k + entry, real, 0)
+                found += tl.sum(tl.load(near + q, real, 0), 1)
+            tl.store(reached + n, found, mask)
