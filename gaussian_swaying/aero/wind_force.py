@@ -248,6 +248,7 @@ class WindForce(Force):
     def twin(self) -> ForceTwin:
         """See ``Force.twin``."""
         from gaussian_swaying.aero.effects_triton import shaped_wind_force, shaped_wind_on_groups
+        from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint
         from gaussian_swaying.aero.force_triton import wind_force, wind_on_groups
 
         aero = self.aero
@@ -283,6 +284,7 @@ class WindForce(Force):
             numbers=numbers,
             vectors=self.winds if self.uniform else self._vectors,
             space=space,
+            adjoint=wind_force_adjoint if self.uniform and not implicit else None,
         )
 
     def _packed(self) -> tuple[tuple[int, ...], Tensor]:

@@ -27,6 +27,7 @@ from gaussian_swaying.mpm.timestep import kick_time, look_marks, substeps_per_fr
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.triton.fused import Fused
+    from gaussian_swaying.mpm.triton.total_adjoint import TotalAdjoint
 
 WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
@@ -114,6 +115,8 @@ class MPMSolver(nn.Module):
         self._bound: Formulation | None = None
         self._fused: Fused | None = None
         self._fused_obstacle: str | None = None
+        self._adjoint: TotalAdjoint | None = None
+        self._missing = ""
 
     # ---- settings
 
@@ -189,7 +192,7 @@ class MPMSolver(nn.Module):
 
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         """Bind the material and compute everything that stays constant."""
-        self._bound = self._fused = None
+        self._bound = self._fused = self._adjoint = None
         bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
         self._fused_obstacle = self._why_not_fused(bound)
         self._bound = bound
@@ -226,12 +229,19 @@ class MPMSolver(nn.Module):
         """
         if self._fused_obstacle is not None:
             return None
-        bound = self.bound
-        asking = (*bound.body.tensors(), *tensors) if torch.is_grad_enabled() else ()
-        if any(t is not None and t.requires_grad for t in asking):
+        if self._wanted(*tensors):
             if self.transfer == "triton":
-                raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
+                raise ValueError(f"`transfer: triton` has no such gradients{self._missing}: set it to auto or torch.")
             return None
+        return self._kernels()
+
+    def _wanted(self, *tensors: Tensor | None) -> bool:
+        """Whether a gradient is wanted by the body or by one of some tensors."""
+        asking = (*self.bound.body.tensors(), *tensors) if torch.is_grad_enabled() else ()
+        return any(t is not None and t.requires_grad for t in asking)
+
+    def _kernels(self) -> Fused:
+        bound = self.bound
         if self._fused is None or not self._fused.holds():
             twin = bound.twin()
             assert twin is not None
@@ -239,6 +249,24 @@ class MPMSolver(nn.Module):
             with torch.inference_mode(False), torch.no_grad():
                 self._fused = twin(bound)
         return self._fused
+
+    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> TotalAdjoint | None:
+        """The backward pass in kernels, if a gradient through a rollout is wanted and they can compute it."""
+        if self._fused_obstacle is not None or self.formulation != "total":
+            return None
+        if not self._wanted(*state.tensors(), *tensors_of(forces)):
+            return None
+        from gaussian_swaying.mpm.triton import total_adjoint
+
+        fused = self._kernels()
+        why = total_adjoint.why_not(fused, state, forces)
+        self._missing = "" if why is None else f" ({why})"
+        if why is not None:
+            return None
+        if self._adjoint is None or self._adjoint.fused is not fused:
+            with torch.inference_mode(False), torch.no_grad():
+                self._adjoint = total_adjoint.TotalAdjoint(fused)
+        return self._adjoint
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
         """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
@@ -435,6 +463,9 @@ class MPMSolver(nn.Module):
             The state ``steps * dt`` later.
         """
         acting = as_forces(forces)
+        adjoint = self._adjoint_for(state, acting)
+        if adjoint is not None:
+            return adjoint.rollout(state, dt, steps, acting, checkpoint, watch)
         fused = self._fused_for(state, acting)
         if fused is not None:
             return fused.rollout(state, dt, steps, acting, watch=watch)[0]

@@ -177,20 +177,9 @@ class Fused(ABC):
             self.speed.zero_()
             fused, self.asked = divide(forces)
             twin = None if fused is None else fused.twin()
-            self.space = self.numbers
-            if twin is not None:
-                self._take_values_of(twin)
-                self.space = self.numbers if twin.space is None else twin.space
-            options: dict[str, Any] = {
-                "LAWS": self.laws,
-                "MULTI": len(self.law_table) > 1,
-                "VISCOUS": self.settings.stiffness_damping > 0,
-                "TWIN": None if twin is None else twin.function,
-                "OPTIONS": None if twin is None else twin.options,
-                "SPACE": twin is not None and twin.space is not None,
-                "FORCE": len(self.asked) > 0 or force is not None or drag is not None,
-                "IMPLICIT": drag is not None or (twin is not None and twin.implicit) or self._resists(state),
-            }
+            options = self.options_for(twin)
+            options["FORCE"] = len(self.asked) > 0 or force is not None or drag is not None
+            options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)
             if options["FORCE"]:
                 if len(self.force_in) < self.count:  # needed for the first time
                     self.force_in = torch.zeros(self.count, 4, device=self.device)
@@ -206,6 +195,23 @@ class Fused(ABC):
                 if watch is not None:
                     watch(first + part)
             return state, self.speed[0] / self.settings.dx
+
+    def options_for(self, twin: ForceTwin | None) -> dict[str, Any]:
+        """Constants of the kernels of a substep with the twin of a force alone, whose values are copied."""
+        self.space = self.numbers
+        if twin is not None:
+            self._take_values_of(twin)
+            self.space = self.numbers if twin.space is None else twin.space
+        return {
+            "LAWS": self.laws,
+            "MULTI": len(self.law_table) > 1,
+            "VISCOUS": self.settings.stiffness_damping > 0,
+            "TWIN": None if twin is None else twin.function,
+            "OPTIONS": None if twin is None else twin.options,
+            "SPACE": twin is not None and twin.space is not None,
+            "FORCE": False,
+            "IMPLICIT": twin is not None and twin.implicit,
+        }
 
     def _advance(
         self,

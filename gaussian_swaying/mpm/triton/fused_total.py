@@ -98,7 +98,7 @@ class FusedTotal(Fused):
         fixed = self.settings.deterministic
         self.touching = None if bound.contact is None or fixed else FusedContact(bound, self.fields)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
-        self._partial: dict[tuple[int, int], Tensor] = {}
+        self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
 
@@ -141,11 +141,17 @@ class FusedTotal(Fused):
     def _take_values(self, values: Tensor) -> None:
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
-    def _sums(self, rows: int, width: int) -> Tensor:
+    def _sums(self, rows: int, width: int, use: str = "") -> Tensor:
         """Buffer for the sums of each cell or piece of a cell, with a row of zeros at the end."""
-        if (rows, width) not in self._partial:
-            self._partial[rows, width] = torch.zeros(27, rows + 1, width, device=self.device)
-        return self._partial[rows, width]
+        if (rows, width, use) not in self._partial:
+            self._partial[rows, width, use] = torch.zeros(27, rows + 1, width, device=self.device)
+        return self._partial[rows, width, use]
+
+    def join_pieces(self, pieces: Tensor, cells: Tensor, width: int) -> None:
+        """Add the sums of the pieces of each cell."""
+        kernels.total_pieces[(-(-self.cells // 8), 27)](
+            pieces, cells, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
+        )
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
         assert state.node_displacement is not None
@@ -210,9 +216,7 @@ class FusedTotal(Fused):
         )  # fmt: skip
         if self.pieces > self.cells:
             pieces, partial = partial, self._sums(self.cells, width)
-            kernels.total_pieces[(-(-self.cells // 8), 27)](
-                pieces, partial, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
-            )
+            self.join_pieces(pieces, partial, width)
         block = 64
         nodes = len(self.active)
         kernels.total_nodes[(-(-nodes // block),)](
