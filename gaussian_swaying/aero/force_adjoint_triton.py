@@ -17,10 +17,7 @@ def _sum3(s, a, t, b):
 def force_adjoint(
     r, n, a, drag, friction, lift, PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr
 ):  # fmt: skip
-    """Gradients of a . f by relative wind, normal and the three coefficients, f being the force per half density and area.
-
-    The last value is a . f.
-    """
+    """Gradients of a . f by relative wind, normal and coefficients, and a . f; f is per half density and area."""
     speed = tl.sqrt(dot3(r, r))
     inverse = 1.0 / tl.maximum(speed, 1e-30)
     square = speed * speed
@@ -94,9 +91,7 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
     drag = tl.load(numbers)
     friction = tl.load(numbers + 1)
     lift = tl.load(numbers + 2)
-    by_r, by_n, parts, whole = force_adjoint(
-        relative, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
-    )
+    by_r, by_n, parts, whole = force_adjoint(relative, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2])
     half = tl.load(numbers + 3) * patch[3]
     area = half * tl.minimum(size, widest)
     # the unit normal and the area both come from the area vector

@@ -23,11 +23,10 @@ from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.recompute import recompute
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.mpm.timestep import kick_time, look_marks, substeps_per_frame
+from gaussian_swaying.mpm.timestep import look_marks, substeps_per_frame, work_done
 
 if TYPE_CHECKING:
-    from gaussian_swaying.mpm.triton.fused import Fused
-    from gaussian_swaying.mpm.triton.total_adjoint import TotalAdjoint
+    from gaussian_swaying.mpm.triton.fused import Adjoint, Fused
 
 WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
@@ -59,9 +58,9 @@ class MPMSolver(nn.Module):
         deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
             order is always fixed. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order, impulses first.
-        transfer: How substeps are computed. ``torch`` is the reference and works on any device and with gradients;
-            ``triton`` runs a whole substep in two kernels on a CUDA device, in float32 and without gradients; ``auto``
-            uses triton where possible.
+        transfer: How substeps are computed. ``torch`` is the reference and works on any device and with all gradients;
+            ``triton`` runs a whole substep in two kernels on a CUDA device, in float32, with gradients in ``total`` by
+            the first state, stiffness, mass, wind and coefficients; ``auto`` uses triton where possible.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -115,8 +114,7 @@ class MPMSolver(nn.Module):
         self._bound: Formulation | None = None
         self._fused: Fused | None = None
         self._fused_obstacle: str | None = None
-        self._adjoint: TotalAdjoint | None = None
-        self._missing = ""
+        self._missing = ""  # why a gradient needs torch
 
     # ---- settings
 
@@ -192,7 +190,7 @@ class MPMSolver(nn.Module):
 
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
         """Bind the material and compute everything that stays constant."""
-        self._bound = self._fused = self._adjoint = None
+        self._bound = self._fused = None
         bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
         self._fused_obstacle = self._why_not_fused(bound)
         self._bound = bound
@@ -250,23 +248,12 @@ class MPMSolver(nn.Module):
                 self._fused = twin(bound)
         return self._fused
 
-    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> TotalAdjoint | None:
+    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Adjoint | None:
         """The backward pass in kernels, if a gradient through a rollout is wanted and they can compute it."""
-        if self._fused_obstacle is not None or self.formulation != "total":
+        if self._fused_obstacle is not None or not self._wanted(*state.tensors(), *tensors_of(forces)):
             return None
-        if not self._wanted(*state.tensors(), *tensors_of(forces)):
-            return None
-        from gaussian_swaying.mpm.triton import total_adjoint
-
-        fused = self._kernels()
-        why = total_adjoint.why_not(fused, state, forces)
-        self._missing = "" if why is None else f" ({why})"
-        if why is not None:
-            return None
-        if self._adjoint is None or self._adjoint.fused is not fused:
-            with torch.inference_mode(False), torch.no_grad():
-                self._adjoint = total_adjoint.TotalAdjoint(fused)
-        return self._adjoint
+        adjoint, self._missing = self._kernels().adjoint(state, forces)
+        return adjoint
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
         """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
@@ -417,18 +404,7 @@ class MPMSolver(nn.Module):
         if fused is not None:
             return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
         after = self.bound.step(state, dt, force, drag)
-        return after if force is None else after.replace(work=self._work(state, after, dt, force, drag))
-
-    @torch.no_grad()
-    def _work(self, state: MPMState, after: MPMState, dt: float, force: Tensor, drag: Tensor | None) -> Tensor:
-        """Work of the external force up to the end of a substep [J].
-
-        It is computed at the mean velocity, which gives exactly what the step adds to the kinetic energy.
-        """
-        if drag is not None:
-            force = force - drag[..., None] * (after.velocity - state.velocity)
-        power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum(-1)
-        return state.work + (0.5 * kick_time(state, dt)) * power
+        return after if force is None else after.replace(work=work_done(state, after, dt, force, drag))
 
     def rollout(
         self,
@@ -454,8 +430,8 @@ class MPMSolver(nn.Module):
                 resistance [kg/s], shape (..., P) (``drag`` in :meth:`step`).
             checkpoint: For gradients through long rollouts: keep one state per this many substeps and recompute the
                 others in the backward pass; a value near the square root of ``steps`` needs the least memory. 0 keeps
-                everything. With checkpoints, forces must return the same values each time they are called with the same
-                state.
+                everything in torch, and lets the kernels choose. With checkpoints, forces must return the same values
+                each time they are called with the same state.
             watch: Called from time to time with the number of substeps that are done, or queued on a GPU; not with
                 ``checkpoint``.
 

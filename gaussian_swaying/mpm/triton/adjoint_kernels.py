@@ -159,14 +159,10 @@ def nodes_adjoint(
 ):  # fmt: skip
     """Gradients by the nodal fields, and by the forces of the substep before.
 
-    Args:
-        SUM: Add the sums of the particles of the later substep.
-        PUSH: Go back through the new displacement, which ends a substep.
-        FINISH: Go back through pins, damping and the new velocity, and put the state at the start of the substep into
-            ``fields``, for the particles.
-        VELOCITY: Whether the sums of the particles have a part for the velocity.
-        HELD: Whether pins hold nodes.
-        MASS: Add the gradient by the inverse mass to ``mass_bar``.
+    SUM adds the sums of the particles of the later substep, whose part for the velocity exists with VELOCITY. PUSH goes
+    back through the new displacement, which ends a substep. FINISH goes back through pins (HELD), damping and the new
+    velocity, and puts the state at the start of the substep into ``fields``, for the particles. MASS adds the gradient
+    by the inverse mass to ``mass_bar``.
     """
     step = tl.load(last) - tl.load(first_step) - step_offset
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -65,6 +65,21 @@ class Part:
     loaded: bool
     begin: Callable[[int], None]
     key: tuple[object, ...] | None
+
+
+class Adjoint(Protocol):
+    """A rollout whose gradients are computed by kernels."""
+
+    def rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        forces: Sequence[Force],
+        checkpoint: int,
+        watch: Callable[[int], None] | None,
+    ) -> MPMState:
+        """As ``MPMSolver.rollout``."""
 
 
 class Fused(ABC):
@@ -134,6 +149,10 @@ class Fused(ABC):
                 return f"the law {type(law).__name__} has no Triton twin"
         return None
 
+    def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
+        """The rollouts with gradients in kernels; or None, and why they need torch in brackets."""
+        return None, ""
+
     @property
     def recordable(self) -> bool:
         """Whether substeps can be recorded in a CUDA graph."""
@@ -173,7 +192,7 @@ class Fused(ABC):
         Returns:
             The state, and the most cells that a wave crosses per second at any of the ``looks`` [1/s] (zero without).
         """
-        with _at_home(self.speed):
+        with at_home(self.speed):
             self.speed.zero_()
             fused, self.asked = divide(forces)
             twin = None if fused is None else fused.twin()
@@ -350,7 +369,7 @@ class Fused(ABC):
 
 
 @contextmanager
-def _at_home(buffer: Tensor) -> Iterator[None]:
+def at_home(buffer: Tensor) -> Iterator[None]:
     """Launch Triton on the device of a buffer, and create ordinary tensors, which can be written in any mode."""
     with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
         yield

@@ -16,14 +16,12 @@ import triton
 from torch import Tensor
 
 from gaussian_swaying.mpm.forces import Force, ForceTwin, tensors_of
-from gaussian_swaying.mpm.formulations.formulation import Formulation
-from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import Stencil, gather, scatter
 from gaussian_swaying.mpm.triton import adjoint_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import MAX_STEPS, _at_home
-from gaussian_swaying.mpm.triton.fused_total import _REGISTERS, FusedTotal
+from gaussian_swaying.mpm.triton.fused import MAX_STEPS, at_home
+from gaussian_swaying.mpm.triton.fused_total import REGISTERS, FusedTotal
 
 Watch = Callable[[int], None] | None
 
@@ -115,7 +113,7 @@ class TotalAdjoint:
         vectors = numbers = None
         if forces:
             twin = forces[0].twin()
-            vectors, numbers = twin.vectors(state.time, dt, steps), twin.numbers()
+            vectors, numbers = twin.vectors(state.time, torch.full_like(state.time, dt), steps), twin.numbers()
         laws, points = bound.body.laws, bound.body.points
         displacement, velocity = _Rollout.apply(
             self, run, state.node_displacement, state.node_velocity, laws.mu, laws.lam, points.volume,
@@ -159,7 +157,7 @@ class TotalAdjoint:
         needs: dict[str, bool],
     ) -> dict[str, Tensor]:
         """Gradients by the inputs of :class:`_Rollout`, by name, from those by the nodal fields at the end."""
-        with _at_home(self.bars):
+        with at_home(self.bars):
             return self._backward(run, displacement, velocity, vectors, numbers, needs)
 
     def _backward(
@@ -316,7 +314,7 @@ class TotalAdjoint:
             LAWS=fused.laws, MULTI=options["MULTI"], ADJOINT=None if twin is None else twin.adjoint,
             OPTIONS=options["OPTIONS"], VISCOUS=options["VISCOUS"], MATERIAL=flags["MATERIAL"],
             SHARES=flags["SHARES"], WIDTH=width, CELLS=per_program, LANES=fused.lanes, num_warps=1,
-            **_REGISTERS.get(fused.lanes, {}),
+            **REGISTERS.get(fused.lanes, {}),
         )  # fmt: skip
         if cut:
             fused.join_pieces(to, partial, width)
@@ -442,8 +440,3 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
 def _own(tensor: Tensor, nodal: tuple[Tensor | None, ...]) -> bool:
     """Whether a field of particles is a leaf that requires a gradient."""
     return tensor.requires_grad and tensor.is_leaf and not any(tensor is t for t in nodal)
-
-
-def supports(bound: Formulation) -> bool:
-    """Whether a formulation may have a backward pass here at all."""
-    return isinstance(bound, Total)

@@ -24,8 +24,8 @@ class LawTwin:
         flow: ``(a, mu, lam, internal, p, dt)``: principal stretches and internal variable after plastic flow.
         energy: ``(F, mu, lam)``: energy density.
         wave: ``(F, mu, lam)``: the first of ``ConstitutiveLaw.moduli``.
-        adjoint: ``(F, Q, mu, lam)``: the derivative of the stress P in a direction Q, which is also the gradient of Q : P
-            by F, and the derivatives of Q : P by mu and by lam.
+        adjoint: ``(F, Q, mu, lam)``: the derivative of the stress P in a direction Q, which is the gradient of Q : P by
+            F, and the derivatives of Q : P by mu and by lam.
 
     A law needs ``principal``, or ``kirchhoff`` and, if it does not flow, ``pk1``. If a body needs the decomposition
     anyway, all laws that have ``principal`` use it. Without ``energy``, ``wave`` and ``adjoint``, torch computes them.
