@@ -243,7 +243,7 @@ class Fused(ABC):
         looks: list[int],
     ) -> MPMState:
         """Run a part of a rollout whose schedule fits in the buffers."""
-        self.schedule[: steps + 2].copy_(self._table(kick_time(state, dt), dt, steps), non_blocking=True)
+        self.schedule[: steps + 2].copy_(self.table(kick_time(state, dt), dt, steps), non_blocking=True)
         self.time.copy_(state.time)
         self.dt.fill_(dt)
         loaded = twin is not None or options["FORCE"]
@@ -267,7 +267,7 @@ class Fused(ABC):
             changes["work"] = state.work + changes["work"]
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _table(self, kick: float, dt: float, steps: int) -> Tensor:
+    def table(self, kick: float, dt: float, steps: int) -> Tensor:
         """The schedule on the host, which can be copied without making it wait."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
         table = torch.empty(steps + 2, SCHEDULE, pin_memory=self.device.type == "cuda")

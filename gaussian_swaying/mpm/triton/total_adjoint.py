@@ -109,7 +109,7 @@ class TotalAdjoint:
         assert state.node_velocity is not None
         if steps == 0:
             return state
-        run = _Run(state, dt, steps, segment(steps, checkpoint), tuple(forces), watch)
+        run = _Run(state, dt, steps, segment(steps, checkpoint, self.nodes), tuple(forces), watch)
         vectors = numbers = None
         if forces:
             twin = forces[0].twin()
@@ -119,9 +119,10 @@ class TotalAdjoint:
             self, run, state.node_displacement, state.node_velocity, laws.mu, laws.lam, points.volume,
             bound.node_inverse_mass, vectors, numbers,
         )  # fmt: skip
-        assert run.end is not None
+        end, run.end = run.end, None
+        assert end is not None
         rows = _Gathered.apply(torch.cat([displacement, velocity], dim=-1), bound.stencil)
-        return bound.with_rows(run.end, displacement, velocity, rows)
+        return bound.with_rows(end, displacement, velocity, rows)
 
     def forward(self, run: _Run) -> tuple[Tensor, Tensor]:
         """Run all segments and keep the state at the start of each; the nodal fields at the end."""
@@ -195,7 +196,7 @@ class TotalAdjoint:
                 own = vectors[first : first + count]
                 own = own.reshape(count, -1, own.shape[-1]).expand(-1, fused.scenes, -1)
                 fused.vectors[:count, :, : own.shape[-1]].copy_(own)
-            fused.schedule[: count + 2].copy_(fused._table(run.kicks[n], run.dt, count))
+            fused.schedule[: count + 2].copy_(fused.table(run.kicks[n], run.dt, count), non_blocking=True)
             self._segment(run.starts[n], count, twin, options, flags, partial, width)
             if shares:
                 by_vector, by_numbers = self._shared(count)
@@ -324,17 +325,15 @@ class TotalAdjoint:
     def _shared(self, count: int) -> tuple[Tensor, Tensor]:
         """Gradients by the vectors of a segment (count, scenes, 3) and by the numbers (3,), summed over particles."""
         fused = self.fused
-        rows = self.shares[:count].double()
-        by_vector = torch.zeros(count, fused.scenes, 3, dtype=torch.float64, device=self.device)
+        rows = self.shares[:count]
         if fused.scenes == 1:
-            by_vector[:, 0] = rows[..., :3].sum(1)
+            total = rows.sum(1, keepdim=True, dtype=torch.float64)
         else:  # pieces are sorted by scene
-            border = torch.searchsorted(
-                fused.piece_scene, torch.arange(fused.scenes + 1, dtype=torch.int32, device=self.device)
-            )
-            total = torch.nn.functional.pad(rows[..., :3].cumsum(1), (0, 0, 1, 0))
-            by_vector = total[:, border[1:]] - total[:, border[:-1]]
-        return by_vector, rows[..., 4:7].sum((0, 1))
+            scenes = torch.arange(fused.scenes + 1, dtype=torch.int32, device=self.device)
+            border = torch.searchsorted(fused.piece_scene, scenes)
+            total = torch.nn.functional.pad(rows.cumsum(1, dtype=torch.float64), (0, 0, 1, 0))
+            total = total[:, border[1:]] - total[:, border[:-1]]
+        return total[..., :3], total[..., 4:7].sum((0, 1))
 
     def _found(
         self,
@@ -403,11 +402,15 @@ class _Gathered(torch.autograd.Function):
         return scatter(ctx.stencil, grad), None
 
 
-def segment(steps: int, checkpoint: int) -> int:
-    """Substeps of a segment: as asked for, else about the square root of all, a multiple of what a graph repeats."""
+def segment(steps: int, checkpoint: int, nodes: int) -> int:
+    """Substeps of a segment: as asked for, else about the square root of all, or more if they fit in 128 MiB.
+
+    It is a multiple of what a graph repeats.
+    """
     if checkpoint > 0:
         return min(checkpoint, MAX_STEPS, steps)
-    return min(max(16 * round(steps**0.5 / 16), 32), MAX_STEPS, steps)
+    fitting = min(2**22 // nodes, MAX_STEPS)  # 32 bytes for each node and substep
+    return min(16 * max(1, round(steps**0.5 / 16), fitting // 16), MAX_STEPS, steps)
 
 
 def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str | None:
