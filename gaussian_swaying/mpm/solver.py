@@ -114,7 +114,6 @@ class MPMSolver(nn.Module):
         self._bound: Formulation | None = None
         self._fused: Fused | None = None
         self._fused_obstacle: str | None = None
-        self._missing = ""  # why a gradient needs torch
 
     # ---- settings
 
@@ -192,24 +191,8 @@ class MPMSolver(nn.Module):
         """Bind the material and compute everything that stays constant."""
         self._bound = self._fused = None
         bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
-        self._fused_obstacle = self._why_not_fused(bound)
+        self._fused_obstacle = bound.why_not_kernels(self.transfer)
         self._bound = bound
-
-    def _why_not_fused(self, bound: Formulation) -> str | None:
-        """Why the Triton kernels cannot be used with this material; None if they can."""
-        if self.transfer == "torch":
-            return "`transfer` is torch"
-        try:
-            twin = bound.twin()
-        except ImportError as error:
-            obstacle: str | None = f"Triton cannot be imported ({error})"
-        else:
-            obstacle = f"the {bound.name} formulation has no kernels"
-            if twin is not None:
-                obstacle = twin.unsupported(bound, interpret=self.transfer == "triton")
-        if self.transfer == "triton" and obstacle is not None:
-            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
-        return obstacle
 
     @property
     def has_kernels(self) -> bool:
@@ -229,30 +212,33 @@ class MPMSolver(nn.Module):
             return None
         if self._wanted(*tensors):
             if self.transfer == "triton":
-                raise ValueError(f"`transfer: triton` has no such gradients{self._missing}: set it to auto or torch.")
+                raise ValueError("`transfer: triton` has no gradients here: set it to auto or torch.")
             return None
         return self._kernels()
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
         """Whether a gradient is wanted by the body or by one of some tensors."""
-        asking = (*self.bound.body.tensors(), *tensors) if torch.is_grad_enabled() else ()
-        return any(t is not None and t.requires_grad for t in asking)
+        asking = (*self.bound.body.tensors(), *tensors)
+        return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
 
     def _kernels(self) -> Fused:
-        bound = self.bound
         if self._fused is None or not self._fused.holds():
-            twin = bound.twin()
+            twin = self.bound.twin()
             assert twin is not None
             # ordinary tensors, which can be written inside and outside inference mode
             with torch.inference_mode(False), torch.no_grad():
-                self._fused = twin(bound)
+                self._fused = twin(self.bound)
         return self._fused
 
     def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Adjoint | None:
         """The backward pass in kernels, if a gradient through a rollout is wanted and they can compute it."""
-        if self._fused_obstacle is not None or not self._wanted(*state.tensors(), *tensors_of(forces)):
+        if self._fused_obstacle is not None or not torch.is_grad_enabled():
             return None
-        adjoint, self._missing = self._kernels().adjoint(state, forces)
+        if not self._wanted(*state.tensors(), *tensors_of(forces)):
+            return None
+        adjoint, why = self._kernels().adjoint(state, forces)
+        if adjoint is None and self.transfer == "triton":
+            raise ValueError(f"`transfer: triton` has no gradients here, because {why}: set it to auto or torch.")
         return adjoint
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
@@ -392,7 +378,7 @@ class MPMSolver(nn.Module):
         if drag is not None:
             check_shape("drag", drag, self.points.count)
         acting = as_forces(forces)
-        if acting and force is None and drag is None:
+        if force is None and drag is None:
             return self.rollout(state, dt, 1, acting)
         found = [split(part(state), part, state) for part in acting]
         force, drag = added([(force, drag), *found])

@@ -150,8 +150,8 @@ class Fused(ABC):
         return None
 
     def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
-        """The rollouts with gradients in kernels; or None, and why they need torch in brackets."""
-        return None, ""
+        """The rollouts with gradients in kernels; or None, and why they need torch."""
+        return None, "only the total formulation has backward kernels"
 
     @property
     def recordable(self) -> bool:
@@ -292,7 +292,7 @@ class Fused(ABC):
             self._take_values(values.expand(*self.body.points.mass.shape, values.shape[-1]).flatten(0, -2))
             if twin.table is not None:
                 table = twin.table()
-                if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `_repeat`
+                if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `repeat`
                     check_indices(TWIN_NUMBERS + len(table))
                     self.numbers = torch.zeros(TWIN_NUMBERS + len(table), device=self.device)
                 self.numbers[TWIN_NUMBERS : TWIN_NUMBERS + len(table)].copy_(table)
@@ -352,7 +352,7 @@ class Fused(ABC):
         work = self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
         return work.reshape(self.body.points.mass.shape[:-1])
 
-    def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
+    def repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
         """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.
 
         The first time a key is seen, the substeps run without a graph, which compiles what is not yet compiled; the

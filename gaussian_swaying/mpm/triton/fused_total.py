@@ -110,7 +110,7 @@ class FusedTotal(Fused):
 
         why = why_not(self, state, forces)
         if why is not None:
-            return None, f" ({why})"
+            return None, why
         if self._adjoint is None:
             with torch.inference_mode(False), torch.no_grad():
                 self._adjoint = TotalAdjoint(self)
@@ -155,7 +155,7 @@ class FusedTotal(Fused):
     def _take_values(self, values: Tensor) -> None:
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
-    def _sums(self, rows: int, width: int, use: str = "") -> Tensor:
+    def sums(self, rows: int, width: int, use: str = "") -> Tensor:
         """Buffer for the sums of each cell or piece of a cell, with a row of zeros at the end."""
         if (rows, width, use) not in self._partial:
             self._partial[rows, width, use] = torch.zeros(27, rows + 1, width, device=self.device)
@@ -200,7 +200,7 @@ class FusedTotal(Fused):
         if self.touching is not None:
             self.touching.look(self._look_at(), float(self.dt))
             key, steps = (*key, *self.touching.key), min(steps, self.touching.every)
-        self._repeat(steps, key, lambda offset: self._substep(offset, options))
+        self.repeat(steps, key, lambda offset: self.substep(offset, options))
         return steps
 
     def _look(self) -> None:
@@ -211,11 +211,12 @@ class FusedTotal(Fused):
             ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
-    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+    def substep(self, offset: int, options: dict[str, Any]) -> None:
+        """Launch one substep, ``offset`` after the first one."""
         if self.asked:
             self._push()
         width = 8 if self.position else 4
-        partial = self._sums(self.pieces, width)
+        partial = self.sums(self.pieces, width)
         _, ny, nz = self.grid.resolution
         per_program = max(1, 32 // self.lanes)
         kernels.total_particles[(-(-self.pieces // per_program),)](
@@ -229,7 +230,7 @@ class FusedTotal(Fused):
             **REGISTERS.get(self.lanes, {}),
         )  # fmt: skip
         if self.pieces > self.cells:
-            pieces, partial = partial, self._sums(self.cells, width)
+            pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
         block = 64
         nodes = len(self.active)

@@ -181,7 +181,7 @@ class TotalAdjoint:
         self.bars.view(nodes, 2, 4)[:, 0, :3] = displacement.reshape(-1, 3)[self.active].float()
         self.bars.view(nodes, 2, 4)[:, 1, :3] = velocity.reshape(-1, 3)[self.active].float()
         width = 8 if twin is not None or options["VISCOUS"] else 4
-        partial = self._sums(width)
+        partial = self.sums(width)
         for buffer in (self.force_bar, self.mass_bar, self.found, partial, fused.fields):
             buffer.zero_()
         material = any(needs[name] for name in ("mu", "lam", "volume"))
@@ -222,18 +222,18 @@ class TotalAdjoint:
 
         def again(offset: int) -> None:
             self._keep(offset)
-            fused._substep(offset, options)
+            fused.substep(offset, options)
 
         def back(offset: int) -> None:
             self._node_stages(offset, partial, width, options, flags)
             self._particles(offset, twin, options, flags, partial, width)
 
         key = (*options.values(), self.history.data_ptr(), self.shares.data_ptr())
-        fused._repeat(count, ("again", *key), again)
+        fused.repeat(count, ("again", *key), again)
         self._keep(0)
         self.last.fill_(count - 1)
         fused.first_step.zero_()
-        fused._repeat(count, ("back", *key, *flags.values()), back)
+        fused.repeat(count, ("back", *key, *flags.values()), back)
 
     def _make_room(self, every: int, loaded: bool) -> None:
         """Buffers for a segment; recorded graphs know their addresses."""
@@ -242,10 +242,10 @@ class TotalAdjoint:
         if loaded and len(self.shares) < every:
             self.shares = torch.zeros(every, self.fused.pieces, 8, device=self.device)
 
-    def _sums(self, width: int) -> Tensor:
+    def sums(self, width: int) -> Tensor:
         """The buffer that nodes sum over; that of the pieces, if cells are cut, is one of ``FusedTotal``."""
         rows = self.fused.cells
-        return self.fused._sums(rows, width, "adjoint")
+        return self.fused.sums(rows, width, "adjoint")
 
     def _keep(self, offset: int) -> None:
         fused, block = self.fused, 512
@@ -305,7 +305,7 @@ class TotalAdjoint:
         per_program = max(1, 32 // fused.lanes)
         _, ny, nz = fused.grid.resolution
         cut = fused.pieces > fused.cells
-        to = fused._sums(fused.pieces, width, "adjoint pieces") if cut else partial
+        to = fused.sums(fused.pieces, width, "adjoint pieces") if cut else partial
         kernels.particles_adjoint[(triton.cdiv(fused.pieces, per_program),)](
             fused.fraction, fused.material, fused.law, fused.law_table, fused.values, fused.count,
             fused.piece_start, fused.piece_node, fused.piece_scene, fused.pieces,
