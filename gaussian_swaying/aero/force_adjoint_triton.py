@@ -3,7 +3,8 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import cofactor_change, cross3, dot3
+from gaussian_swaying.aero.force_triton import add_direction, times
+from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, cross3, dot3, load3, matmul
 from gaussian_swaying.geometry.patches_triton import area_vector
 
 
@@ -108,3 +109,122 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
     by_wind = (area * by_r[0], area * by_r[1], area * by_r[2])
     by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
     return cofactor_change(F, outer), by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
+
+
+@triton.jit
+def _outer(a, b):
+    """A b^T in nine parts."""
+    return (
+        a[0] * b[0], a[0] * b[1], a[0] * b[2], a[1] * b[0], a[1] * b[1], a[1] * b[2],
+        a[2] * b[0], a[2] * b[1], a[2] * b[2],
+    )  # fmt: skip
+
+
+@triton.jit
+def _transposed(m, x):
+    """M^T x."""
+    return (
+        m[0] * x[0] + m[3] * x[1] + m[6] * x[2],
+        m[1] * x[0] + m[4] * x[1] + m[7] * x[2],
+        m[2] * x[0] + m[5] * x[1] + m[8] * x[2],
+    )
+
+
+@triton.jit
+def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.constexpr):
+    """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups`` without a unit tangent.
+
+    The names are those of ``aero.patches.grouped_force``; the sum over the sides that the patches show is constant.
+    """
+    first = 8 + 4 * place[0].to(tl.int32)
+    count = place[1].to(tl.int32)
+    real = count > 0
+    r = (tl.load(wind) - velocity[0], tl.load(wind + 1) - velocity[1], tl.load(wind + 2) - velocity[2])
+    drag = tl.load(numbers)
+    friction = tl.load(numbers + 1)
+    lift = tl.load(numbers + 2)
+    half = tl.load(numbers + 3)
+    widest = tl.load(numbers + 4)
+    speed = tl.sqrt(dot3(r, r))
+    inverse = 1.0 / tl.maximum(speed, 1e-30)
+    square = speed * speed
+    c = cofactor(F)
+    w = _transposed(c, r)
+    t0 = tl.load(numbers + first, real, 0.0)
+    t1 = tl.load(numbers + first + 1, real, 0.0)
+    t2 = tl.load(numbers + first + 2, real, 0.0)
+    t3 = tl.load(numbers + first + 3, real, 0.0)
+    t4 = tl.load(numbers + first + 4, real, 0.0)
+    t5 = tl.load(numbers + first + 5, real, 0.0)
+    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
+    rest = t0 + t3 + t5
+    zero = rest * 0
+    s = (zero, zero, zero)
+    u = (zero, zero, zero)
+    for k in range(0, tl.max(count), 4):  # four rows at once
+        row = first + 8 + 4 * k
+        b0 = load3(numbers, 1, row, k < count)
+        b1 = load3(numbers, 1, row + 4, k + 1 < count)
+        b2 = load3(numbers, 1, row + 8, k + 2 < count)
+        b3 = load3(numbers, 1, row + 12, k + 3 < count)
+        s, u = add_direction(s, u, b0, w, k < count, False)
+        s, u = add_direction(s, u, b1, w, k + 1 < count, False)
+        s, u = add_direction(s, u, b2, w, k + 2 < count, False)
+        s, u = add_direction(s, u, b3, w, k + 3 < count, False)
+    turned = matmul(c, tensor)
+    # a lane without patches gets an area, whose force is multiplied by zero
+    whole = tl.where(real, rest, 1.0)
+    grown = (
+        turned[0] * c[0] + turned[1] * c[1] + turned[2] * c[2] + turned[3] * c[3] + turned[4] * c[4]
+        + turned[5] * c[5] + turned[6] * c[6] + turned[7] * c[7] + turned[8] * c[8]
+    )  # fmt: skip
+    growth = tl.where(real, tl.sqrt(tl.maximum(grown / whole, 1.2e-38)), 1.0)
+    across = times(turned, w)
+    across = (across[0] / growth, across[1] / growth, across[2] / growth)
+    facing = times(c, s)
+    area = growth * rest
+    ar = dot3(a, r)
+    ac = dot3(a, across)
+    af = dot3(a, facing)
+    rub = area * ar - ac
+    shear = speed * rub
+    by_r = _sum3(friction * rub * inverse, r, friction * speed * area, a)
+    by_area = friction * speed * ar
+    to_across = -friction * speed
+    if OPTIONS[0]:
+        pressure = speed * ac
+        by_r = _sum3(1.0, by_r, drag * ac * inverse, r)
+        to_across += drag * speed
+        by_facing = (zero, zero, zero)
+    else:
+        pressure = square * af
+        by_r = _sum3(1.0, by_r, 2 * drag * af, r)
+        by_facing = (drag * square * a[0], drag * square * a[1], drag * square * a[2])
+    if OPTIONS[1]:
+        rf = dot3(r, facing)
+        side = square * af - ar * rf
+        by_r = _sum3(1.0, by_r, lift, _sum3(1.0, _sum3(2 * af, r, -rf, a), -ar, facing))
+        by_facing = _sum3(1.0, by_facing, lift, _sum3(square, a, -ar, r))
+    else:
+        turn = cross3(facing, a)
+        product = dot3(r, turn)
+        side = speed * product
+        by_r = _sum3(1.0, by_r, lift, _sum3(product * inverse, r, speed, turn))
+        by_facing = _sum3(1.0, by_facing, lift * speed, cross3(a, r))
+    by_across = (to_across * a[0], to_across * a[1], to_across * a[2])
+    total = drag * pressure + friction * shear + lift * side
+    cap = tl.minimum(widest / growth, 1.0)
+    by_growth = by_area * rest - dot3(by_across, across) / growth - tl.where(growth > widest, total / growth, 0.0)
+    scaled = (by_across[0] / growth, by_across[1] / growth, by_across[2] / growth)
+    by_w = _transposed(turned, scaled)
+    by_r = _sum3(1.0, by_r, 1.0, times(c, by_w))
+    by_grown = by_growth / (2 * growth * whole)
+    by_turned = axpy9(1.0, _outer(scaled, w), by_grown, c)
+    by_c = axpy9(1.0, _outer(by_facing, s), 1.0, matmul(by_turned, tensor))
+    by_c = axpy9(1.0, by_c, 1.0, _outer(r, by_w))
+    by_c = axpy9(1.0, by_c, by_grown, turned)
+    scale = tl.where(real, half * cap, 0.0)
+    by_c = axpy9(scale, by_c, 0.0, c)
+    by_wind = (scale * by_r[0], scale * by_r[1], scale * by_r[2])
+    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    return cofactor_change(F, by_c), by_velocity, by_wind, (scale * pressure, scale * shear, scale * side)

@@ -9,7 +9,8 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint
+from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
+from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.wind import SineSway, WindField
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.linalg_triton import load3, load9, store3, store9
@@ -87,12 +88,15 @@ def _viscous(F_in, L_in, Q_in, by_F, by_rate, scalars, mu, lam, time, count, BLO
 
 
 @triton.jit
-def _wind(F_in, v_in, patch_in, wind, numbers, a_in, by_F, by_v, parts, count, OPTIONS: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip # noqa: E501
+def _wind(
+    F_in, v_in, patch_in, wind, numbers, a_in, by_F, by_v, parts, count,
+    OPTIONS: tl.constexpr, FUNCTION: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < count
     F, v, n = load9(F_in, 1, 9 * k, mask), load3(v_in, 1, 3 * k, mask), load3(patch_in, 1, 4 * k, mask)
     patch = (n[0], n[1], n[2], tl.load(patch_in + 4 * k + 3, mask, 0.0))
-    one, two, by_wind, by_numbers = wind_force_adjoint(F, v, patch, wind, numbers, load3(a_in, 1, 3 * k, mask), OPTIONS)
+    one, two, by_wind, by_numbers = FUNCTION(F, v, patch, wind, numbers, load3(a_in, 1, 3 * k, mask), OPTIONS)
     store9(by_F, 1, 9 * k, one, mask)
     store3(by_v, 1, 3 * k, two, mask)
     store3(parts, 1, 6 * k, by_wind, mask)
@@ -173,15 +177,51 @@ def test_derivative_of_the_wind(law, side, unit, kernel_device):
     numbers = torch.tensor([0.6, 0.4, 0.2, 0.5 * 1.225, 1.5], dtype=WIDE)
     patch = torch.cat([normal, area[:, None]], 1)
     given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, patch, wind, numbers, a)]
-    by_F, by_v = torch.empty_like(given[0]), torch.empty_like(given[1])
-    parts = torch.empty(count, 6, device=kernel_device, dtype=dtype)
     options = (law == "projected", side == "lift", unit, False)
-    _wind[(triton.cdiv(count, 64),)](*given, by_F, by_v, parts, count, OPTIONS=options, BLOCK=64)
+    _check_wind(given, options, wind_force_adjoint, expected, tolerance)
+
+
+def _check_wind(given, options, function, expected, tolerance):
+    """The gradients of a . f by F, velocity, wind and coefficients."""
+    count = len(given[0])
+    by_F, by_v, parts = (torch.empty_like(given[0]), torch.empty_like(given[1]), given[1].new_empty(count, 6))
+    _wind[(triton.cdiv(count, 64),)](*given, by_F, by_v, parts, count, OPTIONS=options, FUNCTION=function, BLOCK=64)
     _close(by_F.cpu(), expected[0], tolerance, "F")
     _close(by_v.cpu(), expected[1], tolerance, "velocity")
     sums = parts.cpu().double().sum(0)
     _close(sums[:3], expected[2], tolerance, "wind")
     _close(sums[3:], torch.stack(expected[3:]), tolerance, "coefficients")
+
+
+@pytest.mark.parametrize("side", ["side", "lift"])
+@pytest.mark.parametrize("law", ["paper", "projected"])
+def test_derivative_of_the_wind_on_groups(law, side, kernel_device):
+    """Points with no, one and several patches."""
+    dtype, tolerance = _tolerance(kernel_device, 1e-11, 1e-4)
+    aero = AeroForce(0.6, 0.4, 0.2, law=law, lift_direction=side, max_area_ratio=1.2)
+    for coefficient in (aero.C_D, aero.C_F, aero.C_L):
+        coefficient.requires_grad_()
+    F = _deformed(60).requires_grad_()
+    count = len(F)
+    v, wind = _random(2, count, 3).requires_grad_(), torch.tensor([2.0, 5.0, 1.0], dtype=WIDE, requires_grad=True)
+    sums = PatchSums(_patches(count, WIDE))
+    force, _ = aero.on_groups(wind, v, F, sums)
+    a = _random(4, count, 3)
+    expected = torch.autograd.grad((force * a).sum(), [F, v, wind, aero.C_D, aero.C_F, aero.C_L])
+    numbers = torch.tensor([0.6, 0.4, 0.2, 0.5 * 1.225, 1.2, 0.0, 0.0, 0.0], dtype=WIDE)
+    numbers = torch.cat([numbers, sums.table()])
+    place = torch.nn.functional.pad(sums.lists(), (0, 2))
+    given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, place, wind, numbers, a)]
+    _check_wind(given, (law == "projected", side == "lift", False, False), wind_on_groups_adjoint, expected, tolerance)
+
+
+def _patches(count, dtype):
+    """Up to five patches for each point, of all directions, and none for every fourth."""
+    point = torch.arange(5 * count) % count
+    point = point[point % 4 > 0]
+    normal = torch.nn.functional.normalize(_random(3, len(point), 3), dim=-1)
+    area = 0.005 * (1.5 + _random(6, len(point)).tanh())
+    return Patches(normal.to(dtype), area.to(dtype), point, count)
 
 
 # ---- whole rollouts
@@ -197,7 +237,7 @@ def _place(batch=()):
     return place + 2e-3 * torch.rand(*batch, *place.shape, generator=torch.Generator().manual_seed(0), dtype=WIDE)
 
 
-def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(), wind=True, **settings):
+def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(), wind=True, groups=False, **settings):
     """Gradients of a mixture of all fields at the end by every input, by name, and that mixture."""
     place = _place(batch)
     values = {
@@ -227,7 +267,8 @@ def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(),
         values |= {name: leaf.requires_grad_() for name, leaf in leaves.items()}
         normal = torch.nn.functional.normalize(_random(3, *place.shape), dim=-1).to(device, dtype)
         area = 0.02 * torch.rand(place.shape[:-1], generator=torch.Generator().manual_seed(4), dtype=WIDE)
-        forces = [WindForce(aero, field, normal, area.to(device, dtype))]
+        patches = [_patches(place.shape[-2], dtype).to(device)] if groups else [normal, area.to(device, dtype)]
+        forces = [WindForce(aero, field, *patches)]
     state = solver.rollout(state, DT, steps, forces, checkpoint)
     fields = ("position", "velocity", "F_total", "affine", "node_displacement", "node_velocity")
     weights = [1.0, 1e-2, 0.3, 1e-3, 1.0, 1e-2]
@@ -280,6 +321,11 @@ def test_gradients_of_several_scenes(kernel_device):
     """A batch in one wind."""
     pin = PinnedRegion(Box([None, None, None], [0.12, None, None]), kind="hinge")
     _compare(kernel_device, FixedCorotated(), batch=(2,), boundaries=[pin])
+
+
+def test_gradients_with_groups_of_patches(kernel_device):
+    """Points that carry several patches."""
+    _compare(kernel_device, FixedCorotated(), groups=True)
 
 
 def test_gradients_without_wind(kernel_device):
