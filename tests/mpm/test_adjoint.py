@@ -244,7 +244,7 @@ def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(),
         "velocity": _random(1, *place.shape),
         "youngs_modulus": 1e4 * (1.2 + 0.2 * _random(5, *place.shape[:-1]).tanh()),
         "poisson_ratio": torch.tensor(0.3, dtype=WIDE),
-        "density": torch.tensor(80.0, dtype=WIDE),
+        "density": 80 * (1.2 + 0.2 * _random(7, *place.shape[:-1]).tanh()),
         "volume": torch.tensor(1e-4, dtype=WIDE),
     }
     values = {name: value.to(device, dtype).requires_grad_() for name, value in values.items()}
@@ -280,7 +280,7 @@ def _gradients(device, dtype, transfer, law, *, steps=4, checkpoint=2, batch=(),
     return dict(zip(values, (g.cpu().double() for g in found), strict=True)) | {"loss": loss.detach().cpu().double()}
 
 
-def _compare(device, law, tolerance=1e-4, left_out=(), **settings):
+def _compare(device, law, tolerance=3e-4, left_out=(), **settings):
     """The kernels in float32 against torch's autograd in float64; what is left out does not change anything."""
     expected = _gradients(torch.device("cpu"), WIDE, "torch", law, **settings)
     found = _gradients(device, torch.float32, "triton", law, **settings)

@@ -31,6 +31,15 @@ def keep_nodes(active, nodes, fields, history, first_step, step_offset, BLOCK: t
     tl.store(history + step.to(tl.int64) * nodes * 8 + place, value, mask)
 
 
+@triton.jit(do_not_specialize=VARIES)
+def keep_rows(residual, rows, history, first_step, step_offset, BLOCK: tl.constexpr):
+    """Keep the velocities that held points had before they were stopped in the substep before."""
+    step = tl.load(first_step) + step_offset
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < 4 * rows
+    tl.store(history + step * rows * 4 + place, tl.load(residual + place, mask, 0.0), mask)
+
+
 @triton.jit
 def _add(to, value, real, chunk):
     """Write the sums of some cells; from the second chunk of particles on, add to what is there."""
@@ -258,9 +267,15 @@ def rows_adjoint(affected, scene, push, bars, residual, nodes, rows, BLOCK: tl.c
 
 @triton.jit(do_not_specialize=VARIES)
 def hold_adjoint(
-    affected, scene, weight, residual, nodes, rows, bars, BLOCK: tl.constexpr, ROWS: tl.constexpr
+    affected, scene, weight, residual, nodes, rows, bars,
+    weight_bar, multipliers, all_rows, inverse_mass, history, active_count, first_step, step_offset, last,
+    WEIGHTS: tl.constexpr, BLOCK: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Subtract the rows, with weights of shape (nodes, rows), times their multipliers from the gradient."""
+    """Subtract the rows, with weights of shape (nodes, rows), times their multipliers from the gradient.
+
+    WEIGHTS adds the gradient by the weights: less the forward multiplier times the gradient by the momentum, and less
+    that of the gradient times the velocity after the substep.
+    """
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = n < nodes
     first = tl.load(scene + n, mask, 0) * rows
@@ -275,7 +290,31 @@ def hold_adjoint(
         a0 += tl.sum(b * tl.load(place, known, 0.0), 1)
         a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
         a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
-    at = bars + tl.load(affected + n, mask, 0) * 8 + 4
-    tl.store(at, tl.load(at, mask, 0.0) - a0, mask)
-    tl.store(at + 1, tl.load(at + 1, mask, 0.0) - a1, mask)
-    tl.store(at + 2, tl.load(at + 2, mask, 0.0) - a2, mask)
+    own = tl.load(affected + n, mask, 0)
+    at = bars + own * 8 + 4
+    a0 = tl.load(at, mask, 0.0) - a0
+    a1 = tl.load(at + 1, mask, 0.0) - a1
+    a2 = tl.load(at + 2, mask, 0.0) - a2
+    tl.store(at, a0, mask)
+    tl.store(at + 1, a1, mask)
+    tl.store(at + 2, a2, mask)
+    if WEIGHTS:
+        step = tl.load(last) - tl.load(first_step) - step_offset
+        inverse = tl.load(inverse_mass + own, mask, 0.0)
+        after = history + ((step + 1).to(tl.int64) * active_count + own) * 8 + 4
+        v0 = tl.load(after, mask, 0.0)
+        v1 = tl.load(after + 1, mask, 0.0)
+        v2 = tl.load(after + 2, mask, 0.0)
+        pushed = multipliers + step * all_rows * 4
+        for start in range(0, rows, ROWS):
+            k = start + tl.arange(0, ROWS)
+            known = mask[:, None] & (k < rows)[None, :]
+            place = (first[:, None] + k[None, :]) * 4
+            bar = v0[:, None] * tl.load(residual + place, known, 0.0)
+            bar += v1[:, None] * tl.load(residual + place + 1, known, 0.0)
+            bar += v2[:, None] * tl.load(residual + place + 2, known, 0.0)
+            bar += (inverse * a0)[:, None] * tl.load(pushed + place, known, 0.0)
+            bar += (inverse * a1)[:, None] * tl.load(pushed + place + 1, known, 0.0)
+            bar += (inverse * a2)[:, None] * tl.load(pushed + place + 2, known, 0.0)
+            to = weight_bar + n[:, None] * rows + k[None, :]
+            tl.store(to, tl.load(to, known, 0.0) - bar, known)

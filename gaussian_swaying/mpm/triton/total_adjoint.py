@@ -96,7 +96,10 @@ class TotalAdjoint:
         weight = torch.zeros(len(massive) + 1, rows, device=self.device)
         weight.index_put_((where[points.node.long()].long(), row), points.weight, accumulate=True)
         self.weight = weight[:-1].contiguous()
+        self.weight_bar = torch.zeros_like(self.weight)
+        self.entry = (where[points.node.long()].long(), row)
         self.residual = torch.zeros(points.node.shape[1], 4, device=self.device)
+        self.multipliers = self.row_history = torch.zeros(0, len(self.residual), 4, device=self.device)
 
     # ---- forward
 
@@ -114,10 +117,10 @@ class TotalAdjoint:
         if forces:
             twin = forces[0].twin()
             vectors, numbers = twin.vectors(state.time, torch.full_like(state.time, dt), steps), twin.numbers()
-        laws, points = bound.body.laws, bound.body.points
+        laws, points, holds = bound.body.laws, bound.body.points, bound.point_holds
         displacement, velocity = _Rollout.apply(
             self, run, state.node_displacement, state.node_velocity, laws.mu, laws.lam, points.volume,
-            bound.node_inverse_mass, vectors, numbers,
+            bound.node_inverse_mass, None if holds is None else holds.weight, vectors, numbers,
         )  # fmt: skip
         end, run.end = run.end, None
         assert end is not None
@@ -186,7 +189,9 @@ class TotalAdjoint:
             buffer.zero_()
         material = any(needs[name] for name in ("mu", "lam", "volume"))
         shares = twin is not None and (needs["vectors"] or needs["numbers"])
-        flags = {"MATERIAL": material, "SHARES": shares, "MASS": needs["inverse_mass"]}
+        flags = {"MATERIAL": material, "SHARES": shares, "MASS": needs["inverse_mass"], "WEIGHTS": needs["weight"]}
+        if fused.points is not None:
+            self.weight_bar.zero_()
         vector_bars: list[Tensor] = []
         number_bar = torch.zeros(3, dtype=torch.float64, device=self.device)
         for n in reversed(range(len(run.starts))):
@@ -221,7 +226,7 @@ class TotalAdjoint:
         fused.first_step.zero_()
 
         def again(offset: int) -> None:
-            self._keep(offset)
+            self._keep(offset, flags)
             fused.substep(offset, options)
 
         def back(offset: int) -> None:
@@ -230,7 +235,9 @@ class TotalAdjoint:
 
         key = (*options.values(), self.history.data_ptr(), self.shares.data_ptr())
         fused.repeat(count, ("again", *key), again)
-        self._keep(0)
+        self._keep(0, flags)
+        if flags["WEIGHTS"]:
+            self._find_multipliers(count)
         self.last.fill_(count - 1)
         fused.first_step.zero_()
         fused.repeat(count, ("back", *key, *flags.values()), back)
@@ -239,6 +246,11 @@ class TotalAdjoint:
         """Buffers for a segment; recorded graphs know their addresses."""
         if len(self.history) < every + 1:
             self.history = torch.zeros(every + 1, self.nodes, 8, device=self.device)
+            if self.fused.points is not None:
+                rows = len(self.residual)
+                self.row_history, self.multipliers = (
+                    torch.zeros(every + 1, rows, 4, device=self.device) for _ in range(2)
+                )
         if loaded and len(self.shares) < every:
             self.shares = torch.zeros(every, self.fused.pieces, 8, device=self.device)
 
@@ -247,11 +259,25 @@ class TotalAdjoint:
         rows = self.fused.cells
         return self.fused.sums(rows, width, "adjoint")
 
-    def _keep(self, offset: int) -> None:
+    def _find_multipliers(self, count: int) -> None:
+        """The forward multipliers of the held points in every substep of a segment."""
+        holds = self.fused.bound.point_holds
+        assert holds is not None
+        W = holds.whitening[0]
+        rates = self.row_history[1 : count + 1].reshape(count, holds.scenes, holds.rows, 4).double()
+        found = torch.einsum("sij,csjx->csix", W.mT @ W, rates)
+        self.multipliers[:count].copy_(found.reshape(count, -1, 4))
+
+    def _keep(self, offset: int, flags: dict[str, bool]) -> None:
         fused, block = self.fused, 512
         kernels.keep_nodes[(triton.cdiv(8 * self.nodes, block),)](
             fused.active, self.nodes, fused.fields, self.history, fused.first_step, offset, BLOCK=block, num_warps=4
         )
+        if flags["WEIGHTS"]:
+            rows = len(self.residual)
+            kernels.keep_rows[(triton.cdiv(4 * rows, block),)](
+                fused.residual, rows, self.row_history, fused.first_step, offset, BLOCK=block, num_warps=4
+            )
 
     def _node_stages(
         self, offset: int, partial: Tensor, width: int, options: dict[str, Any], flags: dict[str, bool]
@@ -270,7 +296,8 @@ class TotalAdjoint:
         block = 8
         kernels.hold_adjoint[(triton.cdiv(nodes, block),)](
             self.affected, self.scene, self.weight, self.residual, nodes, rows, self.bars,
-            BLOCK=block, ROWS=64, num_warps=2,
+            self.weight_bar, self.multipliers, len(self.residual), fused.inverse_mass, self.history, self.nodes,
+            fused.first_step, offset, self.last, WEIGHTS=flags["WEIGHTS"], BLOCK=block, ROWS=64, num_warps=2,
         )  # fmt: skip
         self._nodes(offset, partial, width, options, flags, SUM=False, PUSH=False, FINISH=True)
 
@@ -360,6 +387,10 @@ class TotalAdjoint:
         inverse = bound.node_inverse_mass
         mass = torch.zeros(inverse.numel(), device=self.device).index_copy(0, self.active, self.mass_bar)
         result["inverse_mass"] = mass.reshape(inverse.shape)
+        if fused.points is not None and bound.point_holds is not None:
+            padded = torch.nn.functional.pad(self.weight_bar, (0, 0, 0, 1))
+            weight = bound.point_holds.weight
+            result["weight"] = padded[self.entry].T.reshape(weight.shape).to(weight)
         if vectors is not None and numbers is not None and vector_bars:
             own = torch.cat(vector_bars[::-1])
             own = own.reshape(vectors.shape) if vectors.ndim > 2 else own.sum(1)
@@ -368,7 +399,7 @@ class TotalAdjoint:
         return result
 
 
-_INPUTS = ("displacement", "velocity", "mu", "lam", "volume", "inverse_mass", "vectors", "numbers")
+_INPUTS = ("displacement", "velocity", "mu", "lam", "volume", "inverse_mass", "weight", "vectors", "numbers")
 
 
 class _Rollout(torch.autograd.Function):
