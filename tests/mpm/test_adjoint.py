@@ -1,5 +1,7 @@
 """Gradients from the kernels of the backward pass against torch's autograd in float64."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -18,6 +20,7 @@ from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.hencky import StVKHencky
@@ -337,3 +340,52 @@ def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
     """Crowded cells are cut into pieces, whose sums are joined."""
     monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 2)
     _compare(kernel_device, FixedCorotated(), steps=3)
+
+
+# ---- what is left to torch
+
+
+def _refused(solver, state, forces=(), match=""):
+    """The kernels say why they do not compute a gradient."""
+    with pytest.raises(ValueError, match=f"`transfer: triton` has no gradients here, because .*{match}"):
+        solver.rollout(state, DT, 1, list(forces))
+
+
+def _free(device, **settings):
+    """A solver of a sheet and its first state, whose nodal velocity requires a gradient."""
+    place = _place().to(device, torch.float32)
+    points = MaterialPoints.create(place, volume=1e-4, density=80.0, youngs_modulus=1e4, poisson_ratio=0.3)
+    solver = MPMSolver(dx=DX, transfer="triton", **settings)
+    state = solver.init_state(points)
+    return solver, state.replace(node_velocity=state.node_velocity.clone().requires_grad_())
+
+
+def test_kernels_refuse_what_they_do_not_cover(kernel_device):
+    """Nothing is silently left out of a gradient: with `transfer: auto` torch computes these."""
+    solver, state = _free(kernel_device)
+    count = state.position.shape[0]
+    normal, area = torch.zeros(count, 3, device=kernel_device), torch.ones(count, device=kernel_device)
+    normal[:, 1] = 1.0
+    wind = WindField([1.0, 0.0, 0.0]).to(kernel_device)
+
+    def force(*patches, **settings):
+        return WindForce(AeroForce(**settings).to(kernel_device), wind, *patches)
+
+    load = force(normal, area)
+    assert solver.rollout(state, DT, 1, load).position.requires_grad
+    _refused(solver, state, [load, load], "one force")
+    _refused(solver, state, [force(normal, area, drag_step="semi_implicit")], "no backward kernel")
+    _refused(solver, state, [force(normal, area.clone().requires_grad_())], "patches")
+    sums = force(_patches(count, torch.float32).to(kernel_device), unit_tangent=True)
+    _refused(solver, state, [sums], "no backward kernel")
+    leaf = state.replace(F_elastic=state.F_elastic.clone().requires_grad_())
+    _refused(solver, leaf, match="inputs of their own")
+    alone = leaf.replace(node_velocity=state.node_velocity.detach())
+    _refused(solver, alone, match="the nodal ones do not")
+    late = PinnedRegion(Box([None, None, None], [0.12, None, None]), start=DT)
+    _refused(*_free(kernel_device, boundaries=[late]), match="pins that hold all the time")
+    floor = Plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    _refused(*_free(kernel_device, boundaries=[floor]), match="pins that hold all the time")
+    place = solver.points.position.clone().requires_grad_()
+    solver.init_state(dataclasses.replace(solver.points, position=place))
+    _refused(solver, state, match="rest positions")
