@@ -6,6 +6,7 @@
 ``python tools/bench.py accuracy``   errors against exact solutions; writes docs/results/accuracy_<device>.json
 ``python tools/bench.py pareto``     speed against error; writes docs/results/pareto_<device>.json
 ``python tools/bench.py points``     error and time against points per cell; writes docs/results/points_<device>.json
+``python tools/bench.py backward``   cost of gradients in `total`; writes docs/results/backward_<device>.json
 ``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
 ``python tools/bench.py train``      training on a capture and a generated flag; writes docs/results/train_cuda.json
 ``python tools/bench.py surfaces``   tilts of trained normals; writes docs/results/surfaces_<device>.json

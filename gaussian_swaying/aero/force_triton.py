@@ -77,7 +77,7 @@ def force_on_patch(F, velocity, patch, air, numbers, OPTIONS: tl.constexpr):
 
 
 @triton.jit
-def _times(a, x):
+def times(a, x):
     """A matrix in nine parts times a vector."""
     return (
         a[0] * x[0] + a[1] * x[1] + a[2] * x[2],
@@ -87,7 +87,7 @@ def _times(a, x):
 
 
 @triton.jit
-def _add_direction(s, u, b, w, known, UNIT: tl.constexpr):
+def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
     """Add the area vector b to the sums of signed vectors and (UNIT) of tangents of length |b|."""
     along = dot3(b, w)
     sign = tl.where(along < 0, -1.0, 1.0)
@@ -141,14 +141,14 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
     t5 = tl.load(numbers + first + 5, real, 0.0)
     tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
     rest = t0 + t3 + t5
-    r0 = _times(tensor, (c[0], c[1], c[2]))
-    r1 = _times(tensor, (c[3], c[4], c[5]))
-    r2 = _times(tensor, (c[6], c[7], c[8]))
+    r0 = times(tensor, (c[0], c[1], c[2]))
+    r1 = times(tensor, (c[3], c[4], c[5]))
+    r2 = times(tensor, (c[6], c[7], c[8]))
     grown = c[0] * r0[0] + c[1] * r0[1] + c[2] * r0[2]
     grown += c[3] * r1[0] + c[4] * r1[1] + c[5] * r1[2]
     grown += c[6] * r2[0] + c[7] * r2[1] + c[8] * r2[2]
     growth = tl.sqrt(tl.maximum(grown / tl.maximum(rest, 1.2e-38), 1.2e-38))
-    across = _times(c, _times(tensor, w))
+    across = times(c, times(tensor, w))
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
     zero = rest * 0
     s = (zero, zero, zero)
@@ -159,11 +159,11 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
         b1 = load3(numbers, 1, row + 4, k + 1 < count)
         b2 = load3(numbers, 1, row + 8, k + 2 < count)
         b3 = load3(numbers, 1, row + 12, k + 3 < count)
-        s, u = _add_direction(s, u, b0, w, k < count, OPTIONS[2])
-        s, u = _add_direction(s, u, b1, w, k + 1 < count, OPTIONS[2])
-        s, u = _add_direction(s, u, b2, w, k + 2 < count, OPTIONS[2])
-        s, u = _add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
-    facing = _times(c, s)
+        s, u = add_direction(s, u, b0, w, k < count, OPTIONS[2])
+        s, u = add_direction(s, u, b1, w, k + 1 < count, OPTIONS[2])
+        s, u = add_direction(s, u, b2, w, k + 2 < count, OPTIONS[2])
+        s, u = add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
+    facing = times(c, s)
     area = growth * rest
     if OPTIONS[0]:
         pressure = (drag * speed * across[0], drag * speed * across[1], drag * speed * across[2])
@@ -171,7 +171,7 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
         square = drag * speed * speed
         pressure = (square * facing[0], square * facing[1], square * facing[2])
     if OPTIONS[2]:
-        tangent = _times(c, u)
+        tangent = times(c, u)
         square = friction * speed * speed
         shear = (square * tangent[0], square * tangent[1], square * tangent[2])
     else:

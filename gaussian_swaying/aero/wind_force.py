@@ -276,10 +276,12 @@ class WindForce(Force):
     def twin(self) -> ForceTwin:
         """See ``Force.twin``."""
         from gaussian_swaying.aero.effects_triton import shaped_wind_force, shaped_wind_on_groups
+        from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
         from gaussian_swaying.aero.force_triton import wind_force, wind_on_groups
 
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
+        smooth = self.uniform and not implicit
         options: tuple[Any, ...] = (aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit)
         functions, space = (wind_force, wind_on_groups), None
         if not self.uniform:
@@ -301,6 +303,7 @@ class WindForce(Force):
                 vectors=self.winds if self.uniform else self._vectors,
                 table=self.sums.table,
                 space=space,
+                adjoint=wind_on_groups_adjoint if smooth and not aero.unit_tangent else None,
             )
         return ForceTwin(
             function=functions[0],
@@ -311,6 +314,7 @@ class WindForce(Force):
             numbers=numbers,
             vectors=self.winds if self.uniform else self._vectors,
             space=space,
+            adjoint=wind_force_adjoint if smooth else None,
         )
 
     def _packed(self) -> Packed:

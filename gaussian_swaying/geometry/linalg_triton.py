@@ -116,6 +116,31 @@ def cofactor(a):
 
 
 @triton.jit
+def cofactor_change(a, x):
+    """The derivative of the cofactor matrix in a direction X; as a form in X and a third matrix it is symmetric."""
+    return (
+        a[4] * x[8] + x[4] * a[8] - a[5] * x[7] - x[5] * a[7],
+        a[5] * x[6] + x[5] * a[6] - a[3] * x[8] - x[3] * a[8],
+        a[3] * x[7] + x[3] * a[7] - a[4] * x[6] - x[4] * a[6],
+        a[7] * x[2] + x[7] * a[2] - a[8] * x[1] - x[8] * a[1],
+        a[8] * x[0] + x[8] * a[0] - a[6] * x[2] - x[6] * a[2],
+        a[6] * x[1] + x[6] * a[1] - a[7] * x[0] - x[7] * a[0],
+        a[1] * x[5] + x[1] * a[5] - a[2] * x[4] - x[2] * a[4],
+        a[2] * x[3] + x[2] * a[3] - a[0] * x[5] - x[0] * a[5],
+        a[0] * x[4] + x[0] * a[4] - a[1] * x[3] - x[1] * a[3],
+    )
+
+
+@triton.jit
+def dot9(a, b):
+    """Sum of the products of the entries of two matrices."""
+    return (
+        a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6]
+        + a[7] * b[7] + a[8] * b[8]
+    )  # fmt: skip
+
+
+@triton.jit
 def dot3(a, b):
     """Product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -196,6 +221,33 @@ def polar_rotation(F):
         u, _a, v = svd3(F)
         x = where9(reflected, matmul(u, transpose(v)), x)
     return x
+
+
+@triton.jit
+def polar_change(F, R, x):
+    """Derivative of the nearest rotation R in a direction X, as that of ``linalg.polar_rotation``; symmetric in X."""
+    s = matmul(transpose(R), F)
+    trace = s[0] + s[4] + s[8]
+    m01 = -0.5 * (s[1] + s[3])
+    m02 = -0.5 * (s[2] + s[6])
+    m12 = -0.5 * (s[5] + s[7])
+    system = (trace - s[0], m01, m02, m01, trace - s[4], m12, m02, m12, trace - s[8])
+    cof = cofactor(system)
+    size = tl.maximum(tl.abs(system[0]), tl.maximum(tl.abs(system[4]), tl.abs(system[8])))
+    size = tl.maximum(size, tl.maximum(tl.abs(m01), tl.maximum(tl.abs(m02), tl.abs(m12))))
+    least = 3.4526698e-4 * tl.maximum(size * size * size, 1.0842022e-19)  # as in the reference
+    scale = 1.0 / tl.maximum(system[0] * cof[0] + m01 * cof[1] + m02 * cof[2], least)
+    turn = matmul(transpose(R), x)
+    k = (turn[7] - turn[5], turn[2] - turn[6], turn[3] - turn[1])
+    spin = (
+        scale * (cof[0] * k[0] + cof[1] * k[1] + cof[2] * k[2]),
+        scale * (cof[3] * k[0] + cof[4] * k[1] + cof[5] * k[2]),
+        scale * (cof[6] * k[0] + cof[7] * k[1] + cof[8] * k[2]),
+    )
+    r0 = cross3((R[0], R[1], R[2]), spin)
+    r1 = cross3((R[3], R[4], R[5]), spin)
+    r2 = cross3((R[6], R[7], R[8]), spin)
+    return (r0[0], r0[1], r0[2], r1[0], r1[1], r1[2], r2[0], r2[1], r2[2])
 
 
 @triton.jit

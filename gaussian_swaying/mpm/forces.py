@@ -52,6 +52,10 @@ class ForceTwin:
         space: What the force reads depending on the place: numbers in float32, shape (n,), which stay at the same
             address and may change between rollouts. The function then has two more arguments: ``(F, velocity, position,
             values, vector, numbers, space, OPTIONS)``. None for a force that does not depend on the place.
+        adjoint: A ``@triton.jit`` function ``(F, velocity, values, vector, numbers, a, OPTIONS)`` that returns the
+            gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three of
+            the vector and by the first three of the numbers. No other input of the force may require a gradient then.
+            None for a force whose gradients need torch.
     """
 
     function: Any
@@ -63,6 +67,7 @@ class ForceTwin:
     vectors: Callable[[Tensor, Tensor, int], Tensor]
     table: Callable[[], Tensor] | None = None
     space: Tensor | None = None
+    adjoint: Any = None
 
 
 class Force(Recordable, nn.Module, ABC):

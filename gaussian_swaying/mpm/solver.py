@@ -23,10 +23,10 @@ from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.recompute import recompute
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.mpm.timestep import kick_time, look_marks, substeps_per_frame
+from gaussian_swaying.mpm.timestep import look_marks, substeps_per_frame, work_done
 
 if TYPE_CHECKING:
-    from gaussian_swaying.mpm.triton.fused import Fused
+    from gaussian_swaying.mpm.triton.fused import Adjoint, Fused
 
 WatchFunction = Callable[[int], None]
 TRANSFERS = ("auto", "torch", "triton")
@@ -58,9 +58,9 @@ class MPMSolver(nn.Module):
         deterministic: On a GPU, sum in a fixed order, so that repeated runs give the same bits; slower. On a CPU the
             order is always fixed. Gradients on a GPU are not covered.
         boundaries: Boundary conditions, applied in order, impulses first.
-        transfer: How substeps are computed. ``torch`` is the reference and works on any device and with gradients;
-            ``triton`` runs a whole substep in two kernels on a CUDA device, in float32 and without gradients; ``auto``
-            uses triton where possible.
+        transfer: How substeps are computed. ``torch`` is the reference and works on any device and with all gradients;
+            ``triton`` runs a whole substep in two kernels on a CUDA device, in float32, with gradients in ``total`` by
+            the first state, stiffness, mass, wind and coefficients; ``auto`` uses triton where possible.
 
     Example:
         >>> points = MaterialPoints.create(torch.rand(100, 3), volume=1e-3, density=100.0, youngs_modulus=1e4,
@@ -191,24 +191,8 @@ class MPMSolver(nn.Module):
         """Bind the material and compute everything that stays constant."""
         self._bound = self._fused = None
         bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
-        self._fused_obstacle = self._why_not_fused(bound)
+        self._fused_obstacle = bound.why_not_kernels(self.transfer)
         self._bound = bound
-
-    def _why_not_fused(self, bound: Formulation) -> str | None:
-        """Why the Triton kernels cannot be used with this material; None if they can."""
-        if self.transfer == "torch":
-            return "`transfer` is torch"
-        try:
-            twin = bound.twin()
-        except ImportError as error:
-            obstacle: str | None = f"Triton cannot be imported ({error})"
-        else:
-            obstacle = f"the {bound.name} formulation has no kernels"
-            if twin is not None:
-                obstacle = twin.unsupported(bound, interpret=self.transfer == "triton")
-        if self.transfer == "triton" and obstacle is not None:
-            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
-        return obstacle
 
     @property
     def has_kernels(self) -> bool:
@@ -226,19 +210,36 @@ class MPMSolver(nn.Module):
         """
         if self._fused_obstacle is not None:
             return None
-        bound = self.bound
-        asking = (*bound.body.tensors(), *tensors) if torch.is_grad_enabled() else ()
-        if any(t is not None and t.requires_grad for t in asking):
+        if self._wanted(*tensors):
             if self.transfer == "triton":
-                raise ValueError("`transfer: triton` has no gradients: set it to auto or torch.")
+                raise ValueError("`transfer: triton` has no gradients here: set it to auto or torch.")
             return None
+        return self._kernels()
+
+    def _wanted(self, *tensors: Tensor | None) -> bool:
+        """Whether a gradient is wanted by the body or by one of some tensors."""
+        asking = (*self.bound.body.tensors(), *tensors)
+        return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
+
+    def _kernels(self) -> Fused:
         if self._fused is None or not self._fused.holds():
-            twin = bound.twin()
+            twin = self.bound.twin()
             assert twin is not None
             # ordinary tensors, which can be written inside and outside inference mode
             with torch.inference_mode(False), torch.no_grad():
-                self._fused = twin(bound)
+                self._fused = twin(self.bound)
         return self._fused
+
+    def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Adjoint | None:
+        """The backward pass in kernels, if a gradient through a rollout is wanted and they can compute it."""
+        if self._fused_obstacle is not None or not torch.is_grad_enabled():
+            return None
+        if not self._wanted(*state.tensors(), *tensors_of(forces)):
+            return None
+        adjoint, why = self._kernels().adjoint(state, forces)
+        if adjoint is None and self.transfer == "triton":
+            raise ValueError(f"`transfer: triton` has no gradients here, because {why}: set it to auto or torch.")
+        return adjoint
 
     def _fused_for(self, state: MPMState, forces: Sequence[Force]) -> Fused | None:
         """As :meth:`fused`, for rollouts with forces; also None if the host has to call a force in every substep."""
@@ -377,7 +378,7 @@ class MPMSolver(nn.Module):
         if drag is not None:
             check_shape("drag", drag, self.points.count)
         acting = as_forces(forces)
-        if acting and force is None and drag is None:
+        if force is None and drag is None:
             return self.rollout(state, dt, 1, acting)
         found = [split(part(state), part, state) for part in acting]
         force, drag = added([(force, drag), *found])
@@ -389,18 +390,7 @@ class MPMSolver(nn.Module):
         if fused is not None:
             return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
         after = self.bound.step(state, dt, force, drag)
-        return after if force is None else after.replace(work=self._work(state, after, dt, force, drag))
-
-    @torch.no_grad()
-    def _work(self, state: MPMState, after: MPMState, dt: float, force: Tensor, drag: Tensor | None) -> Tensor:
-        """Work of the external force up to the end of a substep [J].
-
-        It is computed at the mean velocity, which gives exactly what the step adds to the kinetic energy.
-        """
-        if drag is not None:
-            force = force - drag[..., None] * (after.velocity - state.velocity)
-        power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum(-1)
-        return state.work + (0.5 * kick_time(state, dt)) * power
+        return after if force is None else after.replace(work=work_done(state, after, dt, force, drag))
 
     def rollout(
         self,
@@ -426,8 +416,8 @@ class MPMSolver(nn.Module):
                 resistance [kg/s], shape (..., P) (``drag`` in :meth:`step`).
             checkpoint: For gradients through long rollouts: keep one state per this many substeps and recompute the
                 others in the backward pass; a value near the square root of ``steps`` needs the least memory. 0 keeps
-                everything. With checkpoints, forces must return the same values each time they are called with the same
-                state.
+                everything in torch, and lets the kernels choose. With checkpoints, forces must return the same values
+                each time they are called with the same state.
             watch: Called from time to time with the number of substeps that are done, or queued on a GPU; not with
                 ``checkpoint``.
 
@@ -435,6 +425,9 @@ class MPMSolver(nn.Module):
             The state ``steps * dt`` later.
         """
         acting = as_forces(forces)
+        adjoint = self._adjoint_for(state, acting)
+        if adjoint is not None:
+            return adjoint.rollout(state, dt, steps, acting, checkpoint, watch)
         fused = self._fused_for(state, acting)
         if fused is not None:
             return fused.rollout(state, dt, steps, acting, watch=watch)[0]

@@ -112,6 +112,18 @@ def kick_time(state: MPMState, dt: float) -> float:
     return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
 
+@torch.no_grad()
+def work_done(state: MPMState, after: MPMState, dt: float, force: Tensor, drag: Tensor | None) -> Tensor:
+    """Work of the external force up to the end of a substep [J].
+
+    It is computed at the mean velocity, which gives exactly what the step adds to the kinetic energy.
+    """
+    if drag is not None:
+        force = force - drag[..., None] * (after.velocity - state.velocity)
+    power = torch.linalg.vecdot(force, state.velocity + after.velocity).sum(-1)
+    return state.work + (0.5 * kick_time(state, dt)) * power
+
+
 def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | None) -> Tensor:
     """Largest Courant number ``dt (c + |v|) / dx``; leave out ``velocity`` where stencils do not move."""
     total = speed if velocity is None else speed + torch.linalg.vector_norm(velocity, dim=-1)

@@ -1588,7 +1588,7 @@ def test_what_is_too_large_for_the_indices_is_refused(kernel_device, formulation
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
-def test_gradients_are_left_to_torch(kernel_device, formulation):
+def test_gradients_are_left_to_torch_or_to_their_kernels(kernel_device, formulation):
     points = _points(kernel_device)
     auto = _solver("auto", formulation)
     state = _start(auto, points)
@@ -1606,12 +1606,18 @@ def test_gradients_are_left_to_torch(kernel_device, formulation):
     assert pushed.rollout(state, DT, 1).position.requires_grad
     only = _solver("triton", formulation)
     only.init_state(points)
-    for attempt in (
-        lambda: only.rollout(start, DT, 2, load),
+    attempts = [
         lambda: only.step(state, DT, force=velocity),
         lambda: only.rollout(state, DT, 1, WindForce(load.aero, load.wind, load.normal, area)),
-    ):
-        with pytest.raises(ValueError, match="`transfer: triton` has no gradients"):
+        lambda: only.rollout(start, DT, 1, [load, load]),
+    ]
+    if formulation == "total":  # these have kernels, see test_adjoint.py
+        assert only.rollout(start, DT, 2, load).position.requires_grad
+        assert only.step(start, DT).position.requires_grad
+    else:
+        attempts += [lambda: only.rollout(start, DT, 2, load), lambda: only.step(start, DT)]
+    for attempt in attempts:
+        with pytest.raises(ValueError, match="`transfer: triton` has no gradients here"):
             attempt()
     with torch.no_grad():
         assert not only.rollout(start, DT, 1, load).position.requires_grad

@@ -12,6 +12,7 @@ from bench import pages, record, show
 from bench.cases import (
     accuracy,
     area,
+    backward,
     contact,
     flags,
     gallery,
@@ -79,6 +80,8 @@ COMMANDS = {
     "pareto": Command("Measure speed against error over the settings of the solver.",
                       pareto.run, pareto.add_arguments, page="validation.md"),
     "points": Command("Measure error and time against the points of a cell.", points.run, points.add_arguments),
+    "backward": Command("Measure the gradient through substeps of total: time, memory and agreement with torch.",
+                        backward.run, backward.add_arguments, page="validation.md"),
     "gradients": Command("Measure the memory of gradients through long rollouts, and fit a flag.",
                          gradients.run, device=False, page="validation.md"),
     "surfaces": Command("Measure how trained normals are tilted, by which losses, and what it does to a flag.",

@@ -12,6 +12,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
     accuracy_plot,
     area,
+    backward,
     contact,
     flags,
     goals,

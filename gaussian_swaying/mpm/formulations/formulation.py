@@ -84,6 +84,26 @@ class Formulation(ABC):
         """The class that runs this substep in Triton kernels, or None; ImportError without Triton."""
         return None
 
+    def why_not_kernels(self, transfer: str) -> str | None:
+        """Why the Triton kernels cannot be used with this material and a ``transfer`` of the solver; None if they can.
+
+        Raises:
+            ValueError: If they cannot, but ``transfer`` is triton.
+        """
+        if transfer == "torch":
+            return "`transfer` is torch"
+        try:
+            twin = self.twin()
+        except ImportError as error:
+            obstacle: str | None = f"Triton cannot be imported ({error})"
+        else:
+            obstacle = f"the {self.name} formulation has no kernels"
+            if twin is not None:
+                obstacle = twin.unsupported(self, interpret=transfer == "triton")
+        if transfer == "triton" and obstacle is not None:
+            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
+        return obstacle
+
     # ---- state and grid
 
     @abstractmethod

@@ -220,6 +220,10 @@ class Total(Formulation):
     def read_particles(self, state: MPMState, displacement: Tensor, velocity: Tensor) -> MPMState:
         """Particle fields, interpolated from nodal displacement [m] and velocity [m/s], shape (..., G, 3)."""
         rows = gather(torch.cat([displacement, velocity], dim=-1), self.stencil)
+        return self.with_rows(state, displacement, velocity, rows)
+
+    def with_rows(self, state: MPMState, displacement: Tensor, velocity: Tensor, rows: Tensor) -> MPMState:
+        """As :meth:`read_particles`, from both fields interpolated, shape (..., P, 4, 6)."""
         F = rows[..., 1:4, :3].mT + torch.eye(3, dtype=rows.dtype, device=rows.device)
         return state.replace(
             position=self.body.points.position + rows[..., 0, :3],

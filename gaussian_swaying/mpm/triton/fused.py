@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -65,6 +65,21 @@ class Part:
     loaded: bool
     begin: Callable[[int], None]
     key: tuple[object, ...] | None
+
+
+class Adjoint(Protocol):
+    """A rollout whose gradients are computed by kernels."""
+
+    def rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        forces: Sequence[Force],
+        checkpoint: int,
+        watch: Callable[[int], None] | None,
+    ) -> MPMState:
+        """As ``MPMSolver.rollout``."""
 
 
 class Fused(ABC):
@@ -134,6 +149,10 @@ class Fused(ABC):
                 return f"the law {type(law).__name__} has no Triton twin"
         return None
 
+    def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
+        """The rollouts with gradients in kernels; or None, and why they need torch."""
+        return None, "only the total formulation has backward kernels"
+
     @property
     def recordable(self) -> bool:
         """Whether substeps can be recorded in a CUDA graph."""
@@ -173,24 +192,13 @@ class Fused(ABC):
         Returns:
             The state, and the most cells that a wave crosses per second at any of the ``looks`` [1/s] (zero without).
         """
-        with _at_home(self.speed):
+        with at_home(self.speed):
             self.speed.zero_()
             fused, self.asked = divide(forces)
             twin = None if fused is None else fused.twin()
-            self.space = self.numbers
-            if twin is not None:
-                self._take_values_of(twin)
-                self.space = self.numbers if twin.space is None else twin.space
-            options: dict[str, Any] = {
-                "LAWS": self.laws,
-                "MULTI": len(self.law_table) > 1,
-                "VISCOUS": self.settings.stiffness_damping > 0,
-                "TWIN": None if twin is None else twin.function,
-                "OPTIONS": None if twin is None else twin.options,
-                "SPACE": twin is not None and twin.space is not None,
-                "FORCE": len(self.asked) > 0 or force is not None or drag is not None,
-                "IMPLICIT": drag is not None or (twin is not None and twin.implicit) or self._resists(state),
-            }
+            options = self.options_for(twin)
+            options["FORCE"] = len(self.asked) > 0 or force is not None or drag is not None
+            options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)
             if options["FORCE"]:
                 if len(self.force_in) < self.count:  # needed for the first time
                     self.force_in = torch.zeros(self.count, 4, device=self.device)
@@ -207,6 +215,23 @@ class Fused(ABC):
                     watch(first + part)
             return state, self.speed[0] / self.settings.dx
 
+    def options_for(self, twin: ForceTwin | None) -> dict[str, Any]:
+        """Constants of the kernels of a substep with the twin of a force alone, whose values are copied."""
+        self.space = self.numbers
+        if twin is not None:
+            self._take_values_of(twin)
+            self.space = self.numbers if twin.space is None else twin.space
+        return {
+            "LAWS": self.laws,
+            "MULTI": len(self.law_table) > 1,
+            "VISCOUS": self.settings.stiffness_damping > 0,
+            "TWIN": None if twin is None else twin.function,
+            "OPTIONS": None if twin is None else twin.options,
+            "SPACE": twin is not None and twin.space is not None,
+            "FORCE": False,
+            "IMPLICIT": twin is not None and twin.implicit,
+        }
+
     def _advance(
         self,
         state: MPMState,
@@ -218,7 +243,7 @@ class Fused(ABC):
         looks: list[int],
     ) -> MPMState:
         """Run a part of a rollout whose schedule fits in the buffers."""
-        self.schedule[: steps + 2].copy_(self._table(kick_time(state, dt), dt, steps), non_blocking=True)
+        self.schedule[: steps + 2].copy_(self.table(kick_time(state, dt), dt, steps), non_blocking=True)
         self.time.copy_(state.time)
         self.dt.fill_(dt)
         loaded = twin is not None or options["FORCE"]
@@ -242,7 +267,7 @@ class Fused(ABC):
             changes["work"] = state.work + changes["work"]
         return state.replace(time=state.time + steps * dt, substep=dt, **changes)
 
-    def _table(self, kick: float, dt: float, steps: int) -> Tensor:
+    def table(self, kick: float, dt: float, steps: int) -> Tensor:
         """The schedule on the host, which can be copied without making it wait."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
         table = torch.empty(steps + 2, SCHEDULE, pin_memory=self.device.type == "cuda")
@@ -267,7 +292,7 @@ class Fused(ABC):
             self._take_values(values.expand(*self.body.points.mass.shape, values.shape[-1]).flatten(0, -2))
             if twin.table is not None:
                 table = twin.table()
-                if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `_repeat`
+                if len(self.numbers) < TWIN_NUMBERS + len(table):  # recorded graphs know its address, see `repeat`
                     check_indices(TWIN_NUMBERS + len(table))
                     self.numbers = torch.zeros(TWIN_NUMBERS + len(table), device=self.device)
                 self.numbers[TWIN_NUMBERS : TWIN_NUMBERS + len(table)].copy_(table)
@@ -327,7 +352,7 @@ class Fused(ABC):
         work = self.load[0].reshape(self.scenes, self.particles).sum(1, dtype=torch.float64)
         return work.reshape(self.body.points.mass.shape[:-1])
 
-    def _repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
+    def repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
         """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.
 
         The first time a key is seen, the substeps run without a graph, which compiles what is not yet compiled; the
@@ -344,7 +369,7 @@ class Fused(ABC):
 
 
 @contextmanager
-def _at_home(buffer: Tensor) -> Iterator[None]:
+def at_home(buffer: Tensor) -> Iterator[None]:
     """Launch Triton on the device of a buffer, and create ordinary tensors, which can be written in any mode."""
     with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
         yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,13 +13,13 @@ from torch import Tensor
 from gaussian_swaying._graphs import RECORDED
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.forces import TWIN_VALUES
+from gaussian_swaying.mpm.forces import TWIN_VALUES, Force
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
+from gaussian_swaying.mpm.triton.fused import Adjoint, Fused, Part, check_indices
 from gaussian_swaying.mpm.triton.fused_contact import FusedContact
 
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
@@ -28,7 +29,7 @@ _LANE_COST = {4: 1.5, 8: 1.0, 16: 1.0, 32: 1.0, 64: 0.85}
 _PROGRAMS = 2048
 
 # spilling registers is worth it, because more warps run at once
-_REGISTERS = {64: {"maxnreg": 128}}
+REGISTERS = {64: {"maxnreg": 128}}
 
 
 class FusedTotal(Fused):
@@ -95,9 +96,22 @@ class FusedTotal(Fused):
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
-        self._partial: dict[tuple[int, int], Tensor] = {}
+        self._adjoint: Adjoint | None = None
+        self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
+
+    def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
+        """The rollouts with gradients in kernels, see :mod:`~gaussian_swaying.mpm.triton.total_adjoint`."""
+        from gaussian_swaying.mpm.triton.total_adjoint import TotalAdjoint, why_not
+
+        why = why_not(self, state, forces)
+        if why is not None:
+            return None, why
+        if self._adjoint is None:
+            with torch.inference_mode(False), torch.no_grad():
+                self._adjoint = TotalAdjoint(self)
+        return self._adjoint, ""
 
     def _take_pins(self) -> None:
         """What pins without a window hold: nodes, and points."""
@@ -138,11 +152,17 @@ class FusedTotal(Fused):
     def _take_values(self, values: Tensor) -> None:
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 
-    def _sums(self, rows: int, width: int) -> Tensor:
+    def sums(self, rows: int, width: int, use: str = "") -> Tensor:
         """Buffer for the sums of each cell or piece of a cell, with a row of zeros at the end."""
-        if (rows, width) not in self._partial:
-            self._partial[rows, width] = torch.zeros(27, rows + 1, width, device=self.device)
-        return self._partial[rows, width]
+        if (rows, width, use) not in self._partial:
+            self._partial[rows, width, use] = torch.zeros(27, rows + 1, width, device=self.device)
+        return self._partial[rows, width, use]
+
+    def join_pieces(self, pieces: Tensor, cells: Tensor, width: int) -> None:
+        """Add the sums of the pieces of each cell."""
+        kernels.total_pieces[(-(-self.cells // 8), 27)](
+            pieces, cells, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
+        )
 
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
         if self.touching is None:
@@ -174,7 +194,7 @@ class FusedTotal(Fused):
         same = (*options.values(), *(() if self.touching is None else self.touching.key))
         done = 0
         for mark in sorted({*part.looks, part.steps}):
-            self._repeat(mark - done, same, lambda offset: self._substep(offset, options))
+            self.repeat(mark - done, same, lambda offset: self.substep(offset, options))
             done = mark
             if mark in part.looks:
                 self.repeater.run(1, "look", lambda _: self._look())
@@ -193,11 +213,12 @@ class FusedTotal(Fused):
             ny * nz, nz, 1 / self.grid.dx, WAVE=self.wave, BLOCK=block, num_warps=4,
         )  # fmt: skip
 
-    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+    def substep(self, offset: int, options: dict[str, Any]) -> None:
+        """Launch one substep, ``offset`` after the first one."""
         if self.asked:
             self._push()
         width = 8 if self.position else 4
-        partial = self._sums(self.pieces, width)
+        partial = self.sums(self.pieces, width)
         _, ny, nz = self.grid.resolution
         per_program = max(1, 32 // self.lanes)
         kernels.total_particles[(-(-self.pieces // per_program),)](
@@ -208,13 +229,11 @@ class FusedTotal(Fused):
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes, num_warps=1,
-            **_REGISTERS.get(self.lanes, {}),
+            **REGISTERS.get(self.lanes, {}),
         )  # fmt: skip
         if self.pieces > self.cells:
-            pieces, partial = partial, self._sums(self.cells, width)
-            kernels.total_pieces[(-(-self.cells // 8), 27)](
-                pieces, partial, self.first_piece, self.cells, self.pieces, WIDTH=width, BLOCK=8, num_warps=1
-            )
+            pieces, partial = partial, self.sums(self.cells, width)
+            self.join_pieces(pieces, partial, width)
         block = 64
         nodes, held = len(self.active), self.plain and "nodes" in self.bound.kinds
         moves = self.plain and self.touching is None

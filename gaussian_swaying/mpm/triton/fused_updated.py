@@ -177,7 +177,7 @@ class FusedUpdated(Fused):
     def _several(self, steps: int, options: dict[str, Any]) -> None:
         """Run substeps, from the start of one to the start of a later one."""
         key = (*options.values(), self.grid, self.moving.data_ptr())
-        self._repeat(steps, key, lambda offset: self._substep(offset, options))
+        self.repeat(steps, key, lambda offset: self.substep(offset, options))
 
     def _look(self) -> None:
         block = 128
@@ -185,7 +185,8 @@ class FusedUpdated(Fused):
             self.moving, self.count, self.speed, WAVE=self.wave, BLOCK=block, num_warps=4
         )
 
-    def _substep(self, offset: int, options: dict[str, Any]) -> None:
+    def substep(self, offset: int, options: dict[str, Any]) -> None:
+        """Launch one substep, ``offset`` after the first one."""
         self._nodes(offset, options)
         if self.asked:  # the forces need the end of a substep before the next one starts
             self._particles(offset + 1, options, gather=True, scatter=False)

@@ -35,6 +35,7 @@ class BodyLaws:
         matrices: Functions of Kirchhoff stresses that come from F itself, numbered after those.
         elastic: As ``matrices``, for first Piola-Kirchhoff stresses (None for a law that flows).
         flows: Functions of the plastic flow.
+        adjoints: Derivatives of the stresses in the order of their numbers; None where a law has none.
         all_flow: Whether every law flows.
         cache_key: Changes with the source of the functions, for the caches of Triton.
     """
@@ -49,13 +50,15 @@ class BodyLaws:
         self.principals = tuple(stress[0] for stress in order if len(stress) == 1)
         self.matrices = tuple(stress[0] for stress in order if len(stress) == 2)
         self.elastic = tuple(stress[1] for stress in order if len(stress) == 2)
+        derivatives = {stress: twin.adjoint for stress, twin in zip(chosen, twins, strict=True)}
+        self.adjoints = tuple(derivatives[stress] for stress in order)
         self.flows = _once(twin.flow for twin in twins if twin.flow)
         self.all_flow = all(twin.flow for twin in twins)
         self.table = [
             [float(order.index(stress)), float(self.flows.index(twin.flow) if twin.flow else -1), *_padded(law)]
             for law, twin, stress in zip(laws, twins, chosen, strict=True)
         ]
-        functions = [self.principals, self.matrices, self.elastic, self.flows]
+        functions = [self.principals, self.matrices, self.elastic, self.flows, self.adjoints]
         source = [[_key(function) for function in part] for part in functions]
         self.cache_key = hashlib.sha256(repr((source, self.spectral, self.all_flow)).encode()).hexdigest()
 
@@ -110,6 +113,21 @@ def pk1(F, mu, lam, row, LAWS: tl.constexpr):
     for k in tl.static_range(0 if n > 0 else 1, len(LAWS.elastic)):
         stress = where9(which == n + k, LAWS.elastic[k](F, mu, lam, internal, p), stress)
     return stress
+
+
+@triton.jit
+def pk1_adjoint(F, Q, mu, lam, row, LAWS: tl.constexpr):
+    """Gradient of Q : P by F, mu and lam; ``row`` as for :func:`pk1`."""
+    change, by_mu, by_lam = LAWS.adjoints[0](F, Q, mu, lam)
+    if len(LAWS.adjoints) > 1:
+        which = tl.load(row).to(tl.int32)
+        for k in tl.static_range(1, len(LAWS.adjoints)):
+            other, one, two = LAWS.adjoints[k](F, Q, mu, lam)
+            own = which == k
+            change = where9(own, other, change)
+            by_mu = tl.where(own, one, by_mu)
+            by_lam = tl.where(own, two, by_lam)
+    return change, by_mu, by_lam
 
 
 @triton.jit

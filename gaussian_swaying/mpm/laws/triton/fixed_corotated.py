@@ -6,9 +6,12 @@ import triton.language as tl  # noqa: F401  (Triton's interpreter looks for it)
 from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
+    cofactor_change,
+    dot9,
     largest,
     largest_eigenvalue,
     matmul,
+    polar_change,
     polar_rotation,
     square9,
     transpose,
@@ -63,4 +66,16 @@ def wave(F, mu, lam):
     return 2 * mu + lam * largest(area, 1.0)
 
 
-TWIN = LawTwin(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave)
+@triton.jit
+def adjoint(F, Q, mu, lam):
+    """Derivative of :func:`pk1` in the direction Q, and of Q : P by mu and lam."""
+    cof = cofactor(F)
+    change = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2] - 1
+    R = polar_rotation(F)
+    growth = dot9(cof, Q)
+    bend = axpy9(2 * mu, axpy9(1.0, Q, -1.0, polar_change(F, R, Q)), lam * growth, cof)
+    by_mu = 2 * dot9(Q, axpy9(1.0, F, -1.0, R))
+    return axpy9(1.0, bend, lam * change, cofactor_change(F, Q)), by_mu, change * growth
+
+
+TWIN = LawTwin(principal=principal, pk1=pk1, kirchhoff=kirchhoff, energy=energy, wave=wave, adjoint=adjoint)

@@ -10,7 +10,9 @@ from gaussian_swaying.mpm.laws.triton.shared import (
     log,
     log_difference,
     share_above,
+    spectral_change,
     spectral_modulus,
+    to_principal,
 )
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
@@ -57,8 +59,8 @@ def _own(x, tau, mu, lam):
 
 
 @triton.jit
-def hencky_wave_modulus(a, mu, lam):
-    """``wave`` of ``stvk_hencky_moduli`` from the principal stretches."""
+def _hessian(a, mu, lam):
+    """H_ii, and H_ij, twist and flip of each pair of axes, from the principal stretches."""
     l0 = log(a[0])
     l1 = log(a[1])
     l2 = log(a[2])
@@ -70,6 +72,13 @@ def hencky_wave_modulus(a, mu, lam):
     first = _pair(a[1], a[2], t1, t2, mu, lam)
     second = _pair(a[0], a[2], t0, t2, mu, lam)
     third = _pair(a[0], a[1], t0, t1, mu, lam)
+    return own, first, second, third
+
+
+@triton.jit
+def hencky_wave_modulus(a, mu, lam):
+    """``wave`` of ``stvk_hencky_moduli`` from the principal stretches."""
+    own, first, second, third = _hessian(a, mu, lam)
     return spectral_modulus(own, first, second, third, mu, lam)
 
 
@@ -80,4 +89,17 @@ def wave(F, mu, lam):
     return hencky_wave_modulus(a, mu, lam)
 
 
-TWIN = LawTwin(principal=principal, energy=energy, wave=wave)
+@triton.jit
+def adjoint(F, Q, mu, lam):
+    """Derivative of the stress in the direction Q, and of Q : P by mu and lam."""
+    u, a, v = svd3(F)
+    b = to_principal(u, Q, v)
+    own, first, second, third = _hessian(a, mu, lam)
+    one = mu * 0 + 1
+    diagonal = (b[0], b[4], b[8])
+    by_mu = dot3(diagonal, principal(a, one, mu * 0, mu, mu))
+    by_lam = dot3(diagonal, principal(a, mu * 0, one, mu, mu))
+    return spectral_change(u, v, b, own, first, second, third), by_mu, by_lam
+
+
+TWIN = LawTwin(principal=principal, energy=energy, wave=wave, adjoint=adjoint)

@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, matmul, transpose
+from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, dot9, matmul, transpose
 from gaussian_swaying.mpm.laws.triton.shared import LOG_FLOOR, log
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
@@ -22,4 +22,19 @@ def kirchhoff(F, mu, lam, internal, p):
     return matmul(pk1(F, mu, lam, internal, p), transpose(F))
 
 
-TWIN = LawTwin(pk1=pk1, kirchhoff=kirchhoff)
+@triton.jit
+def adjoint(F, Q, mu, lam):
+    """Derivative of :func:`pk1` in the direction Q, and of Q : P by mu and lam."""
+    cof = cofactor(F)
+    det = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    slope = 1.0 / tl.maximum(det, LOG_FLOOR)
+    volume = log(det)
+    pressure = (lam * volume - mu) * slope
+    curvature = (lam - tl.where(det < LOG_FLOOR, 0.0, lam * volume - mu)) * slope * slope
+    growth = dot9(cof, Q)
+    change = axpy9(mu, Q, curvature * growth, cof)
+    by_mu = dot9(F, Q) - slope * growth
+    return axpy9(1.0, change, pressure, cofactor_change(F, Q)), by_mu, volume * slope * growth
+
+
+TWIN = LawTwin(pk1=pk1, kirchhoff=kirchhoff, adjoint=adjoint)

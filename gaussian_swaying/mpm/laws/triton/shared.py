@@ -5,7 +5,7 @@ import math
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import dot3, largest, largest_eigenvalue
+from gaussian_swaying.geometry.linalg_triton import dot3, largest, largest_eigenvalue, matmul, transpose
 from gaussian_swaying.mpm.laws.shared import LOG_LIMIT
 from gaussian_swaying.mpm.laws.shared import ROOT as _ROOT
 
@@ -96,3 +96,29 @@ def spectral_modulus(own, first, second, third, mu, lam):
     wave = largest(wave, largest(second[1] - second[0], second[2] + second[0]))
     wave = largest(wave, largest(third[1] - third[0], third[2] + third[0]))
     return tl.minimum(wave, bound, tl.PropagateNan.ALL)
+
+
+@triton.jit
+def to_principal(u, Q, v):
+    """U^T Q V."""
+    return matmul(matmul(transpose(u), Q), v)
+
+
+@triton.jit
+def spectral_change(u, v, b, own, first, second, third):
+    """The derivative of a stress in a direction, from B = U^T Q V and the arguments of :func:`spectral_modulus`.
+
+    A symmetric part of B off the diagonal is multiplied by flip, a skew one by twist.
+    """
+    s12 = 0.5 * first[2] * (b[5] + b[7])
+    t12 = 0.5 * first[1] * (b[5] - b[7])
+    s02 = 0.5 * second[2] * (b[2] + b[6])
+    t02 = 0.5 * second[1] * (b[2] - b[6])
+    s01 = 0.5 * third[2] * (b[1] + b[3])
+    t01 = 0.5 * third[1] * (b[1] - b[3])
+    inner = (
+        own[0] * b[0] + third[0] * b[4] + second[0] * b[8], s01 + t01, s02 + t02,
+        s01 - t01, third[0] * b[0] + own[1] * b[4] + first[0] * b[8], s12 + t12,
+        s02 - t02, s12 - t12, second[0] * b[0] + first[0] * b[4] + own[2] * b[8],
+    )  # fmt: skip
+    return matmul(matmul(u, inner), transpose(v))

@@ -4,7 +4,14 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import dot3, svd3
-from gaussian_swaying.mpm.laws.triton.shared import EPSILON, LOG_FLOOR, share_above, spectral_modulus
+from gaussian_swaying.mpm.laws.triton.shared import (
+    EPSILON,
+    LOG_FLOOR,
+    share_above,
+    spectral_change,
+    spectral_modulus,
+    to_principal,
+)
 from gaussian_swaying.mpm.laws.triton.twin import LawTwin
 
 
@@ -99,8 +106,8 @@ def _pair(x, y, plane_x, plane_y, plane, whole, spread, direct, network, bulk, t
 
 
 @triton.jit
-def network_wave_modulus(a, mu, lam):
-    """``wave`` of ``spring_network_moduli`` from the principal stretches."""
+def _hessian(a, mu, lam):
+    """H_ii, and H_ij, twist and flip of each pair of axes, from the principal stretches."""
     least = tl.maximum(tl.minimum(mu, lam), 0.0)
     direct = 10.0 / 7 * least + 2 * (mu - least)
     network = 15 * least
@@ -130,6 +137,13 @@ def network_wave_modulus(a, mu, lam):
     first = _pair(a[1], a[2], plane1, plane2, plane0, whole, spread, direct, network, bulk, tension)
     second = _pair(a[0], a[2], plane0, plane2, plane1, whole, spread, direct, network, bulk, tension)
     third = _pair(a[0], a[1], plane0, plane1, plane2, whole, spread, direct, network, bulk, tension)
+    return own, first, second, third
+
+
+@triton.jit
+def network_wave_modulus(a, mu, lam):
+    """``wave`` of ``spring_network_moduli`` from the principal stretches."""
+    own, first, second, third = _hessian(a, mu, lam)
     return spectral_modulus(own, first, second, third, mu, lam)
 
 
@@ -140,4 +154,21 @@ def wave(F, mu, lam):
     return network_wave_modulus(a, mu, lam)
 
 
-TWIN = LawTwin(principal=principal, energy=energy, wave=wave)
+@triton.jit
+def adjoint(F, Q, mu, lam):
+    """Derivative of the stress in the direction Q, and of Q : P by mu and lam."""
+    u, a, v = svd3(F)
+    b = to_principal(u, Q, v)
+    own, first, second, third = _hessian(a, mu, lam)
+    one = mu * 0 + 1
+    diagonal = (b[0], b[4], b[8])
+    shear = 2 * (b[0] * (a[0] - 1) + b[4] * (a[1] - 1) + b[8] * (a[2] - 1))
+    bulk = (b[0] + b[4] + b[8]) * (a[0] + a[1] + a[2] - 3)
+    # the modulus of the network is the smaller of mu and lam; between equal ones torch shares its gradient
+    network = tl.where(tl.minimum(mu, lam) < 0, 0.0, dot3(diagonal, principal(a, one, one, mu, mu)) - shear - bulk)
+    share = tl.where(mu < lam, 1.0, tl.where(mu > lam, 0.0, 0.5))
+    change = spectral_change(u, v, b, own, first, second, third)
+    return change, shear + share * network, bulk + (1 - share) * network
+
+
+TWIN = LawTwin(principal=principal, energy=energy, wave=wave, adjoint=adjoint)

@@ -24,9 +24,11 @@ class LawTwin:
         flow: ``(a, mu, lam, internal, p, dt)``: principal stretches and internal variable after plastic flow.
         energy: ``(F, mu, lam)``: energy density.
         wave: ``(F, mu, lam)``: the first of ``ConstitutiveLaw.moduli``.
+        adjoint: ``(F, Q, mu, lam)``: the derivative of the stress P in a direction Q, which is the gradient of Q : P by
+            F, and the derivatives of Q : P by mu and by lam.
 
     A law needs ``principal``, or ``kirchhoff`` and, if it does not flow, ``pk1``. If a body needs the decomposition
-    anyway, all laws that have ``principal`` use it. Without ``energy`` and ``wave``, torch computes them.
+    anyway, all laws that have ``principal`` use it. Without ``energy``, ``wave`` and ``adjoint``, torch computes them.
 
     Raises:
         ValueError: If the law has no stress.
@@ -38,6 +40,7 @@ class LawTwin:
     flow: Any = None
     energy: Any = None
     wave: Any = None
+    adjoint: Any = None
 
     def __post_init__(self) -> None:
         if not (self.principal or (self.kirchhoff and (self.pk1 or self.flow))):

@@ -1,0 +1,230 @@
+"""Gradients of the force of the wind as a Triton function; the reference is torch's autograd of ``aero.wind_force``."""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.aero.force_triton import add_direction, times
+from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, cross3, dot3, load3, matmul
+from gaussian_swaying.geometry.patches_triton import area_vector
+
+
+@triton.jit
+def _sum3(s, a, t, b):
+    """S a + t b for vectors."""
+    return (s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2])
+
+
+@triton.jit
+def force_adjoint(
+    r, n, a, drag, friction, lift, PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr
+):  # fmt: skip
+    """Gradients of a . f by relative wind, normal and coefficients, and a . f; f is per half density and area."""
+    speed = tl.sqrt(dot3(r, r))
+    inverse = 1.0 / tl.maximum(speed, 1e-30)
+    square = speed * speed
+    along = dot3(r, n)
+    sign = tl.where(along < 0, -1.0, 1.0)
+    g = dot3(a, n)
+    # drag
+    if PROJECTED:
+        pressure = speed * along * g
+        by_r = _sum3(drag * g * along * inverse, r, drag * g * speed, n)
+        by_n = _sum3(drag * g * speed, r, drag * speed * along, a)
+    else:
+        pressure = square * sign * g
+        by_r = (2 * drag * sign * g * r[0], 2 * drag * sign * g * r[1], 2 * drag * sign * g * r[2])
+        by_n = (drag * square * sign * a[0], drag * square * sign * a[1], drag * square * sign * a[2])
+    # friction
+    t = _sum3(1.0, r, -along, n)
+    if UNIT:
+        size = tl.maximum(tl.sqrt(dot3(t, t)), 1e-18)  # finite where there is no tangent
+        b = (t[0] / size, t[1] / size, t[2] / size)
+        shear = dot3(a, b)
+        w = ((a[0] - shear * b[0]) / size, (a[1] - shear * b[1]) / size, (a[2] - shear * b[2]) / size)
+        wn = dot3(w, n)
+        more = _sum3(2 * shear, r, square, _sum3(1.0, w, -wn, n))
+        turn = _sum3(-square * wn, r, -square * along, w)
+        shear = square * shear
+    else:
+        shear = dot3(a, t)
+        more = _sum3(shear * inverse, r, speed, _sum3(1.0, a, -g, n))
+        turn = _sum3(-speed * g, r, -speed * along, a)
+        shear = speed * shear
+    by_r = _sum3(1.0, by_r, friction, more)
+    by_n = _sum3(1.0, by_n, friction, turn)
+    # lift
+    if LIFT:
+        ar = dot3(a, r)
+        side = sign * (square * g - along * ar)
+        more = _sum3(1.0, _sum3(2 * g, r, -along, a), -ar, n)
+        turn = _sum3(square, a, -ar, r)
+    else:
+        across = cross3(n, a)
+        product = dot3(r, across)
+        side = sign * speed * product
+        more = _sum3(product * inverse, r, speed, across)
+        turn = cross3(a, r)
+        turn = (speed * turn[0], speed * turn[1], speed * turn[2])
+    by_r = _sum3(1.0, by_r, sign * lift, more)
+    by_n = _sum3(1.0, by_n, sign * lift, turn)
+    return by_r, by_n, (pressure, shear, side), drag * pressure + friction * shear + lift * side
+
+
+@triton.jit
+def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constexpr):
+    """Gradients of a . f of ``force_triton.wind_force`` by F, by the velocity, by the wind and by the coefficients."""
+    rest = (patch[0], patch[1], patch[2])
+    vector, det = area_vector(F, rest)
+    size = tl.sqrt(dot3(vector, vector))
+    flat = size == 0
+    scale = tl.where(det < 0, -1.0, 1.0) / tl.where(flat, 1.0, size)
+    n = (
+        tl.where(flat, rest[0], vector[0] * scale),
+        tl.where(flat, rest[1], vector[1] * scale),
+        tl.where(flat, rest[2], vector[2] * scale),
+    )
+    widest = tl.load(numbers + 4)
+    relative = (
+        tl.load(wind) - velocity[0],
+        tl.load(wind + 1) - velocity[1],
+        tl.load(wind + 2) - velocity[2],
+    )
+    drag = tl.load(numbers)
+    friction = tl.load(numbers + 1)
+    lift = tl.load(numbers + 2)
+    by_r, by_n, parts, whole = force_adjoint(relative, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2])
+    half = tl.load(numbers + 3) * patch[3]
+    area = half * tl.minimum(size, widest)
+    # the unit normal and the area both come from the area vector
+    growth = tl.where(size < widest, half * whole, 0.0) * tl.where(det < 0, -1.0, 1.0)
+    turn = area * scale
+    normal_part = dot3(by_n, n)
+    v0 = turn * (by_n[0] - normal_part * n[0]) + growth * n[0]
+    v1 = turn * (by_n[1] - normal_part * n[1]) + growth * n[1]
+    v2 = turn * (by_n[2] - normal_part * n[2]) + growth * n[2]
+    outer = (
+        v0 * rest[0], v0 * rest[1], v0 * rest[2], v1 * rest[0], v1 * rest[1], v1 * rest[2],
+        v2 * rest[0], v2 * rest[1], v2 * rest[2],
+    )  # fmt: skip
+    by_wind = (area * by_r[0], area * by_r[1], area * by_r[2])
+    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    return cofactor_change(F, outer), by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
+
+
+@triton.jit
+def _outer(a, b):
+    """A b^T in nine parts."""
+    return (
+        a[0] * b[0], a[0] * b[1], a[0] * b[2], a[1] * b[0], a[1] * b[1], a[1] * b[2],
+        a[2] * b[0], a[2] * b[1], a[2] * b[2],
+    )  # fmt: skip
+
+
+@triton.jit
+def _transposed(m, x):
+    """M^T x."""
+    return (
+        m[0] * x[0] + m[3] * x[1] + m[6] * x[2],
+        m[1] * x[0] + m[4] * x[1] + m[7] * x[2],
+        m[2] * x[0] + m[5] * x[1] + m[8] * x[2],
+    )
+
+
+@triton.jit
+def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.constexpr):
+    """As :func:`wind_force_adjoint`, for ``force_triton.wind_on_groups`` without a unit tangent.
+
+    The names are those of ``aero.patches.grouped_force``; the sum over the sides that the patches show is constant.
+    """
+    first = 8 + 4 * place[0].to(tl.int32)
+    count = place[1].to(tl.int32)
+    real = count > 0
+    r = (tl.load(wind) - velocity[0], tl.load(wind + 1) - velocity[1], tl.load(wind + 2) - velocity[2])
+    drag = tl.load(numbers)
+    friction = tl.load(numbers + 1)
+    lift = tl.load(numbers + 2)
+    half = tl.load(numbers + 3)
+    widest = tl.load(numbers + 4)
+    speed = tl.sqrt(dot3(r, r))
+    inverse = 1.0 / tl.maximum(speed, 1e-30)
+    square = speed * speed
+    c = cofactor(F)
+    w = _transposed(c, r)
+    t0 = tl.load(numbers + first, real, 0.0)
+    t1 = tl.load(numbers + first + 1, real, 0.0)
+    t2 = tl.load(numbers + first + 2, real, 0.0)
+    t3 = tl.load(numbers + first + 3, real, 0.0)
+    t4 = tl.load(numbers + first + 4, real, 0.0)
+    t5 = tl.load(numbers + first + 5, real, 0.0)
+    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
+    rest = t0 + t3 + t5
+    zero = rest * 0
+    s = (zero, zero, zero)
+    u = (zero, zero, zero)
+    for k in range(0, tl.max(count), 4):  # four rows at once
+        row = first + 8 + 4 * k
+        b0 = load3(numbers, 1, row, k < count)
+        b1 = load3(numbers, 1, row + 4, k + 1 < count)
+        b2 = load3(numbers, 1, row + 8, k + 2 < count)
+        b3 = load3(numbers, 1, row + 12, k + 3 < count)
+        s, u = add_direction(s, u, b0, w, k < count, False)
+        s, u = add_direction(s, u, b1, w, k + 1 < count, False)
+        s, u = add_direction(s, u, b2, w, k + 2 < count, False)
+        s, u = add_direction(s, u, b3, w, k + 3 < count, False)
+    turned = matmul(c, tensor)
+    # a lane without patches gets an area, whose force is multiplied by zero
+    whole = tl.where(real, rest, 1.0)
+    grown = (
+        turned[0] * c[0] + turned[1] * c[1] + turned[2] * c[2] + turned[3] * c[3] + turned[4] * c[4]
+        + turned[5] * c[5] + turned[6] * c[6] + turned[7] * c[7] + turned[8] * c[8]
+    )  # fmt: skip
+    growth = tl.where(real, tl.sqrt(tl.maximum(grown / whole, 1.2e-38)), 1.0)
+    across = times(turned, w)
+    across = (across[0] / growth, across[1] / growth, across[2] / growth)
+    facing = times(c, s)
+    area = growth * rest
+    ar = dot3(a, r)
+    ac = dot3(a, across)
+    af = dot3(a, facing)
+    rub = area * ar - ac
+    shear = speed * rub
+    by_r = _sum3(friction * rub * inverse, r, friction * speed * area, a)
+    by_area = friction * speed * ar
+    to_across = -friction * speed
+    if OPTIONS[0]:
+        pressure = speed * ac
+        by_r = _sum3(1.0, by_r, drag * ac * inverse, r)
+        to_across += drag * speed
+        by_facing = (zero, zero, zero)
+    else:
+        pressure = square * af
+        by_r = _sum3(1.0, by_r, 2 * drag * af, r)
+        by_facing = (drag * square * a[0], drag * square * a[1], drag * square * a[2])
+    if OPTIONS[1]:
+        rf = dot3(r, facing)
+        side = square * af - ar * rf
+        by_r = _sum3(1.0, by_r, lift, _sum3(1.0, _sum3(2 * af, r, -rf, a), -ar, facing))
+        by_facing = _sum3(1.0, by_facing, lift, _sum3(square, a, -ar, r))
+    else:
+        turn = cross3(facing, a)
+        product = dot3(r, turn)
+        side = speed * product
+        by_r = _sum3(1.0, by_r, lift, _sum3(product * inverse, r, speed, turn))
+        by_facing = _sum3(1.0, by_facing, lift * speed, cross3(a, r))
+    by_across = (to_across * a[0], to_across * a[1], to_across * a[2])
+    total = drag * pressure + friction * shear + lift * side
+    cap = tl.minimum(widest / growth, 1.0)
+    by_growth = by_area * rest - dot3(by_across, across) / growth - tl.where(growth > widest, total / growth, 0.0)
+    scaled = (by_across[0] / growth, by_across[1] / growth, by_across[2] / growth)
+    by_w = _transposed(turned, scaled)
+    by_r = _sum3(1.0, by_r, 1.0, times(c, by_w))
+    by_grown = by_growth / (2 * growth * whole)
+    by_turned = axpy9(1.0, _outer(scaled, w), by_grown, c)
+    by_c = axpy9(1.0, _outer(by_facing, s), 1.0, matmul(by_turned, tensor))
+    by_c = axpy9(1.0, by_c, 1.0, _outer(r, by_w))
+    by_c = axpy9(1.0, by_c, by_grown, turned)
+    scale = tl.where(real, half * cap, 0.0)
+    by_c = axpy9(scale, by_c, 0.0, c)
+    by_wind = (scale * by_r[0], scale * by_r[1], scale * by_r[2])
+    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    return cofactor_change(F, by_c), by_velocity, by_wind, (scale * pressure, scale * shear, scale * side)

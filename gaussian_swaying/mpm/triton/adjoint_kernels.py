@@ -1,0 +1,320 @@
+"""Kernels of the backward pass of the ``total`` substep; the reference is torch's autograd of the torch substep.
+
+The adjoint of a substep has the structure of the substep: the gradient by the nodal forces is gathered at the
+particles, multiplied there by the derivatives of stress and force, and scattered to the nodes. So these kernels follow
+those in ``total_kernels``, with the same order of particles and without atomics.
+
+Substeps are numbered within a segment. A backward pass counts forward, from ``last`` down: its ``first_step`` is the
+number of substeps that it has done. Rows of ``bars``, one per active node: gradient by displacement and by velocity,
+each in four columns of eight. Rows of ``history``: displacement and velocity at the start of each substep, likewise.
+"""
+
+import triton
+import triton.language as tl
+
+from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
+from gaussian_swaying.mpm.laws.triton.body import ROW, pk1_adjoint
+from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight
+from gaussian_swaying.mpm.triton.total_kernels import gather
+
+
+@triton.jit(do_not_specialize=VARIES)
+def keep_nodes(active, nodes, fields, history, first_step, step_offset, BLOCK: tl.constexpr):
+    """Keep displacement and velocity of the active nodes at the start of a substep."""
+    step = tl.load(first_step) + step_offset
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    k = place // 8
+    mask = k < nodes
+    node = tl.load(active + k, mask, 0)
+    value = tl.load(fields + node * 8 + place % 8, mask, 0.0)
+    tl.store(history + step.to(tl.int64) * nodes * 8 + place, value, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def keep_rows(residual, rows, history, first_step, step_offset, BLOCK: tl.constexpr):
+    """Keep the velocities that held points had before they were stopped in the substep before."""
+    step = tl.load(first_step) + step_offset
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = place < 4 * rows
+    tl.store(history + step * rows * 4 + place, tl.load(residual + place, mask, 0.0), mask)
+
+
+@triton.jit
+def _add(to, value, real, chunk):
+    """Write the sums of some cells; from the second chunk of particles on, add to what is there."""
+    if chunk > 0:
+        value += tl.load(to, real, 0.0)
+    tl.store(to, value, real)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def particles_adjoint(
+    fraction, material, law, law_table, values, count,
+    cell_start, cell_node, cell_scene, cells,
+    fields, force_bar, partial, found, shares,
+    vectors, scenes, numbers, first_step, step_offset, last,
+    sx, sy, inverse_dx, viscous_time,
+    LAWS: tl.constexpr, MULTI: tl.constexpr, ADJOINT: tl.constexpr, OPTIONS: tl.constexpr, VISCOUS: tl.constexpr,
+    MATERIAL: tl.constexpr, SHARES: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Gradients by the nodal displacements (columns 0 to 2 of ``partial``) and velocities (4 to 6), summed by cells.
+
+    With MATERIAL the gradients by mu, lambda and volume are added to the three rows of ``found``; with SHARES those by
+    the vector and the numbers of the force are written to a row of eight for each substep and cell.
+    """
+    step = tl.load(last) - tl.load(first_step) - step_offset
+    cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
+    real = cell < cells
+    start = tl.load(cell_start + cell, real, 0)
+    end = tl.load(cell_start + cell + 1, real, 0)
+    node = tl.load(cell_node + cell, real, 0)[:, None]
+    scene = tl.load(cell_scene + cell, real, 0)[:, None]
+    longest = tl.max(end - start)
+    lane = tl.arange(0, LANES)[None, :]
+    known = real[:, None]
+    for chunk in range(0, longest, LANES):
+        index = start[:, None] + chunk + lane
+        mask = index < end[:, None]
+        f = (
+            tl.load(fraction + index, mask, 1.0),
+            tl.load(fraction + count + index, mask, 1.0),
+            tl.load(fraction + 2 * count + index, mask, 1.0),
+        )
+        volume = tl.load(material + index, mask, 0.0)
+        mu = tl.load(material + count + index, mask, 0.0)
+        lam = tl.load(material + 2 * count + index, mask, 0.0)
+        wz, gz = axis_weights(f[2], inverse_dx)
+        if VISCOUS:
+            _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+            v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        elif ADJOINT is not None:
+            _u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
+        else:
+            _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+        a, Q, _v = gather(force_bar, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+        if MULTI:
+            row = law_table + ROW * tl.load(law + index, mask, 0)
+        else:
+            row = law_table
+        by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
+        if VISCOUS:
+            more, by_rate, one, two = kelvin_voigt_adjoint(F, rate, Q, mu, lam, viscous_time)
+            by_F = axpy9(1.0, by_F, 1.0, more)
+            by_mu += one
+            by_lam += two
+            by_rate = scale9(-volume, by_rate)
+        if MATERIAL:
+            to = found + index
+            tl.store(to, tl.load(to, mask, 0.0) - volume * by_mu, mask)
+            tl.store(to + count, tl.load(to + count, mask, 0.0) - volume * by_lam, mask)
+            # the stress is homogeneous in mu and lambda, so Q : P follows from its derivatives
+            to = found + 2 * count + index
+            tl.store(to, tl.load(to, mask, 0.0) - mu * by_mu - lam * by_lam, mask)
+        by_F = scale9(-volume, by_F)
+        if ADJOINT is not None:
+            first = load3(values, count, index, mask)
+            value = (first[0], first[1], first[2], tl.load(values + 3 * count + index, mask, 0.0))
+            vector = vectors + (step * scenes + scene) * 8  # forces.TWIN_VECTOR
+            more, by_v, by_vector, by_numbers = ADJOINT(F, v, value, vector, numbers, a, OPTIONS)
+            by_F = axpy9(1.0, by_F, 1.0, more)
+            if SHARES:
+                to = shares + (step.to(tl.int64) * cells + cell) * 8
+                for c in tl.static_range(3):
+                    _add(to + c, tl.sum(tl.where(mask, by_vector[c], 0.0), 1), real, chunk)
+                    _add(to + 4 + c, tl.sum(tl.where(mask, by_numbers[c], 0.0), 1), real, chunk)
+        for i in range(3):
+            wx, gx = node_weight(f[0], i, inverse_dx)
+            for j in range(3):
+                wy, gy = node_weight(f[1], j, inverse_dx)
+                w = wx * wy
+                ax = gx * wy
+                ay = wx * gy
+                a0 = by_F[0] * ax + by_F[1] * ay
+                a1 = by_F[3] * ax + by_F[4] * ay
+                a2 = by_F[6] * ax + by_F[7] * ay
+                if VISCOUS:
+                    b0 = by_rate[0] * ax + by_rate[1] * ay
+                    b1 = by_rate[3] * ax + by_rate[4] * ay
+                    b2 = by_rate[6] * ax + by_rate[7] * ay
+                    if ADJOINT is not None:
+                        b0 += by_v[0] * w
+                        b1 += by_v[1] * w
+                        b2 += by_v[2] * w
+                for k in tl.static_range(3):
+                    out = partial + (((i * 3 + j) * 3 + k) * (cells + 1) + cell) * WIDTH
+                    gw = gz[k] * w
+                    _add(out, tl.sum(wz[k] * a0 + gw * by_F[2], 1), real, chunk)
+                    _add(out + 1, tl.sum(wz[k] * a1 + gw * by_F[5], 1), real, chunk)
+                    _add(out + 2, tl.sum(wz[k] * a2 + gw * by_F[8], 1), real, chunk)
+                    if VISCOUS:
+                        _add(out + 4, tl.sum(wz[k] * b0 + gw * by_rate[2], 1), real, chunk)
+                        _add(out + 5, tl.sum(wz[k] * b1 + gw * by_rate[5], 1), real, chunk)
+                        _add(out + 6, tl.sum(wz[k] * b2 + gw * by_rate[8], 1), real, chunk)
+                    elif ADJOINT is not None:
+                        ww = wz[k] * w
+                        _add(out + 4, tl.sum(ww * by_v[0], 1), real, chunk)
+                        _add(out + 5, tl.sum(ww * by_v[1], 1), real, chunk)
+                        _add(out + 6, tl.sum(ww * by_v[2], 1), real, chunk)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def nodes_adjoint(
+    active, source, sources, inverse_mass, held, nodes, partial, fields, force_bar, history, bars, mass_bar,
+    schedule, first_step, step_offset, last, gravity_x, gravity_y, gravity_z,
+    SUM: tl.constexpr, PUSH: tl.constexpr, FINISH: tl.constexpr, VELOCITY: tl.constexpr, HELD: tl.constexpr,
+    MASS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr, SOURCES: tl.constexpr,
+):  # fmt: skip
+    """Gradients by the nodal fields, and by the forces of the substep before.
+
+    SUM adds the sums of the particles of the later substep, whose part for the velocity exists with VELOCITY. PUSH goes
+    back through the new displacement, which ends a substep. FINISH goes back through pins (HELD), damping and the new
+    velocity, and puts the state at the start of the substep into ``fields``, for the particles. MASS adds the gradient
+    by the inverse mass to ``mass_bar``.
+    """
+    step = tl.load(last) - tl.load(first_step) - step_offset
+    k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = k < nodes
+    own = bars + k * 8
+    u0 = tl.load(own, mask, 0.0)
+    u1 = tl.load(own + 1, mask, 0.0)
+    u2 = tl.load(own + 2, mask, 0.0)
+    v0 = tl.load(own + 4, mask, 0.0)
+    v1 = tl.load(own + 5, mask, 0.0)
+    v2 = tl.load(own + 6, mask, 0.0)
+    if SUM:
+        o = tl.arange(0, SOURCES)[:, None]  # all at once
+        known = mask[None, :] & (o < sources)
+        row = partial + tl.load(source + o * nodes + k[None, :], known, 0) * WIDTH
+        u0 += tl.sum(tl.load(row, known, 0.0), 0)
+        u1 += tl.sum(tl.load(row + 1, known, 0.0), 0)
+        u2 += tl.sum(tl.load(row + 2, known, 0.0), 0)
+        if VELOCITY:
+            v0 += tl.sum(tl.load(row + 4, known, 0.0), 0)
+            v1 += tl.sum(tl.load(row + 5, known, 0.0), 0)
+            v2 += tl.sum(tl.load(row + 6, known, 0.0), 0)
+        tl.store(own, u0, mask)
+        tl.store(own + 1, u1, mask)
+        tl.store(own + 2, u2, mask)
+    if PUSH:
+        dt = tl.load(schedule + (step + 1) * 4 + 1)
+        v0 += dt * u0
+        v1 += dt * u1
+        v2 += dt * u2
+    if FINISH:
+        kick = tl.load(schedule + (step + 1) * 4)
+        decay = tl.load(schedule + (step + 1) * 4 + 2)
+        inverse = tl.load(inverse_mass + k, mask, 0.0)
+        node = tl.load(active + k, mask, 0)
+        before = history + (step.to(tl.int64) * nodes + k) * 8
+        w0 = tl.load(before + 4, mask, 0.0)
+        w1 = tl.load(before + 5, mask, 0.0)
+        w2 = tl.load(before + 6, mask, 0.0)
+        at = fields + node * 8
+        for c in tl.static_range(3):
+            tl.store(at + c, tl.load(before + c, mask, 0.0), mask)
+        tl.store(at + 4, w0, mask)
+        tl.store(at + 5, w1, mask)
+        tl.store(at + 6, w2, mask)
+        if MASS:
+            # what forces and held points added to the velocity is proportional to the inverse mass
+            after = before + nodes.to(tl.int64) * 8
+            rest = decay
+            if HELD:
+                rest = tl.where(tl.load(held + k, mask, 0) == 0, decay, 0.0)
+            gain0 = tl.load(after + 4, mask, 0.0) - rest * (w0 + kick * gravity_x)
+            gain1 = tl.load(after + 5, mask, 0.0) - rest * (w1 + kick * gravity_y)
+            gain2 = tl.load(after + 6, mask, 0.0) - rest * (w2 + kick * gravity_z)
+            gain = (v0 * gain0 + v1 * gain1 + v2 * gain2) / tl.where(mask, inverse, 1.0)
+            tl.store(mass_bar + k, tl.load(mass_bar + k, mask, 0.0) + gain, mask)
+        if HELD:
+            decay = tl.where(tl.load(held + k, mask, 0) == 0, decay, 0.0)
+        v0 *= decay
+        v1 *= decay
+        v2 *= decay
+        push = kick * inverse
+        to = force_bar + node * 8
+        tl.store(to, push * v0, mask)
+        tl.store(to + 1, push * v1, mask)
+        tl.store(to + 2, push * v2, mask)
+    tl.store(own + 4, v0, mask)
+    tl.store(own + 5, v1, mask)
+    tl.store(own + 6, v2, mask)
+
+
+@triton.jit(do_not_specialize=VARIES)
+def rows_adjoint(affected, scene, push, bars, residual, nodes, rows, BLOCK: tl.constexpr):
+    """The multiplier of each held row: the transpose of what rows push, shape (rows, nodes), times the gradient."""
+    row = tl.program_id(0)
+    own = row // rows
+    a0 = tl.zeros([BLOCK], tl.float32)
+    a1 = tl.zeros([BLOCK], tl.float32)
+    a2 = tl.zeros([BLOCK], tl.float32)
+    for start in range(0, nodes, BLOCK):
+        n = start + tl.arange(0, BLOCK)
+        mask = n < nodes
+        mask = mask & (tl.load(scene + n, mask, -1) == own)
+        b = tl.load(push + (row - own * rows) * nodes + n, mask, 0.0)
+        place = bars + tl.load(affected + n, mask, 0) * 8 + 4
+        a0 += b * tl.load(place, mask, 0.0)
+        a1 += b * tl.load(place + 1, mask, 0.0)
+        a2 += b * tl.load(place + 2, mask, 0.0)
+    tl.store(residual + row * 4, tl.sum(a0, 0))
+    tl.store(residual + row * 4 + 1, tl.sum(a1, 0))
+    tl.store(residual + row * 4 + 2, tl.sum(a2, 0))
+
+
+@triton.jit(do_not_specialize=VARIES)
+def hold_adjoint(
+    affected, scene, weight, residual, nodes, rows, bars,
+    weight_bar, multipliers, all_rows, inverse_mass, history, active_count, first_step, step_offset, last,
+    WEIGHTS: tl.constexpr, BLOCK: tl.constexpr, ROWS: tl.constexpr,
+):  # fmt: skip
+    """Subtract the rows, with weights of shape (nodes, rows), times their multipliers from the gradient.
+
+    WEIGHTS adds the gradient by the weights: less the forward multiplier times the gradient by the momentum, and less
+    that of the gradient times the velocity after the substep.
+    """
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = n < nodes
+    first = tl.load(scene + n, mask, 0) * rows
+    a0 = tl.zeros([BLOCK], tl.float32)
+    a1 = tl.zeros([BLOCK], tl.float32)
+    a2 = tl.zeros([BLOCK], tl.float32)
+    for start in range(0, rows, ROWS):
+        k = start + tl.arange(0, ROWS)
+        known = mask[:, None] & (k < rows)[None, :]
+        b = tl.load(weight + n[:, None] * rows + k[None, :], known, 0.0)
+        place = residual + (first[:, None] + k[None, :]) * 4
+        a0 += tl.sum(b * tl.load(place, known, 0.0), 1)
+        a1 += tl.sum(b * tl.load(place + 1, known, 0.0), 1)
+        a2 += tl.sum(b * tl.load(place + 2, known, 0.0), 1)
+    own = tl.load(affected + n, mask, 0)
+    at = bars + own * 8 + 4
+    a0 = tl.load(at, mask, 0.0) - a0
+    a1 = tl.load(at + 1, mask, 0.0) - a1
+    a2 = tl.load(at + 2, mask, 0.0) - a2
+    tl.store(at, a0, mask)
+    tl.store(at + 1, a1, mask)
+    tl.store(at + 2, a2, mask)
+    if WEIGHTS:
+        step = tl.load(last) - tl.load(first_step) - step_offset
+        inverse = tl.load(inverse_mass + own, mask, 0.0)
+        after = history + ((step + 1).to(tl.int64) * active_count + own) * 8 + 4
+        v0 = tl.load(after, mask, 0.0)
+        v1 = tl.load(after + 1, mask, 0.0)
+        v2 = tl.load(after + 2, mask, 0.0)
+        pushed = multipliers + step * all_rows * 4
+        for start in range(0, rows, ROWS):
+            k = start + tl.arange(0, ROWS)
+            known = mask[:, None] & (k < rows)[None, :]
+            place = (first[:, None] + k[None, :]) * 4
+            bar = v0[:, None] * tl.load(residual + place, known, 0.0)
+            bar += v1[:, None] * tl.load(residual + place + 1, known, 0.0)
+            bar += v2[:, None] * tl.load(residual + place + 2, known, 0.0)
+            bar += (inverse * a0)[:, None] * tl.load(pushed + place, known, 0.0)
+            bar += (inverse * a1)[:, None] * tl.load(pushed + place + 1, known, 0.0)
+            bar += (inverse * a2)[:, None] * tl.load(pushed + place + 2, known, 0.0)
+            to = weight_bar + n[:, None] * rows + k[None, :]
+            tl.store(to, tl.load(to, known, 0.0) - bar, known)
