@@ -45,7 +45,7 @@ class FitVideo:
     cameras: int = 2
     size: tuple[int, int] = (480, 270)
     angle: float = 45.0
-    samples: int = 4
+    samples: int = 1
     read_noise: float = 0.006
     shot_noise: float = 2e-4
     quality: int = 85
@@ -144,13 +144,16 @@ def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
     }
 
 
-def scene_settings(pattern: FlagPattern, video: FitVideo, law: str, spacing: float = 0.01) -> dict[str, Any]:
+def scene_settings(
+    pattern: FlagPattern, video: FitVideo, law: str, folder: str, spacing: float = 0.005
+) -> dict[str, Any]:
     """A configuration of ``gaussian-swaying sim`` for a case, with wrong values for what is sought.
 
     Args:
         pattern: The case.
         video: Its video.
         law: ``projected``, the closest law that is always there, or ``linear``, that of the data.
+        folder: Where the case is.
         spacing: Distance between Gaussians [m].
     """
     edge: dict[str, Any] = {"min": [None, None, None], "max": [round(1.1 * spacing, 6), None, None]}
@@ -168,6 +171,7 @@ def scene_settings(pattern: FlagPattern, video: FitVideo, law: str, spacing: flo
                     "width": pattern.width,
                     "height": pattern.height,
                     "spacing": spacing,
+                    "overlap": 0.4,
                     "ripple": pattern.ripple,
                     "pattern": "printed",
                     "yaw": pattern.yaw,
@@ -199,16 +203,16 @@ def scene_settings(pattern: FlagPattern, video: FitVideo, law: str, spacing: flo
             "class_path": "DiffuseShader",
             "init_args": {"light": list(video.light), "two_sided": True, "ambient": video.ambient},
         },
-        "camera": {"class_path": "TransformsCamera", "init_args": {"path": "transforms.json", "frame": 0}},
+        "camera": {"class_path": "TransformsCamera", "init_args": {"path": f"{folder}/transforms.json", "frame": 0}},
     }
 
 
-def fit_settings(pattern: FlagPattern) -> dict[str, Any]:
-    """A configuration of ``gaussian-swaying fit`` for a case: what is sought, and in which part of the video."""
+def fit_settings(folder: str) -> dict[str, Any]:
+    """A configuration of ``gaussian-swaying fit`` for the case in a folder: what is sought, from half of the video."""
     return {
-        "scene": "scene.yaml",
-        "capture": "transforms.json",
-        "until": 0.5 * (pattern.frames - 1) / pattern.fps,
+        "base": [f"{folder}/scene.yaml"],
+        "videos": [folder],
+        "fit_share": 0.5,
         "unknowns": {
             "wind.speed": {"range": [0.5, 10.0]},
             "wind.azimuth": {"range": [-90.0, 90.0]},

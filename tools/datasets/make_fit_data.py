@@ -41,9 +41,12 @@ from fit_video import (
 from flag_motion import read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture
 from flag_reference import FlagPattern
-from make_flag_dataset import claim, missing_pictures
+from make_flag_dataset import claim, make_uncertainty, missing_pictures
 
 from gaussian_swaying._files import atomic, write_json, write_text
+
+UNCERTAINTY = ("steps doubled", "coarser")
+"""How else the motions are solved, see :func:`flag_difference.variants`."""
 
 
 def make_pictures(pattern: FlagPattern, folder: Path, video: FitVideo) -> int:
@@ -101,9 +104,8 @@ def _studio(pattern: FlagPattern, video: FitVideo) -> Studio:
     )
 
 
-def make_case(name: str, folder: Path, video: FitVideo, cells: int | None, frames: int | None, law: str) -> None:
+def make_case(name: str, pattern: FlagPattern, folder: Path, video: FitVideo, law: str) -> None:
     """Make what is missing of one case."""
-    pattern = case_of(name, cells, frames)
 
     def report(line: str) -> None:
         print(f"{name}: {line}", flush=True)
@@ -112,8 +114,8 @@ def make_case(name: str, folder: Path, video: FitVideo, cells: int | None, frame
     if solve_pattern(pattern, folder / "cloth.npz"):
         report(f"cloth solved in {time.time() - started:.0f} s")
     write_json(folder / "truth.json", truth_fields(pattern, video))
-    _write_yaml(folder / "scene.yaml", scene_settings(pattern, video, law))
-    _write_yaml(folder / "fit.yaml", fit_settings(pattern))
+    _write_yaml(folder / "scene.yaml", scene_settings(pattern, video, law, folder.as_posix()))
+    _write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()))
     started = time.time()
     made = make_pictures(pattern, folder, video)
     seconds = time.time() - started
@@ -127,19 +129,20 @@ def _write_yaml(path: Path, settings: dict[str, Any]) -> None:
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    add = parser.add_argument
+    add, base = parser.add_argument, FitVideo()
     add("--out", type=Path, default=Path("outputs/fit_data"), help="folder to write (default: %(default)s)")
     add("--case", nargs="+", choices=sorted(CASES), default=list(CASES), help="which (default: all)")
-    add("--cameras", type=int, default=2, help="cameras, 1 to 8 (2)")
-    add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), default=(480, 270), help="pixels (480 270)")
-    add("--samples", type=int, default=8, help="light paths per pixel (4)")
+    add("--cameras", type=int, default=base.cameras, help="cameras, 1 to 8 (2)")
+    add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), default=base.size, help="pixels (480 270)")
+    add("--samples", type=int, default=base.samples, help="light paths per pixel (1)")
     add("--noise", type=float, default=1.0, help="times the noise of a phone (1)")
-    add("--quality", type=int, default=85, help="of the JPEG files (85)")
-    add("--seed", type=int, default=0, help="of the noise (0)")
+    add("--quality", type=int, default=base.quality, help="of the JPEG files (85)")
+    add("--seed", type=int, default=base.seed, help="of the noise (0)")
     add("--cells", type=int, help="cells of the mesh along the longer side (60)")
     add("--frames", type=int, help="number of frames, the first at rest (97)")
     add("--law", choices=LAWS, default="projected", help="force law in scene.yaml (projected)")
-    add("--threads", type=int, default=1, help="threads to render with; 0 for all (1)")
+    add("--uncertainty", action="store_true", help="solve the motions otherwise, too, and compare")
+    add("--threads", type=int, default=base.threads, help="threads to render with; 0 for all (1)")
     add("--preview", action="store_true", help="coarse mesh, small pictures, one second")
     return parser.parse_args(argv)
 
@@ -164,7 +167,13 @@ def main(argv: list[str] | None = None) -> int:
         frames = options.frames or (25 if options.preview else None)
         require_bpy()
         for name in options.case:
-            make_case(name, options.out / name, video, cells, frames, options.law)
+            pattern = case_of(name, cells, frames)
+            if options.uncertainty:
+                found = make_uncertainty(pattern, options.out / name, list(UNCERTAINTY), print, every=1)
+                for variant, row in found["variants"].items():
+                    print(f"{name}: {variant}: {100 * row['corresponding']:.2f} % of the longer side", flush=True)
+            else:
+                make_case(name, pattern, options.out / name, video, options.law)
     except (ImportError, ValueError, ArithmeticError) as error:
         print(f"make_fit_data.py: {error}", file=sys.stderr)
         return 1
