@@ -138,7 +138,7 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--noise", type=float, default=1.0, help="times the noise of a phone (1)")
     add("--quality", type=int, default=base.quality, help="of the JPEG files (85)")
     add("--seed", type=int, default=base.seed, help="of the noise (0)")
-    add("--cells", type=int, help="cells of the mesh along the longer side (60)")
+    add("--cells", type=int, help="cells of the mesh along the longer side (50, or 60)")
     add("--frames", type=int, help="number of frames, the first at rest (97)")
     add("--law", choices=LAWS, default="projected", help="force law in scene.yaml (projected)")
     add("--uncertainty", action="store_true", help="solve the motions otherwise, too, and compare")
