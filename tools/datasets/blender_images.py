@@ -76,6 +76,7 @@ class Studio:
         transfer: ``linear``: pixel values are proportional to light, and so are the textures. ``srgb``: both are as
             from a camera.
         threads: Threads to render with; 0 for all.
+        ambient: Share of the light that comes from everywhere; the lamps have the rest.
 
     Raises:
         ImportError: If ``bpy`` is not there.
@@ -93,6 +94,7 @@ class Studio:
         transparent: bool,
         transfer: str = "linear",
         threads: int = 0,
+        ambient: float = 0.0,
     ) -> None:
         bpy = self._bpy = require_bpy()
         bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -106,7 +108,10 @@ class Studio:
         self._mesh.materials.append(_cloth_material(bpy, texture, transfer))
         scene.collection.objects.link(bpy.data.objects.new("sheet", self._mesh))
         for index, lamp in enumerate(lamps):
-            self._add_lamp(f"lamp{index}", lamp, center, lamp_size)
+            self._add_lamp(f"lamp{index}", lamp, center, lamp_size, 1.0 - ambient)
+        if ambient:
+            scene.world = bpy.data.worlds.new("world")
+            scene.world.color = (ambient, ambient, ambient)
         camera = bpy.data.cameras.new("camera")
         camera.sensor_fit, camera.clip_start, camera.clip_end = "HORIZONTAL", 0.01, 1000.0
         self._camera = bpy.data.objects.new("camera", camera)
@@ -132,13 +137,13 @@ class Studio:
         render.image_settings.color_mode = "RGBA" if transparent else "RGB"
         render.image_settings.color_depth = "8"
 
-    def _add_lamp(self, name: str, position: np.ndarray, center: np.ndarray, size: float) -> None:
+    def _add_lamp(self, name: str, position: np.ndarray, center: np.ndarray, size: float, share: float) -> None:
         from mathutils import Matrix
 
         light = self._bpy.data.lights.new(name, "AREA")
         light.shape, light.size = "SQUARE", size
         # a diffuse lamp of power P gives P / (pi d^2) at distance d; white cloth scatters 1 / pi of that
-        light.energy = float(np.pi**2 * ((position - center) ** 2).sum())
+        light.energy = float(share * np.pi**2 * ((position - center) ** 2).sum())
         lamp = self._bpy.data.objects.new(name, light)
         lamp.matrix_world = Matrix(look_at(position, center).tolist())
         self._scene.collection.objects.link(lamp)

@@ -6,8 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 from blender_images import View, look_at
 from flag_reference import FlagPattern
+
+from gaussian_swaying.scenes.printed_cloth import printed_colours
 
 _BANDS = ((0.83, 0.30, 0.18), (0.95, 0.92, 0.85), (0.13, 0.33, 0.55))
 
@@ -17,14 +20,15 @@ _DISC, _WHITE = (0.93, 0.68, 0.20), 0.9
 def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
     """Colours of a flag in 0 to 1, upper row first, shape (H, W, 3), float32.
 
-    ``white`` is plain, ``stripes`` has three bands and a disc, anything else is the path of an image.
+    ``white`` is plain, ``stripes`` has three bands and a disc, ``printed`` has features everywhere, as in
+    ``FlagScene``, and anything else is the path of an image.
 
     Raises:
         ValueError: If the image cannot be read.
     """
     if pattern.texture == "white":
         return np.full((2, 2, 3), _WHITE, dtype=np.float32)
-    if pattern.texture != "stripes":
+    if pattern.texture not in ("stripes", "printed"):
         import imageio.v3 as iio
 
         try:
@@ -39,6 +43,9 @@ def draw_texture(pattern: FlagPattern, width: int = 1024) -> np.ndarray:
     height = max(2, round(width * pattern.height / pattern.width))
     x = (np.arange(width) + 0.5) / width * pattern.width
     z = (1 - (np.arange(height) + 0.5) / height)[:, None] * pattern.height
+    if pattern.texture == "printed":
+        places = torch.from_numpy(np.stack(np.broadcast_arrays(x, z)))
+        return printed_colours(*places).float().numpy()
     band = ((1 - z / pattern.height) * 3).astype(np.int64).clip(0, 2)
     colors = np.array(_BANDS)[np.broadcast_to(band, (height, width))]
     disc = np.hypot(x - 0.5 * pattern.width, z - 0.5 * pattern.height) < 0.2 * pattern.height
@@ -77,11 +84,23 @@ def reference_view(
         height: Height of the image [pixels].
         angle: Horizontal field of view [radians].
     """
-    normal = pattern.normal()
-    frame = look_at(pattern.center() + normal, pattern.center())[:3, :3]
+    frame = look_at(pattern.center() + pattern.normal(), pattern.center())[:3, :3]
+    return view_of_all(frame, positions, width, height, angle)
+
+
+def view_of_all(frame: np.ndarray, positions: np.ndarray, width: int, height: int, angle: float) -> View:
+    """The camera with given axes that has a whole motion in view, with 4 % of margin on each side.
+
+    Args:
+        frame: Its axes in the world as columns: right, up, backward; shape (3, 3).
+        positions: The motion [m], shape (F, V, 3).
+        width: Width of the image [pixels].
+        height: Height of the image [pixels].
+        angle: Horizontal field of view [radians].
+    """
     seen = positions.reshape(-1, 3).astype(np.float64) @ frame  # right, up, towards the camera
     middle = 0.5 * (seen.min(0) + seen.max(0))
-    tangent = math.tan(0.5 * angle) * np.array([1.0, height / width]) / 1.08  # 4 % of margin on each side
+    tangent = math.tan(0.5 * angle) * np.array([1.0, height / width]) / 1.08
     middle[2] = max((np.abs(seen[:, k] - middle[k]) / tangent[k] + seen[:, 2]).max() for k in (0, 1))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = frame, frame @ middle
