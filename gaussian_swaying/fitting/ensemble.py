@@ -66,27 +66,32 @@ class Ensemble:
         self.simulation = simulation
         self.stiffening = SAFETY
 
-    def run(self, values: Sequence[Values], times: Sequence[float], careful: bool = True) -> Iterator[list[MPMState]]:
+    def run(
+        self, values: Sequence[Values], times: Sequence[float], careful: bool = True, alike: bool = True
+    ) -> Iterator[list[MPMState]]:
         """The states of all variants at each time, in the order of ``values``.
 
         Args:
             values: For each variant the values that replace those of the base.
             times: Times [s], ascending, from 0 on.
             careful: Raise if a substep was too long; otherwise such a variant may end in NaN.
+            alike: Take the same substeps for all, those of the stiffest. If not, variants that need more substeps are
+                batches of their own.
 
         Raises:
             SubstepTooLongError: If the material stiffened too much; ``stiffening`` is raised for the next try.
         """
         variants = [variant_of(self.simulation, own) for own in values]
-        groups = self._groups(variants)
-        rate = max(self._rate(group) for group in groups)
+        groups = self._groups(variants, alike)
+        rates = [self._rate(group) for group in groups]
+        if alike:
+            rates = [max(rates)] * len(groups)
         now = 0.0
         with torch.no_grad():
             for time in times:
                 if time > now:
-                    steps = max(1, math.ceil((time - now) * rate))
-                    for group in groups:
-                        self._advance(group, time - now, steps, careful)
+                    for group, rate in zip(groups, rates, strict=True):
+                        self._advance(group, time - now, max(1, math.ceil((time - now) * rate)), careful)
                     now = time
                 found: list[MPMState | None] = [None] * len(values)
                 for group in groups:
@@ -94,10 +99,20 @@ class Ensemble:
                         found[member] = member_of(group.state, place)
                 yield [state for state in found if state is not None]
 
-    def _groups(self, variants: Sequence[Variant]) -> list[_Group]:
+    def _groups(self, variants: Sequence[Variant], alike: bool) -> list[_Group]:
         shared: dict[tuple[float, ...], list[int]] = {}
         for number, variant in enumerate(variants):
-            shared.setdefault((*variant.aero, *variant.damping), []).append(number)
+            wave = (
+                0
+                if alike
+                else round(
+                    2
+                    * math.log2(
+                        float((variant.points.youngs_modulus * variant.points.volume / variant.points.mass).amax())
+                    )
+                )
+            )
+            shared.setdefault((*variant.aero, *variant.damping, wave), []).append(number)
         return [self._group(members, [variants[k] for k in members]) for members in shared.values()]
 
     def _group(self, members: list[int], variants: list[Variant]) -> _Group:

@@ -145,13 +145,14 @@ def compare(
         evidence: What is compared.
         values: The values of each variant.
         times: Times of the frames to compare [s], ascending.
-        careful: Repeat with shorter substeps if the material stiffens; else a variant may end in NaN.
+        careful: Take the same substeps for all, and repeat with shorter ones if the material stiffens. If not, each
+            variant takes its own, and may end in NaN.
 
     Returns:
         One block for each kind, joined over cameras and times; clusters of different kinds and, for pictures, cameras
         differ.
     """
-    for _ in range(RETRIES):
+    for _ in range(RETRIES if careful else 1):
         try:
             return _compare(ensemble, evidence, values, times, careful)
         except SubstepTooLongError:
@@ -163,7 +164,7 @@ def _compare(
     ensemble: Ensemble, evidence: Sequence[Evidence], values: Sequence[Values], times: Sequence[float], careful: bool
 ) -> list[Block]:
     parts: dict[str, list[tuple[Tensor, Tensor]]] = {}
-    for time, states in zip(times, ensemble.run(values, times, careful), strict=True):
+    for time, states in zip(times, ensemble.run(values, times, careful, alike=careful), strict=True):
         if time <= 0:  # at rest all variants are alike
             continue
         for place, part in enumerate(evidence):

@@ -26,12 +26,13 @@ from gaussian_swaying.fitting.evidence import (
 )
 from gaussian_swaying.fitting.identifiability import check_apart, directions
 from gaussian_swaying.fitting.least_squares import (
+    LEAST_GAIN,
     Normal,
     Progress,
+    central_sensitivities,
     huber,
     iterate,
     normal_equations,
-    sensitivities,
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
@@ -48,13 +49,16 @@ HORIZONS = (0.35, 0.65, 1.0)
 """Shares of the fitted frames that the first stage takes, one after the other: chaos grows with time."""
 ROUNDS = 3
 """How often Gaussians are matched again."""
-SEARCHED = 0.5
+SEARCHED = 0.3
 """Share of the fitted frames that the coarse search looks at."""
 NEAR = 0.1
 """Standard deviation of the second part of the search, as a share of the ranges."""
 COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
 """Residuals that the search takes for large: shares of the picture's width, and grey levels."""
 TOLERANCE = 3e-4
+"""Shortest step of the last stage, as a share of the ranges."""
+ROUGH = 30
+"""How many times less exact the other steps are."""
 
 Say = Callable[[str], None]
 
@@ -104,6 +108,10 @@ class Fit:
         self.simulation, self.videos, self.plan, self.say = simulation, list(videos), plan, say
         self.times = frame_times(videos)
         fitted = max(3, round(plan.fit_share * len(self.times)))
+        if plan.until is not None:
+            fitted = sum(time <= plan.until + 1e-6 for time in self.times)
+            if fitted < 3:
+                raise ValueError(f"Fewer than three frames lie before `until` = {plan.until:g} s: raise it.")
         self.fitted = self.times[:fitted]
         masked = any(video.masks is not None for video in videos)
         self.stages = [stage for stage in plan.stages if masked or stage != "silhouettes"]
@@ -179,7 +187,7 @@ class Fit:
     def search(self) -> list[float]:
         """The best place of a coarse search: Sobol's sequence over the ranges, then draws around the best place.
 
-        Coefficients and damping stay in the middle of their ranges, so that all simulations are one batch.
+        Coefficients and damping stay in the middle of their ranges: simulations of like stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = [0.5 if u.start is None else u.share(u.start) for u in unknowns]
@@ -237,7 +245,9 @@ class Fit:
             progress = Progress(torch.tensor(course.place, dtype=torch.float64), course.damping, course.iteration)
             residuals, floors = self.residuals(evidence, times), {part.kind: part.floor for part in evidence}
             while not progress.done and progress.iteration < self.plan.iterations:
-                iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, TOLERANCE)  # noqa: B023
+                last = course.step == len(steps) - 1
+                close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+                iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
                 course.place, course.damping = progress.place.tolist(), progress.damping
                 course.iteration, course.seconds = progress.iteration, time.monotonic() - clock
                 row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": progress.cost}
@@ -259,7 +269,7 @@ class Fit:
         )
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
-        blocks, steps = sensitivities(self.residuals(evidence, times), place)
+        blocks, steps = central_sensitivities(self.residuals(evidence, times), place)
         return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
 
     def _check_apart(self, course: Course) -> None:

@@ -22,6 +22,7 @@ HUBER = 1.345
 DAMPINGS = (0.0, 0.1, 1.0, 10.0)
 """Trial steps of an iteration: factors of the damping of the last accepted step; 0 is the Gauss-Newton step."""
 MOST_DAMPING = 1e4
+"""Damping at which the search for a better place ends."""
 LEAST_GAIN = 1e-4
 REACH = 0.25
 """Longest step, as a share of each range."""
@@ -130,11 +131,24 @@ def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Ten
     return residuals(torch.cat([place[None], place + torch.diag(steps)])), steps
 
 
+def central_sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Tensor]:
+    """As :func:`sensitivities`, from steps to both sides: exact to second order, for nearly twice the simulations."""
+    unknowns = len(place)
+    place = place.clamp(STEP, 1 - STEP)
+    steps = torch.diag(torch.full_like(place, STEP))
+    found = []
+    for block in residuals(torch.cat([place[None], place + steps, place - steps])):
+        here, up, down = block.values.split([1, unknowns, unknowns])
+        found.append(Block(block.kind, torch.cat([here, here + 0.5 * (up - down)]), block.cluster))
+    return found, steps.diagonal()
+
+
 def iterate(
     residuals: Residuals,
     rescale: Callable[[Sequence[Block]], dict[str, float]],
     progress: Progress,
     tolerance: float,
+    least_gain: float = LEAST_GAIN,
 ) -> Normal:
     """One iteration; ``progress`` is updated, also with the reason to stop.
 
@@ -143,6 +157,7 @@ def iterate(
         rescale: Standard deviations of the first variant's residuals.
         progress: Where to start.
         tolerance: Smallest step worth another iteration, as a share of the ranges.
+        least_gain: Smallest share of the cost worth another iteration.
 
     Returns:
         The sums at the place where the iteration started.
@@ -166,8 +181,8 @@ def iterate(
     progress.damping = max(DAMPINGS[best], 0.1) * progress.damping
     if moved < tolerance:
         progress.done = f"the last step was below {tolerance:g} of every range"
-    elif gain < LEAST_GAIN * normal.cost:
-        progress.done = f"the last step lowered the cost by less than {LEAST_GAIN:g}"
+    elif gain < least_gain * normal.cost:
+        progress.done = f"the last step lowered the cost by less than {least_gain:.2%}"
     return normal
 
 
@@ -187,4 +202,4 @@ def _step(normal: Normal, place: Tensor, damping: float) -> Tensor:
     return (place + step * min(1.0, REACH / max(longest, 1e-12))).clamp(0.0, 1.0)
 
 
-__all__ = ["Normal", "Progress", "huber", "iterate", "normal_equations", "sensitivities"]
+__all__ = ["Normal", "Progress", "central_sensitivities", "huber", "iterate", "normal_equations", "sensitivities"]

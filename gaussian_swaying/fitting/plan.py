@@ -28,6 +28,7 @@ _FIELDS = (
     "unknowns",
     "stages",
     "fit_share",
+    "until",
     "search",
     "iterations",
     "tracks",
@@ -47,6 +48,7 @@ class Plan:
         known: Options of ``sim`` that replace those of the base.
         stages: What is compared, see :data:`STAGES`; silhouettes are left out if the video has none.
         fit_share: Share of the frames that is fitted; the rest is predicted.
+        until: Fit the frames up to this time [s] instead of a share of them.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
         iterations: Most iterations of a stage at each horizon.
         tracks: Most tracks of a camera.
@@ -60,6 +62,7 @@ class Plan:
     known: Mapping[str, Any] = field(default_factory=dict)
     stages: Sequence[str] = ("tracks", "matches")
     fit_share: float = 0.5
+    until: float | None = None
     search: int = 64
     iterations: int = 8
     tracks: int = 400
@@ -86,7 +89,8 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
     """Read a ``fit.yaml``; docs/fit.md describes it.
 
     Args:
-        path: The file. Its ``videos`` are relative to the working directory, as files in other configurations are.
+        path: The file. Names in ``base`` and ``videos`` are relative to its folder if they exist there, else to the
+            working directory.
         find: Gives the file of a name in ``base``.
 
     Raises:
@@ -119,12 +123,12 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
     settings = {name: given[name] for name in _FIELDS[4:] if given.get(name) is not None}
     if "stages" in settings:
         settings["stages"] = _names(file, "stages", settings["stages"])
-    for name in ("fit_share", "limit"):
+    for name in ("fit_share", "until", "limit"):
         if name in settings and (isinstance(settings[name], bool) or not isinstance(settings[name], int | float)):
             raise ValueError(f"Expected `{name}` in {file} to be a number, but got {settings[name]!r}.")
     return Plan(
-        [find(name) for name in _names(file, "base", given.get("base"))],
-        _names(file, "videos", given.get("videos")),
+        [_beside(file, name) or find(name) for name in _names(file, "base", given.get("base"))],
+        [_beside(file, name) or name for name in _names(file, "videos", given.get("videos"))],
         [read_unknown(name, entry) for name, entry in sought.items()],
         known,
         **settings,
@@ -176,6 +180,11 @@ def _names(file: Path, name: str, given: Any) -> list[str]:
     if not isinstance(several, list) or not several or not all(isinstance(item, str) for item in several):
         raise ValueError(f"Expected `{name}` in {file} to be a name or a list of names, but got {given!r:.60}.")
     return several
+
+
+def _beside(file: Path, name: str) -> str | None:
+    """A file or folder beside another file; None if there is none."""
+    return str(file.parent / name) if (file.parent / name).exists() else None
 
 
 def _is_number(value: Any) -> bool:

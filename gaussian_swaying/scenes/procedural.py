@@ -7,9 +7,10 @@ from abc import ABC, abstractmethod
 
 import torch
 
-from gaussian_swaying._checks import check_positive
+from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.scenes.printed_cloth import printed_colours
 
 _MOST = 50_000_000  # Gaussians, about 100 GB
 
@@ -49,8 +50,8 @@ class FlagScene(ProceduralScene):
         spacing: Distance between Gaussians [m].
         overlap: Standard deviation of a Gaussian as a share of the spacing.
         ripple: Amplitude of the ripple along y [m].
-        pattern: ``stripes`` (three bands of colour and a disc), ``white``, or ``print`` (soft spots of all colours, which
-            can be tracked in a video).
+        pattern: ``stripes`` (three bands of colour and a disc), ``white``, or ``printed``, with features everywhere
+            (see :func:`~gaussian_swaying.scenes.printed_cloth.printed_colours`).
         yaw: Angle by which the flag is turned about its pole side, counter-clockwise seen from above [degrees].
     """
 
@@ -67,8 +68,7 @@ class FlagScene(ProceduralScene):
         for name, value in (("width", width), ("height", height), ("spacing", spacing), ("overlap", overlap)):
             check_positive(f"generator.{name}", value)
         check_positive("generator.ripple", ripple, allow_zero=True)
-        if pattern not in ("stripes", "white", "print"):
-            raise ValueError(f"Expected `generator.pattern` to be stripes, white or print, but got {pattern!r}.")
+        check_choice("generator.pattern", pattern, ("stripes", "white", "printed"))
         if spacing > min(width, height):
             raise ValueError(f"Expected `generator.spacing` below the flag's sides, but got {spacing} m.")
         count = width / spacing * height / spacing
@@ -113,22 +113,11 @@ class FlagScene(ProceduralScene):
     def _colours(self, x: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
         if self.pattern == "white":
             return torch.full((len(x), 3), 0.9, dtype=torch.float64)
-        if self.pattern == "print":
-            return _print(x, z)
+        if self.pattern == "printed":
+            return printed_colours(x, z)
         bands = torch.tensor([[0.83, 0.30, 0.18], [0.95, 0.92, 0.85], [0.13, 0.33, 0.55]], dtype=torch.float64)
         band = ((1 - z / self.height) * 3).long().clamp(0, 2)
         colours = bands[band].clone()
         distance = torch.hypot(x - 0.5 * self.width, z - 0.5 * self.height)
         colours[distance < 0.2 * self.height] = torch.tensor([0.93, 0.68, 0.20], dtype=torch.float64)
         return colours
-
-
-def _print(x: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
-    """Colours of places [m], shape (N, 3): forty waves of 5 to 20 cm in all directions."""
-    generator = torch.Generator().manual_seed(0)
-    length, turn, phase = torch.rand(3, 40, generator=generator, dtype=torch.float64)
-    weight = torch.randn(40, 3, generator=generator, dtype=torch.float64)
-    angle, wave = 2 * math.pi * turn, 2 * math.pi / (0.05 + 0.15 * length)
-    along = x[:, None] * angle.cos() + z[:, None] * angle.sin()
-    mixed = torch.cos(wave * along + 2 * math.pi * phase) @ weight
-    return 0.5 + 0.42 * torch.tanh(mixed / math.sqrt(20))

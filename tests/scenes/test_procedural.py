@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
+from gaussian_swaying.scenes.printed_cloth import PERIOD, printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene
 
 
@@ -78,3 +80,25 @@ def test_patterns():
 def test_bad_arguments(name, value):
     with pytest.raises(ValueError, match=f"generator.{name}"):
         FlagScene(**{name: value})
+
+
+def test_a_printed_flag_has_the_colours_of_its_print():
+    scene = FlagScene(width=0.6, height=0.4, spacing=0.02, pattern="printed", yaw=20.0)
+    plain = FlagScene(width=0.6, height=0.4, spacing=0.02, pattern="printed").generate()
+    wanted = printed_colours(plain.means[:, 0], plain.means[:, 2])
+    torch.testing.assert_close((0.5 + SH_DC * scene.generate().sh[:, 0]).double(), wanted, atol=1e-5, rtol=0)
+
+
+def test_a_print_can_be_told_everywhere():
+    """In every square of 20 cm the colours vary; no two such squares are alike; the same place has the same colour."""
+    x, z = torch.meshgrid(torch.arange(0.0, 1.6, 0.01), torch.arange(0.0, 1.6, 0.01), indexing="ij")
+    colours = printed_colours(x, z)
+    assert float(colours.min()) >= 0
+    assert float(colours.max()) <= 1
+    torch.testing.assert_close(printed_colours(x[:5] + PERIOD, z[:5]), colours[:5], atol=1e-5, rtol=0)
+    squares = colours.reshape(8, 20, 8, 20, 3).permute(0, 2, 1, 3, 4).reshape(64, -1)
+    squares = squares - squares.mean(1, keepdim=True)
+    size = squares.norm(dim=1) / squares.shape[1] ** 0.5
+    assert float(size.min()) > 0.1
+    alike = squares @ squares.T / squares.norm(dim=1).outer(squares.norm(dim=1)) - torch.eye(64)
+    assert float(alike.max()) < 0.7
