@@ -325,7 +325,7 @@ def run_fit(
         if progress:
             print(f"[{time.monotonic() - begin:6.0f} s] {line}", file=sys.stderr, flush=True)
 
-    fit_ = Fit(simulation, read_videos(list(plan.videos)), plan, say)
+    fit_ = Fit(simulation, read_videos(list(plan.videos), plan.cameras), plan, say)
     described = _described(plan, simulation)
     remedy = "choose another with --output"
     if resume and not (folder / PROGRESS).exists():

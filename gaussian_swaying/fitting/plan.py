@@ -34,6 +34,7 @@ _FIELDS = (
     "tracks",
     "limit",
     "seed",
+    "cameras",
 )
 
 
@@ -54,6 +55,7 @@ class Plan:
         tracks: Most tracks of a camera.
         limit: Largest condition number of the sensitivities; above it the fit is refused.
         seed: Seed of the coarse search.
+        cameras: Names of the cameras that are used; None for all.
     """
 
     base: Sequence[str]
@@ -68,6 +70,7 @@ class Plan:
     tracks: int = 400
     limit: float = 1e3
     seed: int = 0
+    cameras: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         for name in self.stages:
@@ -121,8 +124,9 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
             f"Expected `known` in {file} to have options of `sim` as names (material.E), but got {known!r:.60}."
         )
     settings = {name: given[name] for name in _FIELDS[4:] if given.get(name) is not None}
-    if "stages" in settings:
-        settings["stages"] = _names(file, "stages", settings["stages"])
+    for name in ("stages", "cameras"):
+        if name in settings:
+            settings[name] = _names(file, name, settings[name])
     for name in ("fit_share", "until", "limit"):
         if name in settings and (isinstance(settings[name], bool) or not isinstance(settings[name], int | float)):
             raise ValueError(f"Expected `{name}` in {file} to be a number, but got {settings[name]!r}.")

@@ -55,7 +55,9 @@ class _Shot:
     mask: Tensor | None
 
 
-def read_videos(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[Footage]:
+def read_videos(
+    paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], cameras: Sequence[str] | None = None
+) -> list[Footage]:
     """Read the videos of one motion.
 
     Each folder has a ``transforms.json`` as of Nerfstudio. A frame has ``file_path``, ``transform_matrix``, ``time``
@@ -65,6 +67,7 @@ def read_videos(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
     Args:
         paths: A folder or a transforms.json, or several. Their times belong to the same clock.
+        cameras: Names of the cameras that are wanted; None for all.
 
     Returns:
         One for each camera, sorted by name. The earliest frame is at time zero.
@@ -82,7 +85,10 @@ def read_videos(paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
         for name, own in found.items():
             shots.setdefault(name if len(several) == 1 or name not in shots else f"{number}-{name}", []).extend(own)
     begin = min(shot.time for own in shots.values() for shot in own)
-    return [_footage(name, shots[name], begin) for name in sorted(shots)]
+    for name in cameras or ():
+        if name not in shots:
+            raise ValueError(f"There is no camera {name!r} in `videos`: `cameras` may be {', '.join(sorted(shots))}.")
+    return [_footage(name, shots[name], begin) for name in sorted(cameras or shots)]
 
 
 def frame_times(videos: Sequence[Footage]) -> list[float]:

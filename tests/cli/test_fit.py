@@ -46,4 +46,4 @@ def test_the_shipped_fit_is_a_plan():
     assert "printed_flag" in shipped.names("fit")
     file = shipped.with_shipped(["--config", "printed_flag"], "fit")[1]
     plan = read_plan(file, lambda name: shipped.with_shipped(["--config", name], "sim")[1])
-    assert [unknown.name for unknown in plan.unknowns][0] == "wind.speed"
+    assert plan.unknowns[0].name == "wind.speed"

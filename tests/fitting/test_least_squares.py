@@ -44,7 +44,7 @@ def test_outliers_count_little():
 def test_a_value_outside_its_range_ends_at_the_end():
     found = _solve(_decay([0.4, -0.1], torch.zeros(60, 2)), [0.9, 0.9])
     assert float(found.place[1]) == 0.0
-    assert 0.3 < float(found.place[0]) < 0.5
+    assert 0.8 < float(found.place[0]) < 0.9  # the best constant
 
 
 def test_standard_errors_are_the_scatter_of_repeated_fits():

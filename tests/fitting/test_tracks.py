@@ -33,8 +33,9 @@ def test_a_point_that_vanishes_is_lost():
     from gaussian_swaying.fitting.tracks import follow
 
     rng = np.random.default_rng(0)
-    noise = [cv2.GaussianBlur(rng.integers(0, 255, (60, 60, 3), dtype="u1"), (5, 5), 0) for _ in range(2)]
-    _, seen = follow(np.stack([noise[0], noise[0], noise[1]]), np.array([[20.0, 20.0], [30.0, 40.0], [45.0, 25.0]]))
+    picture = cv2.GaussianBlur(rng.integers(0, 255, (60, 60, 3), dtype="u1"), (7, 7), 0)
+    plain = np.full_like(picture, 128)
+    _, seen = follow(np.stack([picture, picture, plain]), np.array([[20.0, 20.0], [30.0, 40.0], [45.0, 25.0]]))
     assert seen[1].all()
     assert not seen[2].any()
 

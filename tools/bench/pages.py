@@ -13,6 +13,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     accuracy_plot,
     area,
     contact,
+    fit,
     flags,
     goals,
     gradients,
