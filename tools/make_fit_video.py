@@ -29,7 +29,9 @@ def main(arguments: list[str] | None = None) -> int:
     painter = simulation.painter
     names = list(painter.cameras) or [""]
     cameras = {name or "main": painter.camera_at(0, name) for name in names}
-    write_video(simulation, options.output, cameras, options.frames or simulation.frames_wanted, options.noise, options.seed)
+    write_video(
+        simulation, options.output, cameras, options.frames or simulation.frames_wanted, options.noise, options.seed
+    )
     print(f"wrote {options.output}")
     return 0
 

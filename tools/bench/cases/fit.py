@@ -48,9 +48,13 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--row", action="append", choices=list(ROWS), help="only this one; repeatable")
     command.add_argument("--data", type=Path, help="folder of tools/datasets/make_fit_data.py: Blender's cloth instead")
     command.add_argument("--case", action="append", help="only this case of --data; repeatable")
-    command.add_argument("--known", default="{}", help="options of sim for --data, as JSON, such as a coarser solver.dx")
+    command.add_argument(
+        "--known", default="{}", help="options of sim for --data, as JSON, such as a coarser solver.dx"
+    )
     command.add_argument("--search", type=int, help="simulations of the coarse search")
-    command.add_argument("--until", type=float, help="fit the frames up to this time [s]; half of the video if left out")
+    command.add_argument(
+        "--until", type=float, help="fit the frames up to this time [s]; half of the video if left out"
+    )
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
