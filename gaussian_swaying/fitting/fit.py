@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,16 +41,16 @@ from gaussian_swaying.fitting.tracks import Tracks, match, track
 from gaussian_swaying.fitting.unknowns import check_unknowns
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.runs.folder import claim_folder, hold_folder
+from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.simulation import Simulation
 
 PROGRESS, VALUES, RESULT, SCENE, PICTURES = "fit.json", "values.csv", "result.json", "scene.yaml", "pictures"
 OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
-HORIZONS = (0.35, 0.65, 1.0)
+HORIZONS = (0.5, 1.0)
 """Shares of the fitted frames that the first stage takes, one after the other: chaos grows with time."""
 ROUNDS = 3
 """How often Gaussians are matched again."""
-SEARCHED = 0.3
+SEARCHED = 0.5
 """Share of the fitted frames that the coarse search looks at."""
 NEAR = 0.1
 """Standard deviation of the second part of the search, as a share of the ranges."""
@@ -343,6 +344,10 @@ def run_fit(
         return result
     finally:
         lock.release()
+        if not (folder / PROGRESS).exists():  # it was refused before the first iteration: nothing stays
+            (folder / MARKER).unlink(missing_ok=True)
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def fit(

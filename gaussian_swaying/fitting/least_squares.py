@@ -166,6 +166,8 @@ def iterate(
     blocks, steps = sensitivities(residuals, place)
     progress.scales = rescale(blocks)
     normal = normal_equations(blocks, progress.scales, steps)
+    if normal.count == 0:
+        raise ValueError("Every simulation of a step diverged: narrow the ranges of `unknowns`, or lower `solver.cfl`.")
     progress.cost, progress.iteration = normal.cost, progress.iteration + 1
     trials = torch.stack([_step(normal, place, factor * progress.damping) for factor in DAMPINGS])
     found = huber(residuals(trials), progress.scales)

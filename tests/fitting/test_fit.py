@@ -89,3 +89,4 @@ def test_what_cannot_be_told_apart_is_refused(own, tmp_path):
         fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", device="cpu", search=0, progress=False)
     for name in sought:
         assert f"`{name}`" in str(error.value)
+    assert not (tmp_path / "fit").exists()

@@ -1,4 +1,4 @@
-"""``bench.py fit``: wind and material found from videos, of our own solver and of Blender's cloth, against the truth."""
+"""``bench.py fit``: wind and material found from videos of our own solver and of Blender's cloth, against the truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PUSH = 0.26
 """C_D = C_F of a force per particle that is, on the flag at rest in the true wind, as large as that on the patches."""
 
 SIZES = {
-    "cpu": {"flag": (0.4, 0.3, 0.05), "dx": 0.1, "size": (200, 120), "frames": 25, "search": 24, "noise": 3.0},
+    "cpu": {"flag": (0.4, 0.3, 0.05), "dx": 0.1, "size": (200, 120), "frames": 37, "search": 24, "noise": 3.0},
     "cuda": {"flag": (0.6, 0.4, 0.0125), "dx": 0.03, "size": (480, 270), "frames": 73, "search": 64, "noise": 3.0},
 }
 """What fits a CPU; and two videos of 3 s, of which the first 2 s are fitted, for a GPU."""
