@@ -17,7 +17,7 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.fitting.unknowns import Variant, aero_like, stacked, variant_of
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.simulation.simulation import Simulation
 
 SAFETY = 1.15
@@ -66,6 +66,7 @@ class Ensemble:
         self.simulation = simulation
         self.stiffening = SAFETY
 
+    @torch.no_grad()
     def run(
         self, values: Sequence[Values], times: Sequence[float], careful: bool = True, alike: bool = True
     ) -> Iterator[list[MPMState]]:
@@ -87,31 +88,21 @@ class Ensemble:
         if alike:
             rates = [max(rates)] * len(groups)
         now = 0.0
-        with torch.no_grad():
-            for time in times:
-                if time > now:
-                    for group, rate in zip(groups, rates, strict=True):
-                        self._advance(group, time - now, max(1, math.ceil((time - now) * rate)), careful)
-                    now = time
-                found: list[MPMState | None] = [None] * len(values)
-                for group in groups:
-                    for place, member in enumerate(group.members):
-                        found[member] = member_of(group.state, place)
-                yield [state for state in found if state is not None]
+        for time in times:
+            if time > now:
+                for group, rate in zip(groups, rates, strict=True):
+                    self._advance(group, time - now, max(1, math.ceil((time - now) * rate)), careful)
+                now = time
+            found: list[MPMState | None] = [None] * len(values)
+            for group in groups:
+                for place, member in enumerate(group.members):
+                    found[member] = member_of(group.state, place)
+            yield [state for state in found if state is not None]
 
     def _groups(self, variants: Sequence[Variant], alike: bool) -> list[_Group]:
         shared: dict[tuple[float, ...], list[int]] = {}
         for number, variant in enumerate(variants):
-            wave = (
-                0
-                if alike
-                else round(
-                    2
-                    * math.log2(
-                        float((variant.points.youngs_modulus * variant.points.volume / variant.points.mass).amax())
-                    )
-                )
-            )
+            wave = 0 if alike else _stiffness_class(variant.points)
             shared.setdefault((*variant.aero, *variant.damping, wave), []).append(number)
         return [self._group(members, [variants[k] for k in members]) for members in shared.values()]
 
@@ -119,12 +110,11 @@ class Ensemble:
         simulation, count = self.simulation, len(members)
         solver = solver_like(simulation.solver, *variants[0].damping)
         aero = aero_like(simulation.aero, variants[0].aero)
-        with torch.no_grad():
-            state = solver.init_state(stacked([v.points for v in variants]), frame=simulation.scene.frame)
-            forces = [force for force in simulation.custom_forces if isinstance(force, Force)]
-            if not aero.idle:
-                patches = _repeated(simulation.scene.patches, count)
-                forces = [WindForce(aero, [v.wind for v in variants], patches), *forces]
+        state = solver.init_state(stacked([v.points for v in variants]), frame=simulation.scene.frame)
+        forces = [force for force in simulation.custom_forces if isinstance(force, Force)]
+        if not aero.idle:
+            patches = _repeated(simulation.scene.patches, count)
+            forces = [WindForce(aero, [v.wind for v in variants], patches), *forces]
         return _Group(members, solver, forces, state)
 
     def _rate(self, group: _Group) -> float:
@@ -175,6 +165,12 @@ def member_of(state: MPMState, place: int) -> MPMState:
     own = {"time", "grid", "substep"}
     fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(MPMState) if f.name not in own}
     return state.replace(**{name: value[place] for name, value in fields.items() if isinstance(value, Tensor)})
+
+
+def _stiffness_class(points: MaterialPoints) -> int:
+    """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
+    squared = (points.youngs_modulus * points.volume / points.mass).amax()
+    return round(2 * math.log2(float(squared)))
 
 
 def _repeated(patches: Patches, count: int) -> Patches:
