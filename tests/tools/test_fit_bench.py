@@ -36,23 +36,25 @@ def test_the_settings_of_own_data_are_a_simulation(tmp_path):
 
 def test_missed_goals_are_said_to_be_missed():
     rows = {"two cameras": ROW, "one camera": ROW | {"speed_error": -0.02}, "pixels alone": ROW | {"speed_error": 0.9}}
-    lines = tables.own(HEAD | {"own": rows})
+    lines = tables.own([HEAD | {"own": rows}])
     assert "| two cameras | +0.40 % | 0.50° | -0.80 % | 31.3 dB | 12 s | yes |" in lines
     assert "| one camera | -2.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s | no |" in lines
     assert "| pixels alone | +90.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s |  |" in lines
     found = tables.blender(
-        HEAD
-        | {
-            "blender": {
-                "flag, two cameras": ROW | {"speed_error": 0.07},
-                "flag, one camera": ROW | {"speed_error": 0.07},
-                "curtain, two cameras": {"refused": "The video cannot tell."},
+        [
+            HEAD
+            | {
+                "blender": {
+                    "flag, two cameras": ROW | {"speed_error": 0.07},
+                    "flag, one camera": ROW | {"speed_error": 0.07},
+                    "curtain, two cameras": {"refused": "The video cannot tell."},
+                }
             }
-        }
+        ]
     )
     assert [line.split(" | ")[-1] for line in found if line.startswith(("| flag", "| curtain"))] == [
         "no |",
         "yes |",
         "no |",
     ]
-    assert "Not measured on this device." in tables.blender(HEAD)
+    assert tables.blender([HEAD]) == ["Not measured yet."]

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import tempfile
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -145,6 +146,7 @@ def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], Non
 
 def _row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> Row:
     """A fit, and how far it is from the truth."""
+    begin = time.process_time()
     try:
         result = run_fit(plan, folder, device=device)
     except ValueError as error:
@@ -159,6 +161,7 @@ def _row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> Row
         "psnr_predicted_db": min(shown.predicted for shown in result.shown),
         "iterations": len(result.history),
         "seconds": result.seconds,
+        "processor_s": time.process_time() - begin,
         "not_determined": result.vague,
     }
 

@@ -16,28 +16,34 @@ ABLATIONS = ("tracks alone", "pixels alone", "without patches")
 """Rows that have no goal."""
 
 
-@table("fit.md", "fit.own", "fit_*")
-def own(result: Row) -> list[str]:
-    """Fits of videos that this package made."""
-    rows = result.get("own", {})
-    if not rows:
-        return [source(result), "", "Not measured on this device."]
-    head = ["", "speed", "direction", "E", "predicted frames", "time", "within 1 % and 1 degree"]
-    found = [[name, *_cells(row), "" if name in ABLATIONS else _reached(row, OWN)] for name, row in rows.items()]
-    one = next(iter(rows.values()))
-    told = f"{one['points']:,} points, videos of {one['size'][0]} x {one['size'][1]}, {one['until_s']:.3g} s fitted."
-    return [source(result), "", told, "", *grid(head, found)]
+HEAD = ["", "speed", "direction", "E", "predicted frames", "time"]
 
 
-@table("fit.md", "fit.blender", "fit_*")
-def blender(result: Row) -> list[str]:
-    """Fits of videos of Blender's cloth."""
-    rows = result.get("blender", {})
-    if not rows:
-        return [source(result), "", "Not measured on this device."]
-    head = ["", "speed", "direction", "E", "predicted frames", "time", "goal reached"]
-    found = [[name, *_cells(row), _reached(row, ONE if "one camera" in name else TWO)] for name, row in rows.items()]
-    return [source(result), "", *grid(head, found)]
+@table("fit.md", "fit.own", "fit_*", together=True)
+def own(results: list[Row]) -> list[str]:
+    """Fits of videos that this package made, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("own", {}):
+            found = [[n, *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()]
+            one = next(row for row in rows.values() if "points" in row)
+            width, height = one["size"]
+            told = f"{one['points']:,} points, videos of {width} x {height}, {one['until_s']:.3g} s fitted."
+            table_ = grid([*HEAD, "within 1 % and 1 degree"], found)
+            lines += ["", source(result), "", told, "", *table_]
+    return lines[1:] or ["Not measured yet."]
+
+
+@table("fit.md", "fit.blender", "fit_*", together=True)
+def blender(results: list[Row]) -> list[str]:
+    """Fits of videos of Blender's cloth, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("blender", {}):
+            goals = {name: ONE if "one camera" in name else TWO for name in rows}
+            found = [[n, *_cells(row), _reached(row, goals[n])] for n, row in rows.items()]
+            lines += ["", source(result), "", *grid([*HEAD, "goal reached"], found)]
+    return lines[1:] or ["Not measured yet."]
 
 
 def _cells(row: Row) -> list[str]:
