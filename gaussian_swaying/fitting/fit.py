@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
-from gaussian_swaying.fitting.ensemble import Ensemble
+from gaussian_swaying.fitting.ensemble import SAFETY, Ensemble
 from gaussian_swaying.fitting.evidence import (
     Block,
     Evidence,
@@ -74,6 +75,7 @@ class Course:
         matched: Where the Gaussians of the current step were matched; empty if they were not.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
+        stiffening: See :class:`~gaussian_swaying.fitting.ensemble.Ensemble`.
         history: One row for each iteration.
         directions: The principal directions of the sensitivities.
         seconds: Time spent.
@@ -84,6 +86,7 @@ class Course:
     matched: list[float] = field(default_factory=list)
     damping: float = 1e-2
     iteration: int = 0
+    stiffening: float = SAFETY
     history: list[dict[str, Any]] = field(default_factory=list)
     directions: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
@@ -228,7 +231,7 @@ class Fit:
         Raises:
             ValueError: If the video cannot tell the unknowns apart.
         """
-        clock = time.monotonic() - course.seconds
+        clock, self.ensemble.stiffening = time.monotonic() - course.seconds, course.stiffening
         if course.step < 0:
             course.place = self.search()
             self.say(f"search: {self._shown(course.place)}")
@@ -250,8 +253,9 @@ class Fit:
                 close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
                 iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
                 course.place, course.damping = progress.place.tolist(), progress.damping
+                course.stiffening = self.ensemble.stiffening
                 course.iteration, course.seconds = progress.iteration, time.monotonic() - clock
-                row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": progress.cost}
+                row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": _cost(progress)}
                 course.history.append(
                     row | {f"scale_{k}": v for k, v in progress.scales.items()} | self.values(course.place)
                 )
@@ -285,6 +289,10 @@ class Fit:
 
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
+
+
+def _cost(progress: Progress) -> float:
+    return math.nan if progress.normal is None else progress.normal.cost
 
 
 _NOTHING = Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, 0, 2), torch.zeros(0, 0, dtype=torch.bool))

@@ -1,8 +1,7 @@
 """Robust nonlinear least squares by Levenberg and Marquardt's method, with a batch of simulations for each step.
 
-A step takes two batches: one for the residuals and their sensitivities by finite differences, one for the trial steps
-of several damping factors at once. Residuals are divided by their robust standard deviation, and weighed by Huber's
-function, so that tracks that went astray count little.
+A step takes one batch: the residuals at its end and their sensitivities, by finite differences. Residuals are divided
+by their robust standard deviation, and weighed by Huber's function, so that tracks that went astray count little.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ STEP = 0.004
 """Step of the finite differences, as a share of the range."""
 HUBER = 1.345
 """Standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)."""
-DAMPINGS = (0.0, 0.1, 1.0, 10.0)
-"""Trial steps of an iteration: factors of the damping of the last accepted step; 0 is the Gauss-Newton step."""
+BETTER, WORSE = 0.1, 10.0
+"""Factors of the damping after a step that lowered the cost, and after one that did not."""
 MOST_DAMPING = 1e4
 """Damping at which the search for a better place ends."""
 LEAST_GAIN = 1e-4
@@ -29,6 +28,8 @@ REACH = 0.25
 
 Residuals = Callable[[Tensor], list[Block]]
 """Residuals at some points (B, U), each a share of every range."""
+Rescale = Callable[[Sequence[Block]], dict[str, float]]
+"""Robust standard deviation of the first variant's residuals, for each kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +73,15 @@ class Progress:
         place: Shares of the ranges, shape (U,).
         damping: Damping of the last accepted step.
         iteration: Iterations done.
-        cost: Cost at ``place``.
-        scales: Standard deviations of each kind of residual, from the last residuals.
+        normal: The sums at ``place``; None if they are to be computed.
+        scales: Standard deviations of each kind of residual there.
         done: Why it ended; empty if it did not.
     """
 
     place: Tensor
     damping: float = 1e-2
     iteration: int = 0
-    cost: float = float("inf")
+    normal: Normal | None = None
     scales: dict[str, float] = field(default_factory=dict)
     done: str = ""
 
@@ -143,13 +144,16 @@ def central_sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Blo
     return found, steps.diagonal()
 
 
+def linearised(residuals: Residuals, rescale: Rescale, place: Tensor) -> tuple[Normal, dict[str, float], list[Block]]:
+    """The sums at a place, the standard deviations of its residuals, and the residuals."""
+    blocks, steps = sensitivities(residuals, place)
+    scales = rescale(blocks)
+    return normal_equations(blocks, scales, steps), scales, blocks
+
+
 def iterate(
-    residuals: Residuals,
-    rescale: Callable[[Sequence[Block]], dict[str, float]],
-    progress: Progress,
-    tolerance: float,
-    least_gain: float = LEAST_GAIN,
-) -> Normal:
+    residuals: Residuals, rescale: Rescale, progress: Progress, tolerance: float, least_gain: float = LEAST_GAIN
+) -> None:
     """One iteration; ``progress`` is updated, also with the reason to stop.
 
     Args:
@@ -159,33 +163,30 @@ def iterate(
         tolerance: Smallest step worth another iteration, as a share of the ranges.
         least_gain: Smallest share of the cost worth another iteration.
 
-    Returns:
-        The sums at the place where the iteration started.
+    Raises:
+        ValueError: If nothing is finite where it starts.
     """
-    place = progress.place
-    blocks, steps = sensitivities(residuals, place)
-    progress.scales = rescale(blocks)
-    normal = normal_equations(blocks, progress.scales, steps)
-    if normal.count == 0:
-        raise ValueError("Every simulation of a step diverged: narrow the ranges of `unknowns`, or lower `solver.cfl`.")
-    progress.cost, progress.iteration = normal.cost, progress.iteration + 1
-    trials = torch.stack([_step(normal, place, factor * progress.damping) for factor in DAMPINGS])
-    found = huber(residuals(trials), progress.scales)
-    best = int(found.argmin())
-    gain = normal.cost - float(found[best])
+    if progress.normal is None:
+        progress.normal, progress.scales, _ = linearised(residuals, rescale, progress.place)
+        if progress.normal.count == 0:
+            raise ValueError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
+    normal = progress.normal
+    progress.iteration += 1
+    trial = _step(normal, progress.place, progress.damping)
+    moved = float((trial - progress.place).abs().amax())
+    there, scales, blocks = linearised(residuals, rescale, trial)
+    gain = normal.cost - float(huber([Block(b.kind, b.values[:1], b.cluster) for b in blocks], progress.scales)[0])
     if not gain > 0:
-        progress.damping = max(progress.damping, 1e-3) * 100
-        if float((trials[0] - place).abs().amax()) < 10 * tolerance or progress.damping > MOST_DAMPING:
+        progress.damping = max(progress.damping, 0.1) * WORSE
+        if moved < 10 * tolerance or progress.damping > MOST_DAMPING:
             progress.done = "no step is better"
-        return normal
-    moved = float((trials[best] - place).abs().amax())
-    progress.place, progress.cost = trials[best], float(found[best])
-    progress.damping = max(DAMPINGS[best], 0.1) * progress.damping
+        return
+    progress.place, progress.normal, progress.scales = trial, there, scales
+    progress.damping *= BETTER
     if moved < tolerance:
         progress.done = f"the last step was below {tolerance:g} of every range"
     elif gain < least_gain * normal.cost:
         progress.done = f"the last step lowered the cost by less than {least_gain:.2%}"
-    return normal
 
 
 def _step(normal: Normal, place: Tensor, damping: float) -> Tensor:
@@ -204,4 +205,4 @@ def _step(normal: Normal, place: Tensor, damping: float) -> Tensor:
     return (place + step * min(1.0, REACH / max(longest, 1e-12))).clamp(0.0, 1.0)
 
 
-__all__ = ["Normal", "Progress", "central_sensitivities", "huber", "iterate", "normal_equations", "sensitivities"]
+__all__ = ["Normal", "Progress", "central_sensitivities", "huber", "iterate", "normal_equations"]

@@ -5,7 +5,7 @@ import torch
 
 from gaussian_swaying.fitting.evidence import Block, scales_of
 from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
-from gaussian_swaying.fitting.least_squares import Progress, iterate, normal_equations, sensitivities
+from gaussian_swaying.fitting.least_squares import Progress, iterate, linearised
 from gaussian_swaying.fitting.unknowns import Unknown
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
@@ -55,8 +55,7 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
         noise = 0.05 * torch.randn(15, 2, generator=generator, dtype=torch.float64).repeat_interleave(4, 0)
         residuals = _decay([0.4, 0.3], noise)
         place = _solve(residuals, [0.5, 0.4]).place
-        blocks, steps = sensitivities(residuals, place)
-        normal = normal_equations(blocks, scales_of(blocks, FLOORS), steps)
+        normal, _, _ = linearised(residuals, lambda blocks: scales_of(blocks, FLOORS), place)
         places.append(place)
         errors.append(normal.covariance().diagonal().sqrt())
     scatter, told = torch.stack(places).std(0), torch.stack(errors).square().mean(0).sqrt()
