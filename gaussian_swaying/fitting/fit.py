@@ -327,7 +327,9 @@ def run_fit(
     folder, parser = Path(output), Simulation.parser()
     settings = parse_base(plan, parser)
     settings.device = device
-    simulation = Simulation.from_settings(parser, settings.clone())
+    own = settings.clone()
+    own.camera = own.cameras = None  # the videos have their own
+    simulation = Simulation.from_settings(parser, own)
     begin = time.monotonic()
 
     def say(line: str) -> None:

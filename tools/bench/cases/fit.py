@@ -130,7 +130,7 @@ def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], Non
             [str(folder / "scene.yaml")],
             [str(folder)],
             sought,
-            known={"camera": None} | json.loads(options.known),
+            known=json.loads(options.known),
             until=options.until or truth["fit_until"],
             search=options.search or 48,
         )
