@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.captures.initial_points import initial_points
     from gaussian_swaying.captures.point_cloud import PointCloud
     from gaussian_swaying.evaluation.compare import compare_run
+    from gaussian_swaying.fitting.fit import fit
     from gaussian_swaying.gaussians.cloud import GaussianCloud
     from gaussian_swaying.gaussians.compact import read_gaussians
     from gaussian_swaying.gaussians.export import export_cloud, write_usd
@@ -129,6 +130,7 @@ _HOMES = {
     "captures.initial_points": ("initial_points",),
     "captures.point_cloud": ("PointCloud",),
     "evaluation.compare": ("compare_run",),
+    "fitting.fit": ("fit",),
     "gaussians.cloud": ("GaussianCloud",),
     "gaussians.compact": ("read_gaussians",),
     "gaussians.export": (
@@ -340,6 +342,7 @@ __all__ = [
     "chamfer_distance",
     "compare_run",
     "export_cloud",
+    "fit",
     "frechet_distance",
     "initial_points",
     "load_trajectory",

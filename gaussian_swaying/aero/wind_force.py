@@ -34,7 +34,7 @@ class WindForce(Force):
         aero: Coefficients and law of the force.
         wind: The wind, or a list with one wind for each scene of a batch.
         normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
-            :class:`~gaussian_swaying.aero.patches.Patches`, which belong to the particles of one scene.
+            :class:`~gaussian_swaying.aero.patches.Patches`, those of the scenes of a batch one after the other.
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
 
     Attributes:
@@ -58,6 +58,7 @@ class WindForce(Force):
     ) -> None:
         super().__init__()
         self.sums: PatchSums | None = None
+        patches = normal if isinstance(normal, Patches) else None
         if isinstance(normal, Patches):
             found = PatchSums(normal, coarse=aero.mostly_linear)
             self.sums = None if found.single else found
@@ -66,6 +67,8 @@ class WindForce(Force):
             raise ValueError("Expected `area` of the patches, one for each `normal`.")
         check_shape("normal", normal, "P", 3)
         check_shape("area", area, normal.shape[-2])
+        if patches is not None and not isinstance(wind, nn.Module) and len(area) % max(len(wind), 1) == 0:
+            normal, area = normal.reshape(len(wind), -1, 3), area.reshape(len(wind), -1)
         self.aero = aero
         self.register_buffer("normal", normal, persistent=False)
         self.register_buffer("area", area, persistent=False)
@@ -194,8 +197,12 @@ class WindForce(Force):
             wind: Air velocity [m/s], broadcastable to (..., P, 3).
         """
         if self.sums is not None:
-            force, area = self.aero.on_groups(wind, state.velocity, state.F_total, self.sums)
-            return force, self.aero.resistance(wind, state.velocity, area)
+            shape = state.velocity.shape
+            flat, F = state.velocity.reshape(-1, 3), state.F_total.reshape(-1, 3, 3)
+            blown = wind if wind.ndim == 1 else wind.expand(shape).reshape(-1, 3)
+            force, area = self.aero.on_groups(blown, flat, F, self.sums)
+            resistance = self.aero.resistance(blown, flat, area)
+            return force.reshape(shape), None if resistance is None else resistance.reshape(shape[:-1])
         normal, area = deform_patch(state.F_total, self.normal, self.area)
         area = capped_area(area, self.area, self.aero.max_area_ratio)
         return self.aero(wind, state.velocity, normal, area), self.aero.resistance(wind, state.velocity, area)
@@ -292,16 +299,17 @@ class WindForce(Force):
             half, widest = (torch.full_like(aero.C_D, v) for v in (0.5 * aero.air_density, aero.max_area_ratio))
             return torch.stack([aero.C_D, aero.C_F, aero.C_L, half, widest])
 
-        if self.sums is not None:
+        sums = self.sums
+        if sums is not None:
             return ForceTwin(
                 function=functions[1],
                 options=options,
                 implicit=implicit,
-                sources=(self.sums.tensor, self.sums.vector),
-                values=self.sums.lists,
+                sources=(sums.tensor, sums.vector),
+                values=lambda: sums.lists().reshape(*self.area.shape, 2),
                 numbers=numbers,
                 vectors=self.winds if self.uniform else self._vectors,
-                table=self.sums.table,
+                table=sums.table,
                 space=space,
                 adjoint=wind_on_groups_adjoint if smooth and not aero.unit_tangent else None,
             )

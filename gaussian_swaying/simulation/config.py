@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import os
 import sys
 import tempfile
@@ -205,3 +206,13 @@ def python_text(heading: str, arguments: Mapping[str, Any]) -> str:
     import yaml
 
     return yaml.safe_dump({heading: describe(dict(sorted(arguments.items())))}) if arguments else ""
+
+
+def option(name: str, value: Any) -> str:
+    """A setting as an option of the command line.
+
+    Example:
+        >>> option("wind.flow", [4, 0, 0])
+        '--wind.flow=[4, 0, 0]'
+    """
+    return f"--{name}={value if isinstance(value, str) else json.dumps(value)}"

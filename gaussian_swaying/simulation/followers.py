@@ -39,6 +39,10 @@ class Followers(nn.Module, ABC):
     def places(self) -> Tensor:
         """Rest positions that are read [m], shape (M, 3)."""
 
+    @abstractmethod
+    def some(self, index: Tensor) -> Followers:
+        """Some of them, by their numbers (K,)."""
+
     def nodes(self, grid: GridSpec) -> Tensor:
         """The nodes of a grid that the stencils of the places reach: flat indices in rising order, shape (N,).
 
@@ -76,6 +80,10 @@ class PointFollowers(Followers):
         """Rest positions of the points that are followed [m], shape (M, 3)."""
         return self.rest[self.source]
 
+    def some(self, index: Tensor) -> PointFollowers:
+        """Some of them."""
+        return PointFollowers(self.source[index], None if self.arm is None else self.arm[index], self.rest)
+
     def _read(self, state: MPMState) -> tuple[Tensor, Tensor]:
         return (state.position - self.rest)[self.source], state.F_total[self.source]
 
@@ -102,6 +110,10 @@ class GridFollowers(Followers):
     def places(self) -> Tensor:
         """Rest positions that are read [m], shape (M, 3)."""
         return self.place
+
+    def some(self, index: Tensor) -> GridFollowers:
+        """Some of them."""
+        return GridFollowers(self.place[index], None if self.arm is None else self.arm[index])
 
     def stencil(self, grid: GridSpec) -> Stencil:
         """The 27 nodes of each follower."""

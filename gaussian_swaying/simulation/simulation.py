@@ -171,6 +171,7 @@ class Simulation(nn.Module):
         obstacles = [part for part in solver.boundaries if isinstance(part, Obstacle)]
         model.take_contact(contact, obstacles)
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
+        self.material = material
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
         self.wind = as_wind(wind, model.frame)
         self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in as_forces(forces))

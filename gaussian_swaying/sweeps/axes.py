@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import random
 from collections.abc import Callable, Mapping
@@ -102,16 +101,6 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
     return found
 
 
-def option(name: str, value: Any) -> str:
-    """A setting as an option of the command line.
-
-    Example:
-        >>> option("wind.flow", [4, 0, 0])
-        '--wind.flow=[4, 0, 0]'
-    """
-    return f"--{name}={value if isinstance(value, str) else json.dumps(value)}"
-
-
 def _range(where: str, given: Mapping[str, Any]) -> tuple[float, ...]:
     _only(where, given, "from", "to", "count", "scale")
     low, high, count = _number(where, given, "from"), _number(where, given, "to"), _whole(where, given, "count")
@@ -196,4 +185,4 @@ def _one_of(where: str, given: Mapping[str, Any], name: str, known: tuple[str, .
     return str(value)
 
 
-__all__ = ["Axis", "option", "read_axis", "runs_of"]
+__all__ = ["Axis", "read_axis", "runs_of"]

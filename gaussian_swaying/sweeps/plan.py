@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._yaml_limits import LARGEST, check_config_files, check_yaml
 from gaussian_swaying.runs.seal import sha256
-from gaussian_swaying.simulation.config import check_settings, config_text, parse_text
+from gaussian_swaying.simulation.config import check_settings, config_text, option, parse_text
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.axes import option, read_axis, runs_of
+from gaussian_swaying.sweeps.axes import read_axis, runs_of
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

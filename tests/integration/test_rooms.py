@@ -12,7 +12,7 @@ FLOORS = (
     "aero rendering scenes",
     "captures",
     "simulation training",
-    "evaluation sweeps validation viewer",
+    "evaluation fitting sweeps validation viewer",
     "cli",
 )
 """From the ground up; rooms of one floor do not know each other."""

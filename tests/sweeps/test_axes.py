@@ -2,7 +2,8 @@
 
 import pytest
 
-from gaussian_swaying.sweeps.axes import option, read_axis, runs_of
+from gaussian_swaying.simulation.config import option
+from gaussian_swaying.sweeps.axes import read_axis, runs_of
 
 
 def _runs(axes, **more):

@@ -13,6 +13,7 @@ DOCS = ROOT / "docs"
 NAMES = (
     "benchmarks.md",
     "contact.md",
+    "fit.md",
     "flag_benchmark.md",
     "gallery.md",
     "live.md",

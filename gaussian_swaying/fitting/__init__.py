@@ -1,0 +1,1 @@
+"""Find the wind and the material from video: what is sought, videos, tracks, batches of simulations, least squares."""

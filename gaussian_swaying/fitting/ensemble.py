@@ -1,0 +1,183 @@
+"""Many variants of one simulation, stepped side by side as a batch."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.shelter import Shelter
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.fitting.unknowns import Variant, aero_like, stacked, variant_of
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.simulation import Simulation
+
+SAFETY = 1.15
+"""How much stiffer than at rest the material may become before a rollout is repeated with shorter substeps."""
+CFL_LIMIT = 0.5
+RETRIES = 3
+
+Values = Mapping[str, float]
+
+
+class SubstepTooLongError(RuntimeError):
+    """The material stiffened so much that the substep was not stable."""
+
+
+@dataclass
+class _Group:
+    """Variants with the same coefficients and damping, which the solver shares among the scenes of a batch."""
+
+    members: list[int]
+    solver: MPMSolver
+    forces: list[Force]
+    state: MPMState
+
+
+class Ensemble:
+    """Variants of a simulation that differ in a few values.
+
+    Variants with the same coefficients of the wind force and the same damping are one batch; the others take a batch
+    of their own. All take the same substeps, so that their differences come from the values alone.
+
+    Args:
+        simulation: The base. Its motion starts from rest at time zero.
+
+    Raises:
+        ValueError: If the simulation has parts that cannot be a batch: timed edits, contact, shelter.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        if simulation.editor.edits:
+            raise ValueError("`edits` of the base cannot be fitted through: put their material into `material`.")
+        if simulation.scene.surface_places is not None:
+            raise ValueError("Contact and obstacles cannot be fitted through yet: set `contact` to null.")
+        wind = simulation.wind
+        if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
+            raise ValueError("The wind effect Shelter cannot be fitted through: remove it from `wind.effects`.")
+        self.simulation = simulation
+        self.stiffening = SAFETY
+
+    @torch.no_grad()
+    def run(
+        self, values: Sequence[Values], times: Sequence[float], careful: bool = True, alike: bool = True
+    ) -> Iterator[list[MPMState]]:
+        """The states of all variants at each time, in the order of ``values``.
+
+        Args:
+            values: For each variant the values that replace those of the base.
+            times: Times [s], ascending, from 0 on.
+            careful: Raise if a substep was too long; otherwise such a variant may end in NaN.
+            alike: Take the same substeps for all, those of the stiffest. If not, variants that need more substeps are
+                batches of their own.
+
+        Raises:
+            SubstepTooLongError: If the material stiffened too much; ``stiffening`` is raised for the next try.
+        """
+        variants = [variant_of(self.simulation, own) for own in values]
+        groups = self._groups(variants, alike)
+        rates = [self._rate(group) for group in groups]
+        if alike:
+            rates = [max(rates)] * len(groups)
+        now = 0.0
+        for time in times:
+            if time > now:
+                for group, rate in zip(groups, rates, strict=True):
+                    self._advance(group, time - now, max(1, math.ceil((time - now) * rate)), careful)
+                now = time
+            found: list[MPMState | None] = [None] * len(values)
+            for group in groups:
+                for place, member in enumerate(group.members):
+                    found[member] = member_of(group.state, place)
+            yield [state for state in found if state is not None]
+
+    def _groups(self, variants: Sequence[Variant], alike: bool) -> list[_Group]:
+        shared: dict[tuple[float, ...], list[int]] = {}
+        for number, variant in enumerate(variants):
+            wave = 0 if alike else _stiffness_class(variant.points)
+            shared.setdefault((*variant.aero, *variant.damping, wave), []).append(number)
+        return [self._group(members, [variants[k] for k in members]) for members in shared.values()]
+
+    def _group(self, members: list[int], variants: list[Variant]) -> _Group:
+        simulation, count = self.simulation, len(members)
+        solver = solver_like(simulation.solver, *variants[0].damping)
+        aero = aero_like(simulation.aero, variants[0].aero)
+        state = solver.init_state(stacked([v.points for v in variants]), frame=simulation.scene.frame)
+        forces = [force for force in simulation.custom_forces if isinstance(force, Force)]
+        if not aero.idle:
+            patches = _repeated(simulation.scene.patches, count)
+            forces = [WindForce(aero, [v.wind for v in variants], patches), *forces]
+        return _Group(members, solver, forces, state)
+
+    def _rate(self, group: _Group) -> float:
+        """Substeps per second that are stable for all variants of a group, for waves and for explicit drag."""
+        solver, state = group.solver, group.state
+        rate = float(solver.cells_per_second(state)) * self.stiffening / solver.cfl
+        viscous = solver.stiffness_damping
+        if viscous > 0:  # the number of substeps that the solver finds for a frame of a second
+            rate = max(rate, float(solver.substeps(state, 1.0)) * self.stiffening)
+        for force in group.forces:
+            if isinstance(force, WindForce) and force.aero.drag_step == "explicit":
+                wind = torch.linalg.vector_norm(force.samples(state, 0.25, 9), dim=-1).amax()
+                speed = 1.5 * wind.to(state.velocity).expand(state.velocity.shape[:-1])
+                rate = max(rate, float(force.aero.rate(speed, force.area, solver.points.mass).amax()))
+        return rate
+
+    def _advance(self, group: _Group, time: float, steps: int, careful: bool) -> None:
+        solver = group.solver
+        group.state = solver.rollout(solver.fit_grid(group.state, time), time / steps, steps, group.forces)
+        if careful:
+            number = float(solver.cfl_number(group.state, time / steps))
+            if not number <= CFL_LIMIT:
+                more = min(number / solver.cfl, 4.0) if math.isfinite(number) else 4.0
+                self.stiffening *= 1.1 * max(more, 1.0)
+                raise SubstepTooLongError(f"The Courant number reached {number:.3g}.")
+
+
+def solver_like(solver: MPMSolver, damping: float, stiffness_damping: float) -> MPMSolver:
+    """A solver with the same settings and boundaries, and another damping."""
+    settings = solver.settings
+    return MPMSolver(
+        dx=settings.dx,
+        formulation=solver.formulation,
+        gravity=settings.gravity,
+        damping=damping,
+        stiffness_damping=stiffness_damping,
+        cfl=solver.cfl,
+        max_nodes=settings.max_nodes,
+        mls=settings.mls,
+        deterministic=settings.deterministic,
+        boundaries=list(solver.boundaries),  # type: ignore[arg-type]
+        transfer=solver.transfer,
+    )
+
+
+def member_of(state: MPMState, place: int) -> MPMState:
+    """The state of one scene of a batch."""
+    own = {"time", "grid", "substep"}
+    fields = {f.name: getattr(state, f.name) for f in dataclasses.fields(MPMState) if f.name not in own}
+    return state.replace(**{name: value[place] for name, value in fields.items() if isinstance(value, Tensor)})
+
+
+def _stiffness_class(points: MaterialPoints) -> int:
+    """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
+    squared = (points.youngs_modulus * points.volume / points.mass).amax()
+    return round(2 * math.log2(float(squared)))
+
+
+def _repeated(patches: Patches, count: int) -> Patches:
+    """The patches of several scenes, one after the other."""
+    shift = patches.count * torch.arange(count, device=patches.point.device)
+    point = (patches.point + shift[:, None]).reshape(-1)
+    return Patches(patches.normal.repeat(count, 1), patches.area.repeat(count), point, patches.count * count)
+
+
+__all__ = ["Ensemble", "SubstepTooLongError"]

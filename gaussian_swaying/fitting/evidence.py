@@ -1,0 +1,208 @@
+"""What a video says about variants of a simulation: differences of tracks, silhouettes and pixels, as residuals."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.fitting.ensemble import RETRIES, Ensemble, SubstepTooLongError, Values
+from gaussian_swaying.fitting.tracks import Tracks
+from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.simulation.simulation import Simulation
+
+PATCHES = 4
+"""Tracks and pixels of a square of so many by so many share their errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Residuals of one kind.
+
+    Attributes:
+        kind: ``tracks``, ``silhouettes`` or ``pixels``.
+        values: Differences between simulation and video for each variant, float64, shape (B, R, D); in pixels for
+            tracks, else in grey levels from 0 to 1.
+        cluster: Which group of residuals with like errors each belongs to, shape (R,).
+    """
+
+    kind: str
+    values: Tensor
+    cluster: Tensor
+
+
+class Evidence(ABC):
+    """One kind of difference between simulation and video, in one camera.
+
+    Attributes:
+        kind: Its name.
+        floor: Smallest standard deviation that is believed.
+    """
+
+    kind: str
+    floor: float
+
+    def __init__(self, video: Footage) -> None:
+        self.video = video
+        self._frame = {round(1e6 * time): k for k, time in enumerate(video.times)}
+
+    def frame_at(self, time: float) -> int | None:
+        """The frame that was taken at a time [s]; None if there is none."""
+        for shift in (0, -1, 1):
+            if (found := self._frame.get(round(1e6 * time) + shift)) is not None:
+                return found
+        return None
+
+    @abstractmethod
+    def residuals(self, simulation: Simulation, states: Sequence[MPMState], frame: int) -> tuple[Tensor, Tensor]:
+        """Differences in a frame, shape (B, R, D), and their clusters, shape (R,)."""
+
+
+class TrackEvidence(Evidence):
+    """Where the simulation carries the Gaussians that were followed, against where they were seen [pixels]."""
+
+    kind, floor = "tracks", 0.05
+
+    def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks) -> None:
+        super().__init__(video)
+        scene = simulation.scene
+        self.tracks = tracks
+        index = tracks.index.to(scene.moving.device)
+        self._follow = scene.follow.some(index).to(scene.moving.device)
+        self._rest = scene.model.means.detach()[scene.moving[index]]
+        self._cluster = _patch_of(self._rest.cpu())
+
+    def residuals(self, simulation: Simulation, states: Sequence[MPMState], frame: int) -> tuple[Tensor, Tensor]:
+        """See the base class; D is 2."""
+        seen = self.tracks.seen[frame]
+        wanted = self.tracks.position[frame, seen]
+        found = []
+        for state in states:
+            move = self._follow.motion(state)[0]
+            means = self._rest + simulation.scene.frame.displacement_to_scene(move.to(self._rest))
+            found.append(project(means.cpu()[seen], self.video.cameras[frame])[0] - wanted)
+        return torch.stack(found), self._cluster[seen]
+
+
+class PictureEvidence(Evidence):
+    """Pictures of the simulation against frames, or their opacities against silhouettes, averaged over squares.
+
+    Args:
+        video: The video.
+        masks: Compare silhouettes instead of colours.
+        width: Width of the averaged pictures [pixels].
+    """
+
+    floor = 1 / 255
+
+    def __init__(self, video: Footage, masks: bool, width: int = 80) -> None:
+        super().__init__(video)
+        self.kind, self.masks = "silhouettes" if masks else "pixels", masks
+        self.factor = max(1, round(video.size[0] / width))
+
+    def residuals(self, simulation: Simulation, states: Sequence[MPMState], frame: int) -> tuple[Tensor, Tensor]:
+        """See the base class; D is 1 for silhouettes and 3 for colours."""
+        painter = simulation.painter
+        camera = self.video.cameras[frame].to(painter.device)
+        if self.masks:
+            assert self.video.masks is not None
+            wanted = self.video.masks[frame][..., None]
+        else:
+            wanted = self.video.images[frame]
+        target = self._averaged(wanted.to(painter.device).float() / 255)
+        found = []
+        for state in states:
+            gaussians = painter.deformed(state)
+            picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+            shown = picture.alpha if self.masks else picture.color
+            found.append((self._averaged(shown.float()) - target).flatten(0, 1))
+        rows, columns = target.shape[:2]
+        row, column = (torch.arange(n) * PATCHES // n for n in (rows, columns))
+        cluster = (row[:, None] * PATCHES + column).reshape(-1)
+        return torch.stack(found).double().cpu(), cluster
+
+    def _averaged(self, picture: Tensor) -> Tensor:
+        planes = picture.permute(2, 0, 1)[None]
+        return torch.nn.functional.avg_pool2d(planes, self.factor)[0].permute(1, 2, 0)
+
+
+def compare(
+    ensemble: Ensemble,
+    evidence: Sequence[Evidence],
+    values: Sequence[Values],
+    times: Sequence[float],
+    careful: bool = True,
+) -> list[Block]:
+    """Simulate variants and compare each with the videos.
+
+    Args:
+        ensemble: The simulation.
+        evidence: What is compared.
+        values: The values of each variant.
+        times: Times of the frames to compare [s], ascending.
+        careful: Take the same substeps for all, and repeat with shorter ones if the material stiffens. If not, each
+            variant takes its own, and may end in NaN.
+
+    Returns:
+        One block for each kind, joined over cameras and times; clusters of different kinds and, for pictures, cameras
+        differ.
+    """
+    for _ in range(RETRIES if careful else 1):
+        try:
+            return _compare(ensemble, evidence, values, times, careful)
+        except SubstepTooLongError:
+            continue
+    return _compare(ensemble, evidence, values, times, False)
+
+
+def _compare(
+    ensemble: Ensemble, evidence: Sequence[Evidence], values: Sequence[Values], times: Sequence[float], careful: bool
+) -> list[Block]:
+    parts: dict[str, list[tuple[Tensor, Tensor]]] = {}
+    for time, states in zip(times, ensemble.run(values, times, careful, alike=careful), strict=True):
+        if time <= 0:  # at rest all variants are alike
+            continue
+        for place, part in enumerate(evidence):
+            frame = part.frame_at(time)
+            if frame is None:
+                continue
+            found, cluster = part.residuals(ensemble.simulation, states, frame)
+            shift = 0 if part.kind == "tracks" else place * PATCHES**2
+            parts.setdefault(part.kind, []).append((found, cluster + shift))
+    return [
+        Block(kind, torch.cat([found for found, _ in own], 1), torch.cat([cluster for _, cluster in own]))
+        for kind, own in parts.items()
+    ]
+
+
+def scales_of(blocks: Sequence[Block], floors: Mapping[str, float], member: int = 0) -> dict[str, float]:
+    """Robust standard deviation of the residuals of a variant, for each kind: from the median of their sizes."""
+    found = {}
+    for block in blocks:
+        size = block.values[member].norm(dim=-1)
+        count = block.values.shape[-1]
+        # median of the norm of D standard normal numbers, to within a percent
+        middle = {1: 0.6745, 2: 1.1774, 3: 1.5382}[count]
+        sigma = float(size.nanmedian()) / middle if size.numel() else 0.0
+        found[block.kind] = max(sigma, floors[block.kind])
+    return found
+
+
+def _patch_of(points: Tensor) -> Tensor:
+    """Square of each point (T, 3) in a grid over the two longest directions of all, shape (T,)."""
+    if len(points) < 3:
+        return torch.zeros(len(points), dtype=torch.long)
+    centred = (points - points.mean(0)).double()
+    axes = torch.linalg.svd(centred, full_matrices=False)[2][:2]
+    flat = centred @ axes.mT
+    low, high = flat.amin(0), flat.amax(0)
+    cell = ((flat - low) / (high - low).clamp(min=1e-12) * PATCHES).long().clamp(0, PATCHES - 1)
+    return cell[:, 0] * PATCHES + cell[:, 1]
+
+
+__all__ = ["Block", "Evidence", "PictureEvidence", "TrackEvidence", "compare", "scales_of"]

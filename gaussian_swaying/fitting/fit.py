@@ -1,0 +1,421 @@
+"""A whole fit: coarse search, then least squares stage by stage; it can be continued after every iteration."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._files import write_json
+from gaussian_swaying._inputs import read_json
+from gaussian_swaying.fitting.ensemble import SAFETY, Ensemble
+from gaussian_swaying.fitting.evidence import (
+    Block,
+    Evidence,
+    PictureEvidence,
+    TrackEvidence,
+    compare,
+    scales_of,
+)
+from gaussian_swaying.fitting.identifiability import check_apart, directions
+from gaussian_swaying.fitting.least_squares import (
+    LEAST_GAIN,
+    Normal,
+    Progress,
+    central_sensitivities,
+    huber,
+    iterate,
+    normal_equations,
+)
+from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
+from gaussian_swaying.fitting.report import Result, predictions, write_results
+from gaussian_swaying.fitting.tracks import Tracks, match, track
+from gaussian_swaying.fitting.unknowns import check_unknowns
+from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
+from gaussian_swaying.simulation.simulation import Simulation
+
+PROGRESS, VALUES, RESULT, SCENE, PICTURES = "fit.json", "values.csv", "result.json", "scene.yaml", "pictures"
+OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
+HORIZONS = (0.5, 1.0)
+"""Shares of the fitted frames that the first stage takes, one after the other: chaos grows with time."""
+ROUNDS = 3
+"""How often Gaussians are matched again."""
+SEARCHED = 0.5
+"""Share of the fitted frames that the coarse search looks at."""
+NEAR = 0.1
+"""Standard deviation of the second part of the search, as a share of the ranges."""
+COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
+"""Residuals that the search takes for large: shares of the picture's width, and grey levels."""
+TOLERANCE = 3e-4
+"""Shortest step of the last stage, as a share of the ranges."""
+ROUGH = 30
+"""How many times less exact the other steps are."""
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class Course:
+    """Where a fit stands, as ``fit.json`` keeps it.
+
+    Attributes:
+        step: Number of the step, which is a stage at a horizon.
+        place: Shares of the ranges.
+        matched: Where the Gaussians of the current step were matched; empty if they were not.
+        damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
+        iteration: Iterations done in this step.
+        stiffening: See :class:`~gaussian_swaying.fitting.ensemble.Ensemble`.
+        history: One row for each iteration.
+        directions: The principal directions of the sensitivities.
+        seconds: Time spent.
+    """
+
+    step: int = -1
+    place: list[float] = field(default_factory=list)
+    matched: list[float] = field(default_factory=list)
+    damping: float = 1e-2
+    iteration: int = 0
+    stiffening: float = SAFETY
+    history: list[dict[str, Any]] = field(default_factory=list)
+    directions: list[dict[str, Any]] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+class Fit:
+    """Finds the unknowns of a simulation from videos.
+
+    Args:
+        simulation: The base, with all that is known.
+        videos: From :func:`~gaussian_swaying.fitting.videos.read_videos`.
+        plan: What is sought, and how.
+        say: Called with a line for each thing that is done.
+
+    Raises:
+        ValueError: If the plan does not fit the simulation or the videos.
+    """
+
+    def __init__(
+        self, simulation: Simulation, videos: Sequence[Footage], plan: Plan, say: Say = lambda line: None
+    ) -> None:
+        check_unknowns(simulation, plan.unknowns)
+        self.simulation, self.videos, self.plan, self.say = simulation, list(videos), plan, say
+        self.times = frame_times(videos)
+        fitted = max(3, round(plan.fit_share * len(self.times)))
+        if plan.until is not None:
+            fitted = sum(time <= plan.until + 1e-6 for time in self.times)
+            if fitted < 3:
+                raise ValueError(f"Fewer than three frames lie before `until` = {plan.until:g} s: raise it.")
+        self.fitted = self.times[:fitted]
+        masked = any(video.masks is not None for video in videos)
+        self.stages = [stage for stage in plan.stages if masked or stage != "silhouettes"]
+        if not self.stages:
+            raise ValueError(
+                "The videos have no silhouettes: give `mask_path` or transparent images, or add tracks to `stages`."
+            )
+        self.ensemble = Ensemble(simulation)
+        self._tracks: list[Tracks] | None = None
+
+    # ---- what is compared
+
+    @property
+    def tracks(self) -> list[Tracks]:
+        """Tracks of every camera."""
+        if self._tracks is None:
+            self._tracks = [track(self.simulation, video, self.plan.tracks) for video in self.videos]
+            if sum(len(own.index) for own in self._tracks) < 4:
+                raise ValueError(
+                    "Fewer than four points of the object can be followed: give sharper videos, or use the `stages` "
+                    "silhouettes and pixels."
+                )
+        return self._tracks
+
+    def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
+        """What a stage compares."""
+        found: list[Evidence] = []
+        if stage == "pixels":
+            return [PictureEvidence(video, masks=False) for video in self.videos]
+        if stage == "tracks" or (stage == "silhouettes" and "tracks" in self.stages):
+            pairs = zip(self.videos, self.tracks, strict=True)
+            found += [TrackEvidence(self.simulation, video, tracks) for video, tracks in pairs]
+        if stage == "silhouettes":
+            found += [PictureEvidence(video, masks=True) for video in self.videos if video.masks is not None]
+        if stage == "matches":
+            found += self._matches(matched)
+        return found
+
+    def _matches(self, place: Sequence[float]) -> list[Evidence]:
+        states: list[list[MPMState]] = [[] for _ in self.videos]
+        probes = [TrackEvidence(self.simulation, video, _NOTHING) for video in self.videos]
+        for moment, found in zip(self.fitted, self._run(torch.tensor([list(place)]), self.fitted), strict=True):
+            for own, probe in zip(states, probes, strict=True):
+                if probe.frame_at(moment) is not None:
+                    own.append(found[0])
+        tracks = [match(self.simulation, v, own, self.plan.tracks) for v, own in zip(self.videos, states, strict=True)]
+        return [TrackEvidence(self.simulation, v, own) for v, own in zip(self.videos, tracks, strict=True)]
+
+    def _run(self, places: Tensor, times: Sequence[float]) -> Any:
+        return self.ensemble.run([self.values(place) for place in places], times, careful=False)
+
+    def values(self, place: Tensor | Sequence[float]) -> dict[str, float]:
+        """The values at a place, shares of the ranges."""
+        return {u.name: u.value(float(share)) for u, share in zip(self.plan.unknowns, place, strict=True)}
+
+    def residuals(self, evidence: Sequence[Evidence], times: Sequence[float]) -> Callable[[Tensor], list[Block]]:
+        """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
+
+        def at(places: Tensor) -> list[Block]:
+            return compare(self.ensemble, evidence, [self.values(place) for place in places], times)
+
+        return at
+
+    # ---- the steps
+
+    def steps(self) -> list[tuple[str, float]]:
+        """Stage and horizon of every step: the first stage at growing horizons, the others at the full one."""
+        found = [(self.stages[0], share) for share in HORIZONS] if self.stages[0] != "matches" else []
+        for stage in self.stages if not found else self.stages[1:]:
+            found += [(stage, 1.0)] * (ROUNDS if stage == "matches" else 1)
+        return found
+
+    def search(self) -> list[float]:
+        """The best place of a coarse search: Sobol's sequence over the ranges, then draws around the best place.
+
+        Coefficients and damping stay in the middle of their ranges: simulations of like stiffness are one batch.
+        """
+        unknowns, plan = self.plan.unknowns, self.plan
+        begin = [0.5 if u.start is None else u.share(u.start) for u in unknowns]
+        moving = [k for k, u in enumerate(unknowns) if u.start is None and not u.name.startswith(("aero.", "solver."))]
+        if not plan.search or not moving:
+            return begin
+        first = self.stages[0]
+        evidence = self.evidence("tracks" if first == "matches" else first)
+        times = self.fitted[: max(3, round(SEARCHED * len(self.fitted)))]
+        places = torch.tensor([begin]).repeat(max(1, 3 * plan.search // 4), 1).double()
+        sobol = torch.quasirandom.SobolEngine(len(moving), scramble=True, seed=plan.seed)
+        places[:, moving] = sobol.draw(len(places)).double()
+        costs = self._coarse(places, evidence, times)
+        generator = torch.Generator().manual_seed(plan.seed)
+        near = places[int(costs.argmin())].repeat(plan.search - len(places), 1)
+        if len(near):
+            shift = torch.randn(len(near), len(moving), generator=generator, dtype=torch.float64)
+            near[:, moving] = (near[:, moving] + NEAR * shift).clamp(0.02, 0.98)
+            places, costs = torch.cat([places, near]), torch.cat([costs, self._coarse(near, evidence, times)])
+        if not bool(torch.isfinite(costs).any()):
+            raise ValueError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
+        return [float(share) for share in places[int(costs.argmin())]]
+
+    def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Tensor:
+        blocks = compare(self.ensemble, evidence, [self.values(p) for p in places], times, careful=False)
+        width = max(video.size[0] for video in self.videos)
+        scales = {b.kind: COARSE[b.kind] * (width if b.kind in ("tracks", "matches") else 1) for b in blocks}
+        return huber(blocks, scales)
+
+    def run(self, course: Course, keep: Callable[[Course], None]) -> Result:
+        """Do what is missing, and report.
+
+        Args:
+            course: Where the fit stands; a new one for a new fit.
+            keep: Called after every iteration, to write the course.
+
+        Raises:
+            ValueError: If the video cannot tell the unknowns apart.
+        """
+        clock, self.ensemble.stiffening = time.monotonic() - course.seconds, course.stiffening
+        if course.step < 0:
+            course.place = self.search()
+            self.say(f"search: {self._shown(course.place)}")
+            self._check_apart(course)
+            course.step, course.seconds = 0, time.monotonic() - clock
+            keep(course)
+        steps = self.steps()
+        evidence: list[Evidence] = []
+        while course.step < len(steps):
+            stage, share = steps[course.step]
+            times = self.fitted[: max(3, round(share * len(self.fitted)))]
+            if stage == "matches" and not course.matched:
+                course.matched = list(course.place)
+            evidence = self.evidence(stage, course.matched)
+            progress = Progress(torch.tensor(course.place, dtype=torch.float64), course.damping, course.iteration)
+            residuals, floors = self.residuals(evidence, times), {part.kind: part.floor for part in evidence}
+            while not progress.done and progress.iteration < self.plan.iterations:
+                last = course.step == len(steps) - 1
+                close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
+                iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
+                course.place, course.damping = progress.place.tolist(), progress.damping
+                course.stiffening = self.ensemble.stiffening
+                course.iteration, course.seconds = progress.iteration, time.monotonic() - clock
+                row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": _cost(progress)}
+                course.history.append(
+                    row | {f"scale_{k}": v for k, v in progress.scales.items()} | self.values(course.place)
+                )
+                self.say(f"{stage} to {times[-1]:.3g} s, {progress.iteration}: {self._shown(course.place)}")
+                keep(course)
+            course.step, course.iteration, course.damping, course.matched = course.step + 1, 0, 1e-2, []
+            keep(course)
+        place = torch.tensor(course.place, dtype=torch.float64)
+        normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)
+        found = directions(normal.matrix, self.plan.unknowns, place)
+        course.seconds = time.monotonic() - clock
+        state = self._run(place[None], self.times)
+        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), (own[0] for own in state))
+        return Result(
+            self.plan.unknowns, tuple(course.place), normal.covariance(), found, shown, course.history, course.seconds
+        )
+
+    def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
+        blocks, steps = central_sensitivities(self.residuals(evidence, times), place)
+        return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
+
+    def _check_apart(self, course: Course) -> None:
+        first = self.stages[0]
+        place = torch.tensor(course.place, dtype=torch.float64)
+        normal = self._normal(place, self.evidence("tracks" if first == "matches" else first), self.fitted)
+        found = directions(normal.matrix, self.plan.unknowns, place)
+        course.directions = [{"strength": d.strength, "parts": d.parts, "sentence": d.sentence} for d in found]
+        for direction in found:
+            self.say(f"sensitivity {direction.strength:9.3g}: {direction.sentence}")
+        check_apart(found, self.plan.unknowns, self.plan.limit)
+
+    def _shown(self, place: Sequence[float]) -> str:
+        return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
+
+
+def _cost(progress: Progress) -> float:
+    return math.nan if progress.normal is None else progress.normal.cost
+
+
+_NOTHING = Tracks(torch.zeros(0, dtype=torch.long), torch.zeros(0, 0, 2), torch.zeros(0, 0, dtype=torch.bool))
+
+
+def run_fit(
+    plan: Plan,
+    output: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    device: str = "auto",
+    progress: bool = True,
+    started: Callable[[], None] = lambda: None,
+) -> Result:
+    """Do a fit and write its folder: values.csv, result.json, scene.yaml and pictures.
+
+    Args:
+        plan: From :func:`~gaussian_swaying.fitting.plan.read_plan`.
+        output: The folder.
+        resume: Continue the fit in it after its last iteration.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        progress: Print a line for each iteration.
+        started: Called when the folder is locked.
+
+    Returns:
+        The result.
+
+    Raises:
+        ValueError: If something does not fit together, the video cannot tell the unknowns apart, or the folder cannot
+            be used.
+    """
+    folder, parser = Path(output), Simulation.parser()
+    settings = parse_base(plan, parser)
+    settings.device = device
+    own = settings.clone()
+    own.camera = own.cameras = None  # the videos have their own
+    simulation = Simulation.from_settings(parser, own)
+    begin = time.monotonic()
+
+    def say(line: str) -> None:
+        if progress:
+            print(f"[{time.monotonic() - begin:6.0f} s] {line}", file=sys.stderr, flush=True)
+
+    fit_ = Fit(simulation, read_videos(list(plan.videos), plan.cameras), plan, say)
+    described = _described(plan, simulation)
+    remedy = "choose another with --output"
+    if resume and not (folder / PROGRESS).exists():
+        raise ValueError(f"There is nothing to resume in {folder}: it has no {PROGRESS}; leave out --resume.")
+    lock = hold_folder(folder, remedy) if resume else claim_folder(folder, OURS, remedy)
+    try:
+        course = _read_course(folder, described) if resume else Course()
+        started()
+
+        def keep(course: Course) -> None:
+            write_json(folder / PROGRESS, {"plan": described, "course": vars(course)})
+
+        result = fit_.run(course, keep)
+        write_results(folder, result, parser, settings, simulation)
+        return result
+    finally:
+        lock.release()
+        if not (folder / PROGRESS).exists():  # it was refused before the first iteration: nothing stays
+            (folder / MARKER).unlink(missing_ok=True)
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def fit(
+    base: str | os.PathLike[str] | Sequence[str],
+    videos: str | os.PathLike[str] | Sequence[str],
+    unknowns: Mapping[str, Any],
+    output: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    device: str = "auto",
+    progress: bool = True,
+    **settings: Any,
+) -> Result:
+    """Find the wind and the material of a simulation from videos, as ``gaussian-swaying fit`` does.
+
+    Args:
+        base: Configuration of ``sim``, or several: the splat, the solver and all that is known.
+        videos: Folders with transforms.json, see :func:`~gaussian_swaying.fitting.videos.read_videos`.
+        unknowns: For each number that is sought its range, such as ``{"wind.speed": [1, 10]}``, or
+            ``{"range": [1, 10], "scale": "log", "start": 3}``.
+        output: Folder for the results.
+        resume: Continue the fit in it.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        progress: Print a line for each iteration.
+        settings: Further fields of :class:`~gaussian_swaying.fitting.plan.Plan`, such as ``known``, ``stages`` and
+            ``fit_share``.
+
+    Returns:
+        Values with standard errors, what the video cannot tell apart, and the error of the predicted frames.
+
+    Raises:
+        ValueError: As :func:`run_fit`.
+    """
+
+    def names(given: Any) -> list[str]:
+        return [os.fspath(given)] if isinstance(given, str | os.PathLike) else [os.fspath(one) for one in given]
+
+    sought = [read_unknown(name, entry) for name, entry in unknowns.items()]
+    plan = Plan(names(base), names(videos), sought, **settings)
+    return run_fit(plan, output, resume=resume, device=device, progress=progress)
+
+
+def _described(plan: Plan, simulation: Simulation) -> dict[str, Any]:
+    """What a fit must have in common with the one that it continues."""
+    own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
+    sought = {u.name: [u.low, u.high, u.scale, u.start] for u in plan.unknowns}
+    own = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}
+    return {**own, "unknowns": sought, "scene": simulation.config}
+
+
+def _read_course(folder: Path, described: Mapping[str, Any]) -> Course:
+    kept = read_json(folder / PROGRESS, "progress of the fit")
+    if kept["plan"] != described:
+        changed = [name for name in described if kept["plan"].get(name) != described[name]]
+        raise ValueError(
+            f"The fit in {folder} has another `{changed[0] if changed else 'plan'}`: leave out --resume to begin again."
+        )
+    return Course(**kept["course"])
+
+
+__all__ = ["Course", "Fit", "fit", "run_fit"]

@@ -1,0 +1,208 @@
+"""Robust nonlinear least squares by Levenberg and Marquardt's method, with a batch of simulations for each step.
+
+A step takes one batch: the residuals at its end and their sensitivities, by finite differences. Residuals are divided
+by their robust standard deviation, and weighed by Huber's function, so that tracks that went astray count little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.fitting.evidence import Block
+
+STEP = 0.004
+"""Step of the finite differences, as a share of the range."""
+HUBER = 1.345
+"""Standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)."""
+BETTER, WORSE = 0.1, 10.0
+"""Factors of the damping after a step that lowered the cost, and after one that did not."""
+MOST_DAMPING = 1e4
+"""Damping at which the search for a better place ends."""
+LEAST_GAIN = 1e-4
+REACH = 0.25
+"""Longest step, as a share of each range."""
+
+Residuals = Callable[[Tensor], list[Block]]
+"""Residuals at some points (B, U), each a share of every range."""
+Rescale = Callable[[Sequence[Block]], dict[str, float]]
+"""Robust standard deviation of the first variant's residuals, for each kind."""
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Residuals and their sensitivities at a point, as sums.
+
+    Attributes:
+        cost: Mean of Huber's function over all residuals, each in standard deviations.
+        gradient: Weighed sum of sensitivity times residual, shape (U,).
+        matrix: Weighed sum of sensitivity times sensitivity, J^T W J, shape (U, U).
+        scores: The gradient of each cluster of like errors, shape (C, U).
+        count: Number of residuals.
+    """
+
+    cost: float
+    gradient: Tensor
+    matrix: Tensor
+    scores: Tensor
+    count: int
+
+    def covariance(self) -> Tensor:
+        r"""Covariance of the unknowns in shares of their ranges, shape (U, U).
+
+        :math:`A^{-1} \bigl(\tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1}`, where the gradients are summed over
+        clusters of residuals whose errors are alike (neighbouring tracks at all times): the sandwich of White (1980)
+        and Liang & Zeger (1986). The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far too
+        small.
+        """
+        inverse = torch.linalg.pinv(self.matrix, hermitian=True)
+        clusters = int((self.scores.abs().sum(-1) > 0).sum())
+        factor = clusters / max(clusters - 1, 1)
+        middle = factor * self.scores.mT @ self.scores
+        return inverse @ middle @ inverse + inverse
+
+
+@dataclass
+class Progress:
+    """Where an optimisation stands; enough to continue it.
+
+    Attributes:
+        place: Shares of the ranges, shape (U,).
+        damping: Damping of the last accepted step.
+        iteration: Iterations done.
+        normal: The sums at ``place``; None if they are to be computed.
+        scales: Standard deviations of each kind of residual there.
+        done: Why it ended; empty if it did not.
+    """
+
+    place: Tensor
+    damping: float = 1e-2
+    iteration: int = 0
+    normal: Normal | None = None
+    scales: dict[str, float] = field(default_factory=dict)
+    done: str = ""
+
+
+def huber(blocks: Sequence[Block], scales: Mapping[str, float]) -> Tensor:
+    """Cost of each variant, shape (B,); infinite for one that is not finite."""
+    total, count = torch.zeros(len(blocks[0].values), dtype=torch.float64), 0
+    for block in blocks:
+        size = block.values.norm(dim=-1) / scales[block.kind]
+        loss = torch.where(size < HUBER, 0.5 * size.square(), HUBER * (size - 0.5 * HUBER))
+        total, count = total + loss.sum(-1), count + size.shape[-1]
+    return torch.where(torch.isfinite(total), total, float("inf")) / max(count, 1)
+
+
+def normal_equations(blocks: Sequence[Block], scales: Mapping[str, float], steps: Tensor) -> Normal:
+    """Sums of the residuals of the first variant and of their sensitivities, from the differences of the others.
+
+    Args:
+        blocks: Residuals of 1 + U variants; variant 1 + u differs from the first in unknown u.
+        scales: Standard deviation of each kind.
+        steps: By how much of its range, shape (U,).
+    """
+    unknowns, gradient, matrix, count = len(steps), 0.0, 0.0, 0
+    clusters = sum(int(block.cluster.max()) + 1 if len(block.cluster) else 0 for block in blocks)
+    scores, first = torch.zeros(clusters, unknowns, dtype=torch.float64), 0
+    for block in blocks:
+        sigma = scales[block.kind]
+        residual = block.values[0] / sigma
+        change = (block.values[1:] - block.values[:1]) / (sigma * steps[:, None, None])
+        usable = torch.isfinite(residual).all(-1) & torch.isfinite(change).all(-1).all(0)
+        residual, change, cluster = residual[usable], change[:, usable], block.cluster[usable]
+        weight = HUBER / residual.norm(dim=-1).clamp(min=HUBER)
+        own = ((change * residual).sum(-1) * weight).mT  # (R, U)
+        gradient = gradient + own.sum(0)
+        flat = (change * weight.sqrt()[:, None]).flatten(1)
+        matrix = matrix + flat @ flat.mT
+        scores.index_add_(0, cluster + first, own)
+        first, count = first + (int(block.cluster.max()) + 1 if len(block.cluster) else 0), count + len(residual)
+    assert isinstance(gradient, Tensor)
+    assert isinstance(matrix, Tensor)
+    base = [Block(b.kind, b.values[:1], b.cluster) for b in blocks]
+    return Normal(float(huber(base, scales)[0]), gradient, matrix, scores, count)
+
+
+def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Tensor]:
+    """Residuals at a point and next to it, and the steps between, shape (U,); steps point into the range."""
+    steps = torch.where(place > 1 - STEP, -STEP, STEP)
+    return residuals(torch.cat([place[None], place + torch.diag(steps)])), steps
+
+
+def central_sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Tensor]:
+    """As :func:`sensitivities`, from steps to both sides: exact to second order, for nearly twice the simulations."""
+    unknowns = len(place)
+    place = place.clamp(STEP, 1 - STEP)
+    steps = torch.diag(torch.full_like(place, STEP))
+    found = []
+    for block in residuals(torch.cat([place[None], place + steps, place - steps])):
+        here, up, down = block.values.split([1, unknowns, unknowns])
+        found.append(Block(block.kind, torch.cat([here, here + 0.5 * (up - down)]), block.cluster))
+    return found, steps.diagonal()
+
+
+def linearised(residuals: Residuals, rescale: Rescale, place: Tensor) -> tuple[Normal, dict[str, float], list[Block]]:
+    """The sums at a place, the standard deviations of its residuals, and the residuals."""
+    blocks, steps = sensitivities(residuals, place)
+    scales = rescale(blocks)
+    return normal_equations(blocks, scales, steps), scales, blocks
+
+
+def iterate(
+    residuals: Residuals, rescale: Rescale, progress: Progress, tolerance: float, least_gain: float = LEAST_GAIN
+) -> None:
+    """One iteration; ``progress`` is updated, also with the reason to stop.
+
+    Args:
+        residuals: Computes residuals.
+        rescale: Standard deviations of the first variant's residuals.
+        progress: Where to start.
+        tolerance: Smallest step worth another iteration, as a share of the ranges.
+        least_gain: Smallest share of the cost worth another iteration.
+
+    Raises:
+        ValueError: If nothing is finite where it starts.
+    """
+    if progress.normal is None:
+        progress.normal, progress.scales, _ = linearised(residuals, rescale, progress.place)
+        if progress.normal.count == 0:
+            raise ValueError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
+    normal = progress.normal
+    progress.iteration += 1
+    trial = _step(normal, progress.place, progress.damping)
+    moved = float((trial - progress.place).abs().amax())
+    there, scales, blocks = linearised(residuals, rescale, trial)
+    gain = normal.cost - float(huber([Block(b.kind, b.values[:1], b.cluster) for b in blocks], progress.scales)[0])
+    if not gain > 0:
+        progress.damping = max(progress.damping, 0.1) * WORSE
+        if moved < 10 * tolerance or progress.damping > MOST_DAMPING:
+            progress.done = "no step is better"
+        return
+    progress.place, progress.normal, progress.scales = trial, there, scales
+    progress.damping *= BETTER
+    if moved < tolerance:
+        progress.done = f"the last step was below {tolerance:g} of every range"
+    elif gain < least_gain * normal.cost:
+        progress.done = f"the last step lowered the cost by less than {least_gain:.2%}"
+
+
+def _step(normal: Normal, place: Tensor, damping: float) -> Tensor:
+    """The place after a damped step that stays in the ranges; an unknown at its end that would leave it is kept."""
+    free = torch.ones_like(place, dtype=torch.bool)
+    for _ in range(len(place) + 1):
+        matrix = normal.matrix[free][:, free]
+        damped = matrix + (damping + 1e-12) * torch.diag(matrix.diagonal().clamp(min=1e-12))
+        step = torch.zeros_like(place)
+        step[free] = -torch.linalg.solve(damped, normal.gradient[free])
+        blocked = free & (((place <= 0) & (step < 0)) | ((place >= 1) & (step > 0)))
+        if not bool(blocked.any()) or not bool((free & ~blocked).any()):
+            break
+        free &= ~blocked
+    longest = float(step.abs().amax())
+    return (place + step * min(1.0, REACH / max(longest, 1e-12))).clamp(0.0, 1.0)
+
+
+__all__ = ["Normal", "Progress", "central_sensitivities", "huber", "iterate", "normal_equations"]

@@ -1,0 +1,223 @@
+"""What a fit writes: the table of values, pictures of video, simulation and difference, and a scene for ``sim``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._files import write_json, write_table, write_text
+from gaussian_swaying.fitting.identifiability import Direction
+from gaussian_swaying.fitting.unknowns import POLAR, Unknown, flow_of
+from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.simulation.config import config_text, option, parse_text
+from gaussian_swaying.simulation.simulation import Simulation
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+SHOWN = 3
+"""Frames of the fitted and of the predicted part in a picture."""
+VAGUE = 0.25
+"""Standard error, as a share of the range, above which an unknown is called not determined."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """How well one camera is reproduced.
+
+    Attributes:
+        camera: Its name.
+        fitted: PSNR of the fitted frames [dB].
+        predicted: PSNR of the predicted frames [dB]; NaN if there are none.
+        picture: Rows of video, simulation and difference, dtype uint8, shape (H, W, 3).
+        times: Time of each row [s].
+    """
+
+    camera: str
+    fitted: float
+    predicted: float
+    picture: Tensor
+    times: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a fit found.
+
+    Attributes:
+        unknowns: What was sought.
+        place: Where in their ranges the values are.
+        covariance: Covariance of the places, shape (U, U).
+        directions: Principal directions of the sensitivities, the best known first.
+        shown: How well each camera is reproduced.
+        history: One row for each iteration.
+        seconds: Time it took.
+    """
+
+    unknowns: Sequence[Unknown]
+    place: tuple[float, ...]
+    covariance: Tensor
+    directions: Sequence[Direction]
+    shown: Sequence[Shown]
+    history: Sequence[Mapping[str, Any]]
+    seconds: float
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The values."""
+        return {u.name: u.value(share) for u, share in zip(self.unknowns, self.place, strict=True)}
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Standard errors, in the units of the values. They contain the noise of the video, not faults of the model."""
+        share = self.covariance.diagonal().clamp(min=0).sqrt().tolist()
+        return {u.name: s * u.slope(p) for u, s, p in zip(self.unknowns, share, self.place, strict=True)}
+
+    @property
+    def vague(self) -> list[str]:
+        """Names of unknowns that the video does not determine."""
+        share = self.covariance.diagonal().clamp(min=0).sqrt().tolist()
+        return [u.name for u, s in zip(self.unknowns, share, strict=True) if s > VAGUE]
+
+    @property
+    def at_an_end(self) -> list[str]:
+        """Names of unknowns at an end of their range."""
+        return [u.name for u, p in zip(self.unknowns, self.place, strict=True) if p < 1e-3 or p > 1 - 1e-3]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The table: a row for each unknown."""
+        values, errors = self.values, self.errors
+        return [
+            {
+                "name": u.name,
+                "value": values[u.name],
+                "standard_error": errors[u.name],
+                "unit": u.unit,
+                "low": u.low,
+                "high": u.high,
+            }
+            for u in self.unknowns
+        ]
+
+    def text(self) -> str:
+        """The table and what is to be said about it, for printing."""
+        lines = [f"{'':<28}{'value':>12}{'error':>12}"]
+        for row in self.rows():
+            lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
+        for name in self.vague:
+            lines.append(f"{name} is not determined by this video: its error is a large part of its range.")
+        for name in self.at_an_end:
+            lines.append(f"{name} is at an end of its range: widen the range.")
+        for one in self.shown:
+            told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
+            lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
+        return "\n".join(lines)
+
+
+def predictions(
+    simulation: Simulation, videos: Sequence[Footage], times: Sequence[float], fitted: int, states: Iterable[MPMState]
+) -> list[Shown]:
+    """Compare a simulation with whole videos.
+
+    Args:
+        simulation: Draws the states.
+        videos: The videos.
+        times: Times of the states [s].
+        fitted: How many of them were fitted.
+        states: The states.
+    """
+    chosen = {k for part in (range(1, fitted), range(fitted, len(times))) for k in _spread(part)}
+    squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
+    rows: list[list[tuple[float, Tensor]]] = [[] for _ in videos]
+    for k, (time, state) in enumerate(zip(times, states, strict=True)):
+        for number, video in enumerate(videos):
+            frame = next((f for f, own in enumerate(video.times) if abs(own - time) < 2e-6), None)
+            if frame is None:
+                continue
+            painter = simulation.painter
+            camera = video.cameras[frame].to(painter.device)
+            gaussians = painter.deformed(state)
+            shown = painter.draw(gaussians, painter.colors(gaussians, camera), camera).color.clamp(0, 1).float().cpu()
+            real = video.images[frame].float() / 255
+            squares[number][k >= fitted].append(float((shown - real).square().mean()))
+            if k in chosen:
+                difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
+                rows[number].append((time, torch.cat([real, shown, difference], 1)))
+    found = []
+    for video, own, row in zip(videos, squares, rows, strict=True):
+        picture = (torch.cat([part for _, part in row]) * 255).round().to(torch.uint8)
+        found.append(Shown(video.name, _psnr(own[0]), _psnr(own[1]), picture, tuple(time for time, _ in row)))
+    return found
+
+
+def write_results(
+    folder: Path, result: Result, parser: ArgumentParser, settings: Namespace, simulation: Simulation
+) -> None:
+    """Write ``values.csv``, ``result.json``, ``scene.yaml`` and the folder ``pictures``."""
+    import imageio.v3 as iio
+
+    pictures = folder / "pictures"
+    pictures.mkdir(exist_ok=True)
+    for one in result.shown:
+        iio.imwrite(pictures / f"{one.camera}.png", one.picture.numpy())
+    write_table(folder / "values.csv", result.rows())
+    write_json(
+        folder / "result.json",
+        {
+            "values": result.rows(),
+            "covariance_of_shares": result.covariance.tolist(),
+            "sensitivities": [{"strength": d.strength, "direction": d.sentence} for d in result.directions],
+            "cameras": [
+                {"camera": s.camera, "psnr_fitted_db": s.fitted, "psnr_predicted_db": s.predicted} for s in result.shown
+            ],
+            "not_determined": result.vague,
+            "at_an_end": result.at_an_end,
+            "history": list(result.history),
+            "seconds": result.seconds,
+        },
+    )
+    write_text(folder / "scene.yaml", scene_text(result.values, parser, settings, simulation))
+
+
+def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> str:
+    """The configuration of the base with the values that were found, as YAML for ``sim``."""
+    import yaml
+
+    options: dict[str, Any] = {name: value for name, value in values.items() if not name.startswith("wind.")}
+    if any(name in values for name in POLAR):
+        options["wind.flow"] = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
+    text = config_text(parser, settings)
+    modulations = [name for name in values if name.startswith("wind.modulations.")]
+    if modulations:
+        entries = yaml.safe_load(text)["wind"]["modulations"]
+        for name in modulations:
+            _, _, place, field = name.split(".")
+            entries[int(place)]["init_args"][field] = values[name]
+        options["wind.modulations"] = entries
+    told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
+    found = parse_text(parser, text, [option(name, value) for name, value in options.items()])
+    return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
+
+
+def _spread(places: range) -> list[int]:
+    """Up to :data:`SHOWN` of some numbers, evenly spread, with the last."""
+    count = min(SHOWN, len(places))
+    return [places[(k + 1) * len(places) // count - 1] for k in range(count)]
+
+
+def _psnr(squares: Sequence[float]) -> float:
+    """PSNR of mean squares [dB], of their mean; NaN for none."""
+    if not squares:
+        return math.nan
+    mean = sum(squares) / len(squares)
+    return -10 * math.log10(mean) if mean > 0 else math.inf
+
+
+__all__ = ["Result", "Shown", "predictions", "scene_text", "write_results"]

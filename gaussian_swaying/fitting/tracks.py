@@ -1,0 +1,188 @@
+"""Point tracks: Gaussians that a camera sees at rest, followed through its video by Lucas and Kanade's method.
+
+The tracker is OpenCV's pyramidal Lucas-Kanade (Bouguet 2000), frame to frame. A track ends where following it back
+does not return to where it came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.simulation.simulation import Simulation
+
+WINDOW = 15
+"""Side of the square that is followed [pixels]."""
+LEVELS = 3
+BACK = 0.5
+"""Largest distance between a point and the one found by following it back [pixels]."""
+QUALITY = 0.02
+"""Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
+EDGE = 4.0
+"""Least distance from the edges of the picture [pixels]."""
+OPAQUE = 0.3
+"""Least opacity of a Gaussian that is followed."""
+BEHIND = 0.03
+"""How far behind the picture's depth a visible Gaussian may lie, as a share of the object's size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Gaussians that were followed in the video of one camera.
+
+    Attributes:
+        index: Their places among the moving Gaussians of the scene, shape (T,).
+        position: Where each was seen [pixels], float64, shape (F, T, 2).
+        seen: Whether the track still holds, bool, shape (F, T).
+    """
+
+    index: Tensor
+    position: Tensor
+    seen: Tensor
+
+
+def track(simulation: Simulation, video: Footage, most: int = 400) -> Tracks:
+    """Follow the Gaussians that a camera sees in its first frame, at rest.
+
+    Args:
+        simulation: The scene, at rest where the video begins.
+        video: The video.
+        most: Largest number of tracks; those with the most texture are taken.
+
+    Raises:
+        ImportError: Without OpenCV.
+    """
+    chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
+    position, seen = follow(video.images.numpy(), start.numpy())
+    return Tracks(chosen, torch.from_numpy(position), torch.from_numpy(seen))
+
+
+def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], most: int = 400) -> Tracks:
+    """Where the Gaussians of a simulation are seen in the video: from each rendered frame to the frame of the camera.
+
+    Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
+    simulation must already be near, within a few tens of pixels.
+
+    Args:
+        simulation: The scene.
+        video: The video.
+        states: The state at the time of each frame of the video; fewer if only the first frames are wanted.
+        most: Largest number of Gaussians.
+    """
+    import numpy as np
+
+    scene, painter, count = simulation.scene, simulation.painter, len(video.times)
+    chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
+    index = scene.moving[chosen.to(scene.moving.device)]
+    position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
+    seen = torch.zeros(count, len(chosen), dtype=torch.bool)
+    for k, state in enumerate(states):
+        camera = video.cameras[k].to(painter.device)
+        with torch.no_grad():
+            gaussians = painter.deformed(state)
+            picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
+        pixel, depth = project(gaussians.means[index], video.cameras[k])
+        there = _in_sight(pixel, depth, picture, BEHIND * scene.size)
+        shown = (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        pair = np.stack([shown, video.images[k].numpy()])
+        found, good = follow(pair, pixel.numpy())
+        position[k], seen[k] = torch.from_numpy(found[1]), torch.from_numpy(good[1]) & there
+    return Tracks(chosen, position, seen)
+
+
+def follow(images: Any, start: Any) -> tuple[Any, Any]:
+    """Follow points through a video.
+
+    Args:
+        images: Frames as NumPy array, dtype uint8, shape (F, H, W, 3).
+        start: Points in the first frame [pixels; the first pixel's centre is at 0.5], shape (T, 2).
+
+    Returns:
+        NumPy arrays: positions, float64, shape (F, T, 2), and whether each still holds, shape (F, T).
+    """
+    import numpy as np
+
+    cv2 = _opencv()
+    options = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS}
+    options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
+    count, (height, width) = len(start), images.shape[1:3]
+    position = np.zeros((len(images), count, 2))
+    seen = np.zeros((len(images), count), dtype=bool)
+    now = np.ascontiguousarray(start - 0.5, dtype=np.float32)[:, None]
+    position[0], seen[0] = now[:, 0] + 0.5, True
+    for k in range(1, len(images)):
+        if not count:
+            break
+        there, found, _ = cv2.calcOpticalFlowPyrLK(images[k - 1], images[k], now, None, **options)
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(images[k], images[k - 1], there, None, **options)
+        off = np.linalg.norm((back - now)[:, 0], axis=-1)
+        inside = ((there[:, 0] >= 0) & (there[:, 0] <= (width - 1, height - 1))).all(-1)
+        good = (found[:, 0] > 0) & (returned[:, 0] > 0) & (off < BACK) & inside
+        seen[k] = seen[k - 1] & good
+        now = np.where(seen[k][:, None, None], there, now)
+        position[k] = now[:, 0] + 0.5
+    return position, seen
+
+
+def _chosen(simulation: Simulation, video: Footage, grey: Any, most: int) -> tuple[Tensor, Tensor]:
+    """Gaussians that are seen at rest and have texture around them, no two within a few pixels; and their pixels."""
+    import numpy as np
+
+    scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]
+    with torch.no_grad():
+        rest = scene.rest()
+        pixel, depth = project(rest.means[scene.moving], camera)
+        picture = painter.draw(rest, painter.colors(rest, camera.to(painter.device)), camera.to(painter.device))
+    opaque = scene.model.opacity().cpu()[scene.moving.cpu()] > OPAQUE
+    place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
+    column, row = pixel[place].long().unbind(-1)
+    width, height = video.size
+    texture = torch.from_numpy(np.asarray(_opencv().cornerMinEigenVal(grey, 7)))
+    score = texture[row, column]
+    good = score > QUALITY * texture.max()
+    place, score, column, row = (part[good] for part in (place, score, column, row))
+    order = score.argsort(descending=True, stable=True)
+    taken = torch.zeros(height + 8, width + 8, dtype=torch.bool)
+    kept: list[int] = []
+    for k in order.tolist():
+        r, c = int(row[k]), int(column[k])
+        if len(kept) < most and not taken[r + 4, c + 4]:
+            taken[r + 2 : r + 7, c + 2 : c + 7] = True
+            kept.append(int(place[k]))
+    chosen = torch.tensor(sorted(kept), dtype=torch.long)
+    return chosen, pixel[chosen]
+
+
+def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float) -> Tensor:
+    """Which points (T, 2) at some depths (T,) lie in a picture, away from its edges, and not behind what it shows."""
+    expected = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].cpu()
+    height, width = expected.shape
+    inside = (pixel > EDGE).all(-1) & (pixel[:, 0] < width - EDGE) & (pixel[:, 1] < height - EDGE) & (depth > 0)
+    column, row = torch.where(inside[:, None], pixel, EDGE).long().unbind(-1)
+    return inside & (depth < expected[row, column] + behind)
+
+
+def _grey(images: Tensor) -> Any:
+    weights = torch.tensor([0.299, 0.587, 0.114])
+    return (images.float() @ weights).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "Tracks need OpenCV: pip install 'gaussian-swaying[fit]', or leave `tracks` out of `stages`.", name="cv2"
+        ) from error
+    return cv2
+
+
+__all__ = ["Tracks", "follow", "match", "track"]

@@ -1,0 +1,49 @@
+"""``gaussian-swaying fit``: the one sentence it answers bad input with."""
+
+import pytest
+import yaml
+
+from gaussian_swaying.cli import shipped
+from gaussian_swaying.cli.fit import main
+
+
+def _file(path, **fields):
+    start = {"base": "flag", "videos": str(path.parent / "video"), "unknowns": {"wind.speed": {"range": [1, 9]}}}
+    path.write_text(yaml.safe_dump(start | fields))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"base": "flga"}, "'flga' (did you mean flag?)"),
+        ({"unknowns": {}}, "`unknowns`"),
+        ({"unknowns": {"wind.speed": [1]}}, "`unknowns.wind.speed` to be {range: [low, high]}"),
+        ({"unknowns": {"wind.sped": [1, 2]}}, "`wind.sped` cannot be sought"),
+        ({"unknowns": {"wind.speed": {"range": [1, 2], "start": 3}}}, "`unknowns.wind.speed.start` within its range"),
+        ({"known": {"material.EE": 3}}, "material.E"),
+        ({"stages": ["traks"]}, "'traks'"),
+        ({"fit_share": 0}, "`fit_share` above 0"),
+        ({"search": -1}, "`search`"),
+        ({"steps": 3}, "unknown field `steps`"),
+        ({}, "video does not exist"),
+    ],
+)
+def test_bad_input(fields, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    file = _file(tmp_path / "fit.yaml", **fields)
+    assert main(["--config", file]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1, error
+    assert words in error
+    assert [path.name for path in tmp_path.iterdir()] == ["fit.yaml"]
+
+
+def test_the_shipped_fit_is_a_plan():
+    from gaussian_swaying.fitting.plan import read_plan
+
+    assert "printed_flag" in shipped.names("fit")
+    file = shipped.with_shipped(["--config", "printed_flag"], "fit")[1]
+    plan = read_plan(file, lambda name: shipped.with_shipped(["--config", name], "sim")[1])
+    assert plan.unknowns[0].name == "wind.speed"

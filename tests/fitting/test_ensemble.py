@@ -1,0 +1,84 @@
+"""Variants of a simulation as a batch, against each on its own."""
+
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.fitting.ensemble import Ensemble, member_of
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import base
+
+TIMES = [0.0, 1 / 24, 2 / 24, 4 / 24]
+
+
+def test_each_variant_moves_as_its_own_simulation(simulation, tmp_path):
+    values = [
+        {},
+        {"wind.speed": 7.0, "wind.azimuth": 10.0},
+        {"material.E": 5e3, "material.density": 40.0},
+        {"aero.C_D": 0.4},
+        {"solver.damping": 3.0},
+    ]
+    own = base(material={"E": 5e3, "nu": 0.3, "density": 40.0, "thickness": 0.01})
+    damped = base()
+    damped["solver"] = damped["solver"] | {"damping": 3.0}
+    angle = torch.deg2rad(torch.tensor(10.0))
+    changes = [
+        base(),
+        base(wind={"flow": [float(7 * angle.cos()), float(7 * angle.sin()), 0.0]}),
+        own,
+        base(aero={"C_D": 0.4, "C_F": 0.3, "C_L": 0.005}),
+        damped,
+    ]
+    found = list(Ensemble(simulation).run(values, TIMES))
+    still = found[0][0].position
+    for number, settings in enumerate(changes):
+        (tmp_path / f"{number}.yaml").write_text(yaml.safe_dump(settings))
+        alone = list(Ensemble(Simulation.from_yaml(tmp_path / f"{number}.yaml", device="cpu")).run([{}], TIMES))
+        moved = (alone[-1][0].position - still).norm(dim=-1).max()
+        off = (found[-1][number].position - alone[-1][0].position).norm(dim=-1).max()
+        assert moved > 0.05
+        assert off < 5e-3 * moved  # the substeps differ
+    assert [float(state.time) for state in found[-1]] == pytest.approx([TIMES[-1]] * len(values))
+
+
+def test_wind_on_patches_of_many_directions_in_a_batch():
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(40, 3, generator=generator), dim=-1)
+    point = torch.randint(0, 6, (40,), generator=generator)
+    area = torch.rand(40, generator=generator) * 0.01
+    position = torch.rand(6, 3, generator=generator)
+    aero = AeroForce(drag_step="semi_implicit")
+    winds = [WindField([3.0, 1.0, 0.0]), WindField([-1.0, 0.5, 2.0])]
+    material = {"volume": 1e-3, "density": 100.0, "youngs_modulus": 1e4, "poisson_ratio": 0.3}
+
+    def moved(wind, patches, shape):
+        solver = MPMSolver(dx=0.3)
+        state = solver.init_state(MaterialPoints.create(position.expand(*shape, 6, 3).contiguous(), **material))
+        return solver.rollout(state, 1e-3, 5, WindForce(aero, wind, patches))
+
+    both = Patches(normal.repeat(2, 1), area.repeat(2), torch.cat([point, point + 6]), 12)
+    batch = moved(winds, both, (2,))
+    for place, wind in enumerate(winds):
+        alone = moved(wind, Patches(normal, area, point, 6), ())
+        one = member_of(batch, place)
+        torch.testing.assert_close(one.position, alone.position)
+        torch.testing.assert_close(one.work, alone.work)
+        assert one.node_velocity.shape == alone.node_velocity.shape
+
+
+def test_what_cannot_be_a_batch_is_refused(tmp_path):
+    edit = [{"time": 0.5, "E": 1e3}]
+    (tmp_path / "edits.yaml").write_text(yaml.safe_dump(base(edits=edit)))
+    with pytest.raises(ValueError, match="edits"):
+        Ensemble(Simulation.from_yaml(tmp_path / "edits.yaml", device="cpu"))
+    (tmp_path / "contact.yaml").write_text(yaml.safe_dump(base(contact={"thickness": 0.01})))
+    with pytest.raises(ValueError, match="contact"):
+        Ensemble(Simulation.from_yaml(tmp_path / "contact.yaml", device="cpu"))

@@ -1,0 +1,42 @@
+"""Residuals of pictures and silhouettes: as small as the noise at the truth, and larger away from it."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gaussian_swaying.fitting.ensemble import Ensemble
+from gaussian_swaying.fitting.evidence import PATCHES, Block, PictureEvidence, compare, scales_of
+from gaussian_swaying.fitting.fit import Fit
+from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.videos import read_videos
+
+
+@pytest.mark.parametrize("masks", [False, True])
+def test_pictures_at_the_truth_and_away_from_it(own, simulation, masks):
+    (left, _) = read_videos(own / "video")
+    evidence = PictureEvidence(left, masks, width=50)
+    (block,) = compare(Ensemble(simulation), [evidence], [{}, {"wind.speed": 8.0}], left.times[:5])
+    assert block.kind == ("silhouettes" if masks else "pixels")
+    assert block.values.shape == (2, 4 * 30 * 50, 1 if masks else 3)  # not the frame at rest
+    assert block.cluster.shape == (4 * 30 * 50,)
+    assert sorted(block.cluster.unique().tolist()) == list(range(PATCHES**2))
+    here, away = block.values.square().mean((-1, -2)).sqrt().tolist()
+    assert here < 2 / 255  # noise of two grey levels, averaged over 4 x 4 pixels, and rounding
+    assert away > 10 * here
+
+
+def test_scales_are_those_of_normal_noise():
+    generator = torch.Generator().manual_seed(0)
+    for count in (1, 2, 3):
+        values = 0.3 * torch.randn(1, 4000, count, generator=generator, dtype=torch.float64)
+        values[:, :200] = 50.0
+        block = Block("tracks", values, torch.zeros(4000, dtype=torch.long))
+        assert scales_of([block], {"tracks": 0.0})["tracks"] == pytest.approx(0.3, rel=0.1)
+
+
+def test_silhouettes_need_masks(own, simulation):
+    videos = [dataclasses.replace(video, masks=None) for video in read_videos(own / "video")]
+    plan = Plan(["base"], ["video"], [read_unknown("wind.speed", [1, 9])], stages=("silhouettes",))
+    with pytest.raises(ValueError, match="no silhouettes"):
+        Fit(simulation, videos, plan)

@@ -1,0 +1,92 @@
+"""Whole fits of a small flag: own data with noise, stopped and continued, and refused where hopeless."""
+
+import csv
+import json
+
+import pytest
+
+from gaussian_swaying.fitting.fit import Course, Fit, fit, run_fit
+from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import TRUTH
+
+pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+SOUGHT = {"wind.speed": [2.0, 12.0], "wind.azimuth": [-20.0, 100.0], "material.E": [2e3, 5e4]}
+
+
+def test_own_data_with_noise(own, tmp_path, capsys):
+    """Easier than a real video, as the model is right: within 1 % and 1 degree."""
+    result = fit(own / "base.yaml", own / "video", SOUGHT, tmp_path / "fit", device="cpu", search=16, progress=False)
+    values = result.values
+    assert values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.01)
+    assert values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.01)
+    assert values["wind.azimuth"] == pytest.approx(TRUTH["wind.azimuth"], abs=1.0)
+    assert not result.vague
+    assert not result.at_an_end
+    for shown in result.shown:
+        assert shown.fitted > 35
+        assert shown.predicted > 35
+    with (tmp_path / "fit/values.csv").open() as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+    assert float(rows["material.E"]["value"]) == values["material.E"]
+    assert float(rows["wind.speed"]["standard_error"]) == result.errors["wind.speed"] > 0
+    assert (tmp_path / "fit/pictures/left.png").stat().st_size > 0
+    assert json.loads((tmp_path / "fit/result.json").read_text())["not_determined"] == []
+    again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")
+    assert pytest.approx(values["material.E"]) == again.material.E
+    assert float(again.wind.flows[0].norm()) == pytest.approx(values["wind.speed"])
+
+
+def test_stopped_and_continued(own, tmp_path):
+    """A fit that is stopped after some iterations and continued ends where an undisturbed one does, bit for bit."""
+    sought = [read_unknown(name, SOUGHT[name]) for name in ("wind.speed", "wind.azimuth")]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=8, iterations=2, tracks=40)
+    whole = run_fit(plan, tmp_path / "whole", device="cpu", progress=False)
+
+    class StopError(Exception):
+        pass
+
+    simulation = Simulation.from_yaml(own / "base.yaml", device="cpu")
+    seen = []
+
+    def keep(course):
+        seen.append(json.loads(json.dumps(vars(course))))
+        if len(seen) in (1, 4, 9):
+            raise StopError
+
+    course, stops = Course(), 0
+    while True:
+        try:
+            result = Fit(simulation, read_videos(own / "video"), plan).run(course, keep)
+            break
+        except StopError:
+            course, stops = Course(**seen[-1]), stops + 1
+    assert stops == 3
+    assert result.place == whole.place
+    assert [row["cost"] for row in result.history] == [row["cost"] for row in whole.history]
+
+
+def test_resume_needs_the_same_plan(own, tmp_path):
+    sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=0, iterations=1, tracks=40)
+    with pytest.raises(ValueError, match="nothing to resume"):
+        run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
+    first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
+    again = run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
+    assert again.place == first.place
+    other = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=0, iterations=1, tracks=50)
+    with pytest.raises(ValueError, match="another `tracks`"):
+        run_fit(other, tmp_path / "fit", resume=True, device="cpu", progress=False)
+
+
+def test_what_cannot_be_told_apart_is_refused(own, tmp_path):
+    """A membrane has E times thickness and density times thickness, and nothing that tells the three."""
+    sought = {"material.E": [2e3, 5e4], "material.density": [5, 100], "material.thickness": [0.002, 0.05]}
+    with pytest.raises(ValueError, match="cannot tell") as error:
+        fit(own / "base.yaml", own / "video", sought, tmp_path / "fit", device="cpu", search=0, progress=False)
+    for name in sought:
+        assert f"`{name}`" in str(error.value)
+    assert not (tmp_path / "fit").exists()

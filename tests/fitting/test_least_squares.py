@@ -1,0 +1,75 @@
+"""Least squares on problems whose answers are known."""
+
+import pytest
+import torch
+
+from gaussian_swaying.fitting.evidence import Block, scales_of
+from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
+from gaussian_swaying.fitting.least_squares import Progress, iterate, linearised
+from gaussian_swaying.fitting.unknowns import Unknown
+
+TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
+FLOORS = {"tracks": 1e-6}
+
+
+def _decay(truth, noise):
+    """Residuals of amplitude x exp(-rate t) against noisy data, of two columns."""
+
+    def curve(place):
+        amplitude, rate = 1 + 4 * place[..., 0, None], 10 * place[..., 1, None]
+        found = amplitude * torch.exp(-rate * TIME)
+        return torch.stack([found, 0.5 * found + 1], -1)
+
+    data = curve(torch.tensor(truth, dtype=torch.float64)) + noise
+    cluster = torch.arange(len(TIME)) // 4
+    return lambda places: [Block("tracks", curve(places.double()) - data, cluster)]
+
+
+def _solve(residuals, start, iterations=30):
+    progress = Progress(torch.tensor(start, dtype=torch.float64))
+    while not progress.done and progress.iteration < iterations:
+        iterate(residuals, lambda blocks: scales_of(blocks, FLOORS), progress, 1e-7)
+    return progress
+
+
+def test_outliers_count_little():
+    generator = torch.Generator().manual_seed(1)
+    noise = 0.01 * torch.randn(60, 2, generator=generator, dtype=torch.float64)
+    noise[::10] += 3.0  # tracks that jumped to something else
+    found = _solve(_decay([0.4, 0.3], noise), [0.9, 0.9])
+    assert found.done
+    assert found.place.tolist() == pytest.approx([0.4, 0.3], abs=0.006)
+
+
+def test_a_value_outside_its_range_ends_at_the_end():
+    found = _solve(_decay([0.4, -0.1], torch.zeros(60, 2)), [0.9, 0.9])
+    assert float(found.place[1]) == 0.0
+    assert 0.8 < float(found.place[0]) < 0.9  # the best constant
+
+
+def test_standard_errors_are_the_scatter_of_repeated_fits():
+    """Noise that is the same for four neighbours in time: s^2 A^-1 would be half of it."""
+    places, errors = [], []
+    for seed in range(60):
+        generator = torch.Generator().manual_seed(seed)
+        noise = 0.05 * torch.randn(15, 2, generator=generator, dtype=torch.float64).repeat_interleave(4, 0)
+        residuals = _decay([0.4, 0.3], noise)
+        place = _solve(residuals, [0.5, 0.4]).place
+        normal, _, _ = linearised(residuals, lambda blocks: scales_of(blocks, FLOORS), place)
+        places.append(place)
+        errors.append(normal.covariance().diagonal().sqrt())
+    scatter, told = torch.stack(places).std(0), torch.stack(errors).square().mean(0).sqrt()
+    assert (told / scatter).tolist() == pytest.approx([1.0, 1.0], abs=0.3)
+
+
+def test_an_exact_combination_is_named_and_refused():
+    unknowns = [Unknown("material.E", 1e3, 1e5, "log"), Unknown("material.thickness", 1e-3, 1e-1, "log")]
+    row = torch.tensor([[1.0, 1.0]], dtype=torch.float64)  # only the product is seen
+    place = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    found = directions(100 * row.mT @ row, unknowns, place)
+    assert condition(found) > 1e6
+    with pytest.raises(ValueError, match="cannot tell") as error:
+        check_apart(found, unknowns, 1e3)
+    for words in ("`material.E` and `material.thickness`", "raising", "lowering", "10%", "`known`"):
+        assert words in str(error.value)
+    check_apart(directions(torch.eye(2, dtype=torch.float64), unknowns, place), unknowns, 1e3)

@@ -1,0 +1,60 @@
+"""``bench.py fit``: errors against the truth, and tables that say what is reached and what is missed."""
+
+import pytest
+from bench.cases import fit as case
+from bench.tables import fit as tables
+
+HEAD = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0}
+ROW = {
+    "speed_error": 0.004,
+    "direction_error_deg": 0.5,
+    "material.E_error": -0.008,
+    "psnr_predicted_db": 31.26,
+    "seconds": 12.4,
+    "points": 1200,
+    "size": [200, 120],
+    "until_s": 0.75,
+}
+
+
+def test_errors_of_a_flow():
+    found = case.errors([0.0, 2.2, 0.0], [2.0, 0.0, 0.0])
+    assert found["speed_error"] == pytest.approx(0.1)
+    assert found["direction_error_deg"] == pytest.approx(90.0)
+
+
+def test_the_settings_of_own_data_are_a_simulation(tmp_path):
+    import yaml
+
+    from gaussian_swaying.simulation.simulation import Simulation
+
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(case._settings(case.SIZES["cpu"])))
+    simulation = Simulation.from_yaml(tmp_path / "base.yaml", device="cpu")
+    assert set(simulation.painter.cameras) == {"left", "right"}
+    assert simulation.wind.flows[0].tolist() == case.TRUTH["flow"]
+
+
+def test_missed_goals_are_said_to_be_missed():
+    rows = {"two cameras": ROW, "one camera": ROW | {"speed_error": -0.02}, "pixels alone": ROW | {"speed_error": 0.9}}
+    lines = tables.own([HEAD | {"own": rows}])
+    assert "| two cameras | +0.40 % | 0.50° | -0.80 % | 31.3 dB | 12 s | yes |" in lines
+    assert "| one camera | -2.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s | no |" in lines
+    assert "| pixels alone | +90.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s |  |" in lines
+    found = tables.blender(
+        [
+            HEAD
+            | {
+                "blender": {
+                    "flag, two cameras": ROW | {"speed_error": 0.07},
+                    "flag, one camera": ROW | {"speed_error": 0.07},
+                    "curtain, two cameras": {"refused": "The video cannot tell."},
+                }
+            }
+        ]
+    )
+    assert [line.split(" | ")[-1] for line in found if line.startswith(("| flag", "| curtain"))] == [
+        "no |",
+        "yes |",
+        "no |",
+    ]
+    assert tables.blender([HEAD]) == ["Not measured yet."]

@@ -1,0 +1,70 @@
+"""Tables of ``bench.py fit``: what was found from videos, and how far it is from the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench.slots import table
+from bench.tables.markdown import grid, source, yes_no
+
+Row = dict[str, Any]
+
+OWN = (0.01, 1.0, 0.01)
+TWO, ONE = (0.05, 3.0, 0.10), (0.10, 6.0, 0.20)
+"""Goals: error of the speed, angle between the winds [degrees], error of E."""
+ABLATIONS = ("tracks alone", "pixels alone", "without patches")
+"""Rows that have no goal."""
+
+
+HEAD = ["", "speed", "direction", "E", "predicted frames", "time"]
+
+
+@table("fit.md", "fit.own", "fit_*", together=True)
+def own(results: list[Row]) -> list[str]:
+    """Fits of videos that this package made, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("own", {}):
+            found = [[n, *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()]
+            one = next(row for row in rows.values() if "points" in row)
+            width, height = one["size"]
+            told = f"{one['points']:,} points, videos of {width} x {height}, {one['until_s']:.3g} s fitted."
+            table_ = grid([*HEAD, "within 1 % and 1 degree"], found)
+            lines += ["", source(result), "", told, "", *table_]
+    return lines[1:] or ["Not measured yet."]
+
+
+@table("fit.md", "fit.blender", "fit_*", together=True)
+def blender(results: list[Row]) -> list[str]:
+    """Fits of videos of Blender's cloth, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("blender", {}):
+            goals = {name: ONE if "one camera" in name else TWO for name in rows}
+            found = [[n, *_cells(row), _reached(row, goals[n])] for n, row in rows.items()]
+            lines += ["", source(result), "", *grid([*HEAD, "goal reached"], found)]
+    return lines[1:] or ["Not measured yet."]
+
+
+def _cells(row: Row) -> list[str]:
+    if "refused" in row:
+        return ["refused", "", "", "", ""]
+    stiffness = row.get("material.E_error")
+    return [
+        f"{100 * row['speed_error']:+.2f} %",
+        f"{row['direction_error_deg']:.2f}°",
+        "" if stiffness is None else f"{100 * stiffness:+.2f} %",
+        "" if row["psnr_predicted_db"] is None else f"{row['psnr_predicted_db']:.1f} dB",
+        f"{row['seconds']:.0f} s",
+    ]
+
+
+def _reached(row: Row, goal: tuple[float, float, float]) -> str:
+    if "refused" in row:
+        return "no"
+    speed, angle, stiffness = goal
+    return yes_no(
+        abs(row["speed_error"]) <= speed
+        and row["direction_error_deg"] <= angle
+        and abs(row.get("material.E_error", 0.0)) <= stiffness
+    )
