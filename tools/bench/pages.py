@@ -14,6 +14,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     area,
     contact,
     flags,
+    folds,
     goals,
     gradients,
     live,
