@@ -61,7 +61,7 @@ ROWS = {
 }
 """All rows, by name."""
 
-CROSSED = (25, 50, 100, 150, 200, 249)
+CROSSED = (50, 249)
 """Frames in which crossings are counted."""
 
 LATTICE = 3
@@ -115,7 +115,7 @@ def run_row(fold: Fold, dataset: Path, options: argparse.Namespace, output: Path
                 source = dataset / name / f"pattern{PATTERN}" / "cloth.npz"
                 (bare / "cloth.npz").symlink_to(source.resolve())
             shown = min(frames, reference_frames(bare / "cloth.npz"))
-            found = compare_run(output, bare, frames=shown, points=options.points)
+            found = compare_run(output, bare, frames=shown, points=options.points, device=options.device)
             row["to"][name] = {key: found[key] for key in ("chamfer_share", "sampling_m")} | {"frames": shown}
     row["crossings"] = folder_crossings(output, tuple(f for f in CROSSED if f < frames))
     return row
