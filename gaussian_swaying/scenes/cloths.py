@@ -22,7 +22,7 @@ GROUND = (0.52, 0.54, 0.55)
 
 
 class ClothScene(ProceduralScene):
-    """A cloth above a ball or a table or under a ball, or two flags one behind the other, in metres, on a floor at z = 0.
+    """A cloth above a ball or a table or under a ball, or two flags in metres. The floor is z = 0.
 
     The cloths come first, so a configuration can select them by their height or place.
 

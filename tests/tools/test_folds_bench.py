@@ -26,19 +26,15 @@ def test_rows_differ_in_contact_and_grid_only(name):
 
 def _reference(folder, frames, lift):
     """A motion of a coarse flag that rises."""
-    from flag_motion import UNITS  # noqa: F401  the folder of the tools is on the path
-
     pattern = flags.REFERENCES[folds.PATTERN]
     flat = pattern.rest(np.stack(np.meshgrid([0, 0.5, 1], [0, 1], indexing="ij"), -1).reshape(-1, 2))[0]
-    moved = np.stack([flat + [0, 0, lift * k] for k in range(frames)]).astype(np.float32)
+    moved = np.stack([flat + np.array([0, 0, lift * k]) for k in range(frames)]).astype(np.float32)
     uv = np.stack(np.meshgrid([0, 0.5, 1], [0, 1], indexing="ij"), -1).reshape(-1, 2)
     faces = np.array([[0, 2, 3, 1], [2, 4, 5, 3]])
     settings = {"cells": 3, "quality": 8, "width": 1.2, "height": 0.8}
     path = folder / f"pattern{folds.PATTERN}"
     path.mkdir(parents=True)
-    np.savez(
-        path / "cloth.npz", positions=moved, faces=faces, uv=uv, columns=2, rows=1, settings=json.dumps(settings)
-    )
+    np.savez(path / "cloth.npz", positions=moved, faces=faces, uv=uv, columns=2, rows=1, settings=json.dumps(settings))
     return path
 
 
@@ -54,8 +50,8 @@ def test_references_are_described_and_compared_over_the_frames_that_both_have(tm
     assert found["references"]["blender"]["uncertainty"]["coarser"]["chamfer"] == 0.01
     # frames 0 and 5: 0.6 m up, of which the surfaces, which overlap, see a part
     assert 0.01 < found["apart"]["blender newton"] < 0.25
+    options = type("Options", (), {"rows": "free_04", "dataset": str(tmp_path / "nothing")})()
     with pytest.raises(SystemExit, match="has none of blender"):
-        options = type("Options", (), {"rows": "free_04", "dataset": str(tmp_path / "nothing")})()
         folds.measure(options, {}, lambda now: None)
     options.rows = "glue"
     with pytest.raises(SystemExit, match=r"--rows takes free_04, .* not glue"):

@@ -1,4 +1,4 @@
-"""A second, independent cloth solver: vertex block descent of Newton (Chen et al. 2024), on the meshes of Blender's cloth.
+"""A second cloth solver: vertex block descent (Chen et al. 2024) of Newton, on the meshes of Blender's cloth.
 
 This is the only file that runs it. ``newton`` and ``warp-lang`` (the extra ``peers``) are imported when a cloth is
 solved, and run on a CPU. Masses, springs and pins are those that Blender gets, so the membrane is the same lattice;

@@ -29,7 +29,7 @@ def _ball():
 
 
 def _drop(friction=0.3, **settings):
-    """The solver, its first state, and the triangles of sheet and ball, and of the ball, among the places that touch."""
+    """The solver, its first state, and the triangles of both and of the ball, among the places that touch."""
     x = torch.arange(SIDE, dtype=torch.float64) * SPACING
     sheet = torch.cat([torch.cartesian_prod(x, x), torch.zeros(SIDE * SIDE, 1, dtype=torch.float64)], dim=-1)
     inner, out = _ball()
@@ -56,9 +56,7 @@ def _drop(friction=0.3, **settings):
     )
     side = (SIDE - 1) * SPACING
     rim = Not(Box([0.01, 0.01, None], [side - 0.01, side - 0.01, None]))
-    solver = MPMSolver(
-        dx=2.2 * SPACING, boundaries=[PinnedRegion(rim, kind="hinge")], transfer="torch", **settings
-    )
+    solver = MPMSolver(dx=2.2 * SPACING, boundaries=[PinnedRegion(rim, kind="hinge")], transfer="torch", **settings)
     state = solver.init_state(points, surface=surface)
     number = len(sheet) + torch.arange(RINGS * AROUND).reshape(RINGS, AROUND)
     closed = torch.cat([number, number[:, :1]], dim=1)
@@ -68,7 +66,7 @@ def _drop(friction=0.3, **settings):
 
 
 def _passed(place, triangles):
-    """Crossings of the sheet with the ball and with itself; the rings at the poles of the ball are too fine to count."""
+    """Crossings of the sheet with the ball and with itself; the rings at the poles of the ball are too fine."""
     whole, ball = triangles
     return crossings(place, whole) - crossings(place, ball)
 

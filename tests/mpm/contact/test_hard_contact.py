@@ -49,7 +49,7 @@ def test_sheets_in_the_same_place_come_apart(layers, march):
 
 
 def test_everything_in_contact_at_half_the_thickness(layers, march):
-    """Every place of five sheets overlaps its neighbours: the pile opens in order, at the speeds that remove overlap."""
+    """Every place of five sheets overlaps its neighbours: the pile opens in order, at bounded speeds."""
     solver, state = layers(5, 0.5 * THICKNESS, stiffness_damping=1e-3)
     later = march(solver, state, 0.1, frame=0.02)[-1]
     height = later.position[:, 2].reshape(5, -1)
@@ -59,7 +59,7 @@ def test_everything_in_contact_at_half_the_thickness(layers, march):
 
 
 def test_a_thickness_above_the_spacing_is_kept(sheet, scene, march):
-    """Three times the distance of the points: two sheets stop that far from each other, and do not disturb themselves."""
+    """Three times the distance of the points: two sheets stop that far from each other, and leave themselves alone."""
     below, above = sheet(14, 14), sheet(8, 8, (0.053, 0.047, 0.2))
     points = MaterialPoints.join([below, above])
     velocity = torch.zeros_like(points.position)
