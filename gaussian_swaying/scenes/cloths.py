@@ -22,26 +22,28 @@ GROUND = (0.52, 0.54, 0.55)
 
 
 class ClothScene(ProceduralScene):
-    """A cloth above a ball or a table, or two flags one behind the other, in metres, on a floor at z = 0.
+    """A cloth above a ball or a table or under a ball, or two flags in metres. The floor is z = 0.
 
     The cloths come first, so a configuration can select them by their height or place.
 
     Args:
         setting: ``ball`` (radius 0.3 m, centre 0.35 m high, the cloth 0.68 m high), ``table`` (1 x 0.7 m, 0.5 m high,
-            the cloth at 0.58 m) or ``flags`` (poles at x = 0, y = 0 and at x = 0.45 m, y = 0.16 m).
+            the cloth at 0.58 m), ``drop`` (the cloth in a frame, 0.5 m high, and a ball of radius 0.15 m, centre 0.95 m
+            high, to fall onto it) or ``flags`` (poles at x = 0, y = 0 and at x = 0.45 m, y = 0.16 m).
         side: Sides of the cloth [m]: of a flag, its length along x; it is two thirds as high.
         spacing: Distance between Gaussians [m].
     """
 
     def __init__(self, setting: str = "ball", side: float = 1.2, spacing: float = 0.0125) -> None:
-        check_choice("generator.setting", setting, ("ball", "table", "flags"))
+        check_choice("generator.setting", setting, ("ball", "table", "drop", "flags"))
         check_positive("generator.side", side)
         check_positive("generator.spacing", spacing)
         self.setting, self.side, self.spacing = setting, float(side), float(spacing)
 
     def generate(self) -> GaussianCloud:
         """Make the splat."""
-        cloths, rest = {"ball": self._ball, "table": self._table, "flags": self._flags}[self.setting]()
+        made = {"ball": self._ball, "table": self._table, "drop": self._drop, "flags": self._flags}
+        cloths, rest = made[self.setting]()
         shadows = [cast([0.0, 0.0, 0.3], 0.35, 0.3)] if self.setting != "flags" else []
         ground = floor(0.04, GROUND, shadows, flat=1.5)
         return to_cloud(join([*cloths, *rest, ground]))
@@ -64,6 +66,18 @@ class ClothScene(ProceduralScene):
         top = box([-0.5, -0.35, 0.44], [0.5, 0.35, 0.5], 0.02, WOOD)
         legs = [box([x, y, 0.0], [x + 0.06, y + 0.06, 0.44], 0.02, WOOD) for x in (-0.5, 0.44) for y in (-0.35, 0.29)]
         return [self._cloth(0.58, BLUE)], [top, *legs]
+
+    def _drop(self) -> tuple[list[Patches], list[Patches]]:
+        ball = ellipsoid([0, 0, 0.95], [0.15] * 3, self.spacing, BLUE)
+        ball = ball.painted(WHITE, (ball.center[:, 2] - 0.95).abs() < 0.04)
+        a = 0.5 * self.side
+        corners = [[-a, -a], [a, -a], [a, a], [-a, a]]
+        bars = [
+            tube([[*one, 0.5], [*other, 0.5]], [0.014, 0.014], 0.012, WOOD)
+            for one, other in zip(corners, [*corners[1:], corners[0]], strict=True)
+        ]
+        posts = [tube([[*corner, 0.0], [*corner, 0.5]], [0.016, 0.016], 0.012, WOOD) for corner in corners]
+        return [self._cloth(0.5, RED), ball], [*bars, *posts]
 
     def _flags(self) -> tuple[list[Patches], list[Patches]]:
         high = 2 / 3 * self.side

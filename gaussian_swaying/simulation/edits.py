@@ -25,7 +25,8 @@ class Edit:
     """A change to a part of the object.
 
     Deformations and velocities stay as they are; stresses follow the new material from then on. Where the law changes,
-    its internal variable is reset.
+    its internal variable is reset. The thickness cannot be edited: the points of the material, their layers and the
+    surface that touches are made from it.
 
     Args:
         region: Region at rest, in scene units; it may also contain Gaussians that do not move. Everything that moves if

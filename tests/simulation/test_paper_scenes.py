@@ -35,7 +35,7 @@ def files(name):
     return ["--config", str(CONFIGS / f"{name}.yaml"), "--config", str(CONFIGS / f"preview/{name}.yaml")]
 
 
-TOUCHING = {"cloth_over_ball", "cloth_over_table", "two_flags"}
+TOUCHING = {"ball_on_cloth", "cloth_over_ball", "cloth_over_table", "two_flags"}
 """Scenes that are not the paper's: those of docs/contact.md."""
 
 

@@ -18,7 +18,7 @@ from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
 
 TOOLS = Path(__file__).parents[2] / "tools" / "datasets"
 NAMES = ("blender_cloth", "blender_checks", "blender_images", "make_flag_dataset")
-NAMES += ("flag_reference", "flag_pictures", "flag_motion", "flag_difference")
+NAMES += ("flag_reference", "flag_pictures", "flag_motion", "flag_difference", "newton_cloth")
 
 
 @pytest.fixture(scope="module")
@@ -380,6 +380,57 @@ def test_bending_is_that_of_a_plate_unless_given(reference, flag_difference):
     assert not pattern.run().self_collision
     assert pattern.cloth_settings()["bending"] == 1.0
     assert slack.cloth_settings()["bending"] == 0.02
+
+
+def test_self_contact_keeps_the_distance_that_is_asked_for(reference, cloth):
+    """Blender's own setting is less by what it adds; a mesh so coarse that flat cloth touches itself is refused."""
+    pattern = replace(reference.PATTERNS[1], cells=80, self_collision=True, self_distance=0.005)
+    found = cloth.blender_settings(pattern.grid(), pattern.material(), pattern.run())
+    assert found["self_distance_min"] == pytest.approx(0.005 / cloth.SELF_DISTANCE)
+    assert found["self_friction"] == 0.0
+    half = replace(pattern, self_distance=None)
+    assert half.cloth_settings()["blender.self_distance_min"] == pytest.approx(0.5 * half.grid().cell * 9 / 16)
+    apart = replace(pattern, self_collision=False, self_distance=None)
+    assert not any("self" in name for name in cloth.blender_settings(apart.grid(), apart.material(), apart.run()))
+    with pytest.raises(ValueError, match=r"`self_distance` of at most 0\.00[0-9]+ m on cells of 0\.0[0-9]+ m"):
+        replace(pattern, self_distance=0.01).cloth_settings()
+    with pytest.raises(ValueError, match="`self_distance` to be positive"):
+        replace(pattern, self_distance=0.0)
+
+
+def test_another_solver_is_named_in_the_settings(tool, reference, flag_motion, monkeypatch, tmp_path):
+    pattern = replace(reference.PATTERNS[1], cells=12, quality=8, frames=2)
+    fake = lambda grid, vertices, pins, material, run, report: np.stack([vertices, vertices]).astype(np.float32)  # noqa: E731
+    monkeypatch.setattr(sys.modules["newton_cloth"], "solve_cloth", fake)
+    path = tmp_path / "cloth.npz"
+    assert flag_motion.solve_pattern(pattern, path, None, "newton")
+    assert flag_motion.read_cloth(path).settings["solver"] == "newton"
+    assert not flag_motion.solve_pattern(pattern, path, None, "newton")
+    with pytest.raises(ValueError, match="`solver` was 'newton' and is now None"):
+        flag_motion.solve_pattern(pattern, path)
+
+
+def test_newton_has_no_wind(tool, reference):
+    pattern = replace(reference.PATTERNS[2], cells=30)
+    grid = pattern.grid()
+    with pytest.raises(ValueError, match="no wind that could be matched"):
+        sys.modules["newton_cloth"].solve_cloth(grid, grid.flat(), [], pattern.material(), pattern.run())
+
+
+@pytest.mark.slow
+def test_newtons_cloth_falls_as_it_should(tool, cloth):
+    """A free panel falls with the damping that is asked for; without gravity it stays, also with self-contact."""
+    pytest.importorskip("newton")
+    newton = sys.modules["newton_cloth"]
+    grid = cloth.Grid.of_cells(0.2, 0.2, 8)
+    material = cloth.ClothMaterial(0.3, 30.0, 2.75e-4, air_rate=2.0)
+    run = cloth.ClothRun(frames=6, quality=8)
+    height = newton.solve_cloth(grid, grid.flat(), [], material, run)[..., 2].astype(np.float64).mean(1)
+    times = np.arange(6) / 25
+    fallen = 9.8 / 2 * (times - (1 - np.exp(-2 * times)) / 2)
+    np.testing.assert_allclose(height[0] - height[1:], fallen[1:], rtol=0.04)
+    still = newton.solve_cloth(grid, grid.flat(), [], material, replace(run, gravity=0.0, self_collision=True))
+    np.testing.assert_allclose(still[-1], still[0], atol=1e-6)
 
 
 # ---- cameras

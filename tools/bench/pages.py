@@ -16,6 +16,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     contact,
     fit,
     flags,
+    folds,
     goals,
     gradients,
     live,

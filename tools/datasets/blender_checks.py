@@ -84,6 +84,19 @@ def sheared_panel(cell: float, quality: int) -> dict[str, Any]:
     return _row(f"G h, sheared panel, {cell} m cells", float((along * lengths).sum() / sag), modulus, "N/m", "its sag")
 
 
+def apart_panel(cell: float, quality: int) -> dict[str, Any]:
+    """Width of a hanging panel with self-contact: it must not push itself apart in its own plane."""
+    grid = Grid.of_cells(0.4, 0.4, round(0.4 / cell), "top")
+    pins = np.flatnonzero(grid.uv()[:, 1] > 1 - 1e-9)
+    run = ClothRun(frames=25, quality=quality, gravity=2.0)
+    last = [
+        solve_cloth(grid, grid.flat(), pins, replace(SHEET, air_rate=20.0), replace(run, self_collision=apart))[-1]
+        for apart in (True, False)
+    ]
+    wide, expected = (float(np.ptp(place[:, 0])) for place in last)
+    return _row(f"width with self-contact, {cell} m cells", wide, expected, "m", "the same panel without")
+
+
 def wind(cell: float, quality: int, speed: float = 2.0, incidence: float = 90.0) -> list[dict[str, Any]]:
     """Pressure on a free panel without gravity, and the speed that it reaches (unless the panel would turn)."""
     grid = Grid.of_cells(20 * cell, 20 * cell, 20)
@@ -147,7 +160,7 @@ def check_relations(
     for cell, quality in filter(None, (coarse, fine)):
         rows += [free_fall(cell, quality), damped_fall(cell, quality)]
         rows += hanging_panel(cell, quality)
-        rows.append(sheared_panel(cell, quality))
+        rows += [sheared_panel(cell, quality), apart_panel(cell, quality)]
         rows += wind(cell, quality)
         rows.append(cantilever(cell, quality))
     rows += wind(coarse[0], 4 * coarse[1], incidence=35.0)  # read from the first frame: it needs short steps

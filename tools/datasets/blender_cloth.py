@@ -34,6 +34,16 @@ blows up."""
 SPRING_TIME = 2.2e-3
 """Damping of a membrane spring divided by its stiffness [s]: that of Blender's defaults on flags of 2 cm cells."""
 
+SELF_DISTANCE = 16 / 9
+"""Distance that Blender's cloth keeps from itself, divided by ``self_distance_min``; also measured."""
+
+SELF_REACH = 0.7
+"""Blender looks for contact up to twice ``self_distance_min``, also between triangles of a flat sheet that share no
+vertex. The closest of them are 0.71 cells apart: beyond that the sheet pushes itself apart in its own plane."""
+
+COLLISION_QUALITY = 4
+"""Rounds of Blender's contact in a step."""
+
 BENDING_DAMPING = 0.5 / 0.3
 """``bending_damping`` divided by vertex mass: Blender's defaults, for the mass that they assume. It is explicit too.
 Divided by vertex mass and quality, 0.4 crumpled a flag of 1 cm cells at the scale of its mesh; 0.1 and less did not."""
@@ -186,7 +196,8 @@ class ClothRun:
         gravity: Along -z [m/s²].
         flow: Velocity of the air [m/s].
         pressure: Pressure of the air on a face at rest across the flow [Pa].
-        self_collision: Whether self-contact is on, at a distance of half a cell.
+        self_collision: Whether self-contact is on, without friction.
+        self_distance: Distance that the cloth then keeps from itself [m]; None for half a cell.
     """
 
     frames: int
@@ -196,6 +207,7 @@ class ClothRun:
     flow: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pressure: float = 0.0
     self_collision: bool = False
+    self_distance: float | None = None
 
 
 def bending_number(grid: Grid, material: ClothMaterial, run: ClothRun) -> float:
@@ -213,7 +225,11 @@ def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict
         run: Gravity, wind and solver settings.
 
     Returns:
-        ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind.
+        ``mass`` to ``air_damping`` of the cloth, ``gravity`` of the scene, ``strength`` and ``flow`` of the wind; with
+        self-contact, ``self_distance_min`` to ``collision_quality`` of the collisions.
+
+    Raises:
+        ValueError: If the mesh is too coarse for the distance of self-contact.
     """
     rate2 = run.fps**2
     mass = material.areal_density * grid.cell**2
@@ -223,7 +239,7 @@ def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict
     damping = material.spring_time * spring / run.fps
     speed = math.hypot(*run.flow)
     field = run.pressure / (0.02 * run.fps)
-    return {
+    return _contact_settings(grid, run) | {
         "mass": mass,
         "tension_stiffness": tension,
         "compression_stiffness": tension,
@@ -236,6 +252,20 @@ def blender_settings(grid: Grid, material: ClothMaterial, run: ClothRun) -> dict
         "strength": field,
         "flow": field / speed if speed else 0.0,
     }
+
+
+def _contact_settings(grid: Grid, run: ClothRun) -> dict[str, float]:
+    if not run.self_collision:
+        return {}
+    distance = 0.5 * grid.cell if run.self_distance is None else run.self_distance
+    setting = distance / SELF_DISTANCE
+    if 2 * setting > SELF_REACH * min(grid.cells):
+        raise ValueError(
+            f"Expected `self_distance` of at most {0.5 * SELF_DISTANCE * SELF_REACH * min(grid.cells):.4f} m on cells "
+            f"of {min(grid.cells):.4f} m, but got {distance:g} m: beyond that a flat cloth pushes itself apart; lower "
+            "it, or take fewer `cells`."
+        )
+    return {"self_distance_min": setting, "self_friction": 0.0, "collision_quality": COLLISION_QUALITY}
 
 
 def solve_cloth(
@@ -291,14 +321,16 @@ def solve_cloth(
     cloth = modifier.settings
     cloth.quality, cloth.time_scale = run.quality, 1.0
     cloth.bending_model = "ANGULAR"
-    for name in settings.keys() - {"gravity", "strength", "flow"}:
+    contact = _contact_settings(grid, run)
+    for name in settings.keys() - {"gravity", "strength", "flow", *contact}:
         setattr(cloth, name, settings[name])
     for name in ("tension", "compression", "bending"):  # so that no vertex group scales a stiffness
         setattr(cloth, f"{name}_stiffness_max", settings[f"{name}_stiffness"])
     cloth.use_pressure = cloth.use_internal_springs = cloth.use_dynamic_mesh = False
     modifier.collision_settings.use_collision = False
     modifier.collision_settings.use_self_collision = run.self_collision
-    modifier.collision_settings.self_distance_min = 0.5 * grid.cell
+    for name, value in contact.items():
+        setattr(modifier.collision_settings, name, value)
     pins = np.asarray(pins, dtype=np.int64)
     if len(pins):
         group = sheet.vertex_groups.new(name="pins")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import newton_cloth
 import numpy as np
 from blender_cloth import solve_cloth
 from flag_reference import FlagPattern
@@ -93,22 +94,33 @@ def _between(nodes: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndar
     return low, ((places - nodes[low]) / np.diff(nodes)[low]).astype(np.float32)[:, None]
 
 
-def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None) -> bool:
+SOLVERS = ("blender", "newton")
+
+
+def motion_settings(pattern: FlagPattern, solver: str = "blender") -> dict[str, Any]:
+    """Everything that a motion depends on."""
+    return pattern.cloth_settings() | ({} if solver == "blender" else newton_cloth.settings())
+
+
+def solve_pattern(
+    pattern: FlagPattern, path: Path, report: Callable[[int], None] | None = None, solver: str = "blender"
+) -> bool:
     """Solve a flag and write its motion, unless the file exists.
 
     Args:
         pattern: The flag.
         path: The ``.npz`` to write, see :func:`read_cloth`.
         report: Called after each frame.
+        solver: One of ``SOLVERS``.
 
     Returns:
         Whether it was solved.
 
     Raises:
-        ImportError: If ``bpy`` is not there.
+        ImportError: If the solver is not there.
         ValueError: If the file exists but has other settings, or if ``quality`` is too low for the mesh.
     """
-    settings = pattern.cloth_settings()
+    settings = motion_settings(pattern, solver)
     if path.exists():
         check_settings(path, read_cloth(path).settings, settings)
         return False
@@ -116,7 +128,8 @@ def solve_pattern(pattern: FlagPattern, path: Path, report: Callable[[int], None
     uv = grid.uv()
     rest, normals = pattern.rest(uv)
     pins = pattern.pins(uv)
-    positions = solve_cloth(grid, rest, pins, material, run, report)
+    solve = solve_cloth if solver == "blender" else newton_cloth.solve_cloth
+    positions = solve(grid, rest, pins, material, run, report)
     arrays: dict[str, Any] = {
         "positions": positions,
         "faces": grid.faces().astype(np.int32),

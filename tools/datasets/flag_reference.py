@@ -53,6 +53,7 @@ class FlagPattern:
         frames: Number of frames, the first being the rest shape; paper.
         fps: Frames per second; paper.
         self_collision: Whether self-contact is on.
+        self_distance: Distance that the cloth then keeps from itself [m]; null: half a cell.
         bending: Bending stiffness as a share of that of a plate of this thickness.
     """
 
@@ -78,6 +79,7 @@ class FlagPattern:
     frames: int = 250
     fps: int = 25
     self_collision: bool = False
+    self_distance: float | None = None
     bending: float = 1.0
 
     def __post_init__(self) -> None:
@@ -95,6 +97,8 @@ class FlagPattern:
         for name, least in (("cells", 2), ("quality", 1), ("frames", 2), ("fps", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"Expected `{name}` to be at least {least}, but got {getattr(self, name)}.")
+        if self.self_distance is not None and not 0 < self.self_distance < math.inf:
+            raise ValueError(f"Expected `self_distance` to be positive and finite, but got {self.self_distance}.")
         if self.quality & (self.quality - 1):
             raise ValueError(
                 "Expected `quality` to be a power of two, since Blender adds up its steps in float32, but got "
@@ -186,7 +190,14 @@ class FlagPattern:
         """Gravity, wind and solver settings."""
         x, y, z = (float(u) for u in self.flow)
         return ClothRun(
-            self.frames, self.fps, self.quality, self.gravity, (x, y, z), self.pressure(), self.self_collision
+            self.frames,
+            self.fps,
+            self.quality,
+            self.gravity,
+            (x, y, z),
+            self.pressure(),
+            self.self_collision,
+            self.self_distance,
         )
 
     def cloth_settings(self) -> dict[str, Any]:

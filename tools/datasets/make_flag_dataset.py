@@ -32,9 +32,10 @@ from blender_checks import check_relations
 from blender_cloth import require_bpy
 from blender_images import TRANSFERS, Studio
 from flag_difference import VARIANTS, difference, variants
-from flag_motion import check_settings, read_cloth, settings_hash, solve_pattern
+from flag_motion import SOLVERS, check_settings, motion_settings, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
 from flag_reference import PAPER, PATTERNS, FlagPattern, least_quality
+from newton_cloth import require_newton
 
 from gaussian_swaying._files import atomic, write_json
 
@@ -191,7 +192,13 @@ def write_film(path: Path, frames: list[Path], fps: int) -> bool:
 
 
 def make_uncertainty(
-    pattern: FlagPattern, folder: Path, names: list[str], report: Report, every: int = 5, along: int = 80
+    pattern: FlagPattern,
+    folder: Path,
+    names: list[str],
+    report: Report,
+    every: int = 5,
+    along: int = 80,
+    solver: str = "blender",
 ) -> dict[str, Any]:
     """Solve variants of a flag and compare them with it.
 
@@ -202,21 +209,23 @@ def make_uncertainty(
         report: Called with a line of progress.
         every: Compare only every ``every``-th frame.
         along: Points compared along the longer side.
+        solver: One of :data:`flag_motion.SOLVERS`.
 
     Returns:
         What is written to ``uncertainty.json``: for each variant the fields of :func:`flag_difference.difference`.
     """
     own = folder / "cloth.npz"
-    solve_pattern(pattern, own, _every_25th(report, "cloth", pattern.frames))
+    solve_pattern(pattern, own, _every_25th(report, "cloth", pattern.frames), solver)
+    settings = motion_settings(pattern, solver)
     result: dict[str, Any] = {
-        "settings": pattern.cloth_settings(),
-        "hash": settings_hash(pattern.cloth_settings()),
+        "settings": settings,
+        "hash": settings_hash(settings),
         "unit": "shares of the longer side; mean over frames; Chamfer distance is half the sum of both mean distances",
         "variants": {},
     }
     for name, variant in variants(pattern, names).items():
         path = folder / "uncertainty" / f"{name.replace(' ', '_')}.npz"
-        solve_pattern(variant, path, _every_25th(report, name, pattern.frames))
+        solve_pattern(variant, path, _every_25th(report, name, pattern.frames), solver)
         numbers = difference(pattern, read_cloth(own), read_cloth(path), every, along)
         result["variants"][name] = {"cells": variant.cells, "quality": variant.quality, **numbers}
     write_json(folder / "uncertainty.json", result)
@@ -272,6 +281,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     add("--drag", type=float, help="C of the wind's pressure 1/2 rho C U^2 (0.8 in pattern 2, else 1.28)")
     add("--damping", type=float, help="rate at which every velocity decays [1/s] (2 in pattern 1, else 1)")
     add("--self-collision", action="store_true", default=None, help="turn self-contact on")
+    add("--self-distance", type=float, help="distance that the cloth then keeps from itself [m] (half a cell)")
+    add("--solver", choices=SOLVERS, default="blender", help="newton: another cloth solver, without wind or pictures")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="size of the video [pixels] (1920x1080)")
     add("--samples", type=int, help="light paths per pixel (16)")
     add("--views", type=int, help="number of photos of the rest shape (200)")
@@ -292,7 +303,7 @@ def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
     Raises:
         ValueError: If an option is out of range.
     """
-    names = ("frames", "texture", "drag", "damping", "self_collision", "cells")
+    names = ("frames", "texture", "drag", "damping", "self_collision", "self_distance", "cells")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.flag_size:
         given["width"], given["height"] = options.flag_size
@@ -327,13 +338,13 @@ def make(number: int, options: argparse.Namespace) -> None:
         print(f"pattern {number}: {line}", flush=True)
 
     if options.uncertainty:
-        found = make_uncertainty(pattern, folder, options.variants, report)
+        found = make_uncertainty(pattern, folder, options.variants, report, solver=options.solver)
         for name, row in found["variants"].items():
             report(f"{name}: Chamfer distance {100 * row['chamfer']:.2f} % of the longer side")
         return
     started = time.time()
     if "cloth" in options.only:
-        solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames))
+        solve_pattern(pattern, folder / "cloth.npz", _every_25th(report, "cloth", pattern.frames), options.solver)
         make_truth(pattern, folder)
     if "train" in options.only:
         make_train(pattern, folder / "train", pictures, report)
@@ -346,7 +357,10 @@ def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     options = parse(argv)
     try:
-        require_bpy()
+        if options.solver == "newton":
+            require_newton()
+        else:
+            require_bpy()
         if options.check:
             path = options.json or options.out / "check.json"
             rows = check_relations()

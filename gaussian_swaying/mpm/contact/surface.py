@@ -12,9 +12,11 @@ from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.mpm.state import MaterialPoints
 
 
-@dataclass
+@dataclass(frozen=True)
 class Contact:
     """Contact of the material with itself: between the layers of a sheet, and between objects.
+
+    It cannot be changed, since the surface of a simulation keeps the thickness it was made with: make another simulation.
 
     Args:
         thickness: Distance that two surfaces keep [m]; null for the thickness of the material at each place. Obstacles

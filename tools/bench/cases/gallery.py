@@ -38,10 +38,20 @@ SCENES = {
     "flag_behind_pole": "Flag behind a pole",
     "plant_row": "Row of plants in a boundary layer",
     "ficus_behind_wall": "Ficus behind a wall",
+    "flag1_pole": "Flag, pattern 1, and its pole",
+    "cloth_over_ball": "Cloth over a ball",
+    "ball_on_cloth": "Ball dropped on a cloth",
+    "two_flags": "Two flags",
+    "leaves_contact": "Leaves that touch",
 }
 """Name of the file in configs/sim, without suffix, and title."""
 
-_BASES = {"solid_all_wind": "solid_surface_wind", "sand_to_foam": "sand"}
+_BASES = {
+    "solid_all_wind": "solid_surface_wind",
+    "sand_to_foam": "sand",
+    "flag1_pole": "flag1",
+    "leaves_contact": "leaves",
+}
 """Files in configs/sim/variants, and the scenes that they vary."""
 
 _SHOWN = (0.0, 0.08, 0.2, 0.45, 0.9)  # frames of a strip, as shares of the run

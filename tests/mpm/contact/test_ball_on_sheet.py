@@ -1,0 +1,110 @@
+"""An elastic ball dropped on a held sheet: it dents the sheet, bounces and comes to rest, and does not pass through."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.regions import Box, Not
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.contact.surface import Contact, Surface
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.validation.contacts import crossings, gaps, sheet_triangles
+
+RADIUS, SPACING, THICKNESS, SIDE = 0.1, 0.02, 0.01, 26
+RINGS, AROUND = 11, 18
+CENTRE = torch.tensor([0.25, 0.25, 0.24], dtype=torch.float64)
+
+
+def _ball():
+    """Points of a ball, and rings of places on its surface: (P, 3), (RINGS x AROUND, 3) unit vectors."""
+    axis = (torch.arange(20, dtype=torch.float64) - 9.5) * SPACING
+    place = torch.cartesian_prod(axis, axis, axis)
+    polar = (torch.arange(RINGS, dtype=torch.float64) + 0.5) * math.pi / RINGS
+    turn = torch.arange(AROUND, dtype=torch.float64) * 2 * math.pi / AROUND
+    a, b = torch.cartesian_prod(polar, turn).unbind(-1)
+    out = torch.stack([a.sin() * b.cos(), a.sin() * b.sin(), -a.cos()], dim=-1)
+    return place[place.norm(dim=-1) < RADIUS - 0.25 * SPACING], out
+
+
+def _drop(friction=0.3, **settings):
+    """The solver, its first state, and the triangles of both and of the ball, among the places that touch."""
+    x = torch.arange(SIDE, dtype=torch.float64) * SPACING
+    sheet = torch.cat([torch.cartesian_prod(x, x), torch.zeros(SIDE * SIDE, 1, dtype=torch.float64)], dim=-1)
+    inner, out = _ball()
+    ball = inner + CENTRE
+    points = MaterialPoints.join(
+        [
+            MaterialPoints.create(
+                sheet, volume=SPACING**2 * THICKNESS, density=100.0, youngs_modulus=4e4, poisson_ratio=0.3
+            ),
+            MaterialPoints.create(ball, volume=SPACING**3, density=200.0, youngs_modulus=1e5, poisson_ratio=0.3),
+        ]
+    )
+    skin = CENTRE + RADIUS * out
+    nearest = torch.cdist(skin, ball).argmin(1)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(sheet), 3)
+    radius = torch.cat([torch.full((len(sheet),), 0.75 * SPACING), torch.full((len(skin),), 1.3 * SPACING)]).double()
+    surface = Surface(
+        torch.cat([sheet, skin]),
+        torch.cat([up, out]),
+        radius,
+        torch.full_like(radius, THICKNESS),
+        torch.cat([sheet, ball[nearest]]),
+        Contact(friction=friction),
+    )
+    side = (SIDE - 1) * SPACING
+    rim = Not(Box([0.01, 0.01, None], [side - 0.01, side - 0.01, None]))
+    solver = MPMSolver(dx=2.2 * SPACING, boundaries=[PinnedRegion(rim, kind="hinge")], transfer="torch", **settings)
+    state = solver.init_state(points, surface=surface)
+    number = len(sheet) + torch.arange(RINGS * AROUND).reshape(RINGS, AROUND)
+    closed = torch.cat([number, number[:, :1]], dim=1)
+    rings = sheet_triangles(RINGS, AROUND + 1)
+    skin = closed.reshape(-1)[rings]
+    return solver, state, (torch.cat([sheet_triangles(SIDE, SIDE), skin]), skin)
+
+
+def _passed(place, triangles):
+    """Crossings of the sheet with the ball and with itself; the rings at the poles of the ball are too fine."""
+    whole, ball = triangles
+    return crossings(place, whole) - crossings(place, ball)
+
+
+def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march):
+    """It falls 13 cm. Nothing passes through; energy does not grow; the ball comes back up."""
+    solver, state, triangles = _drop(gravity=(0, 0, -9.8))
+    count = SIDE * SIDE
+    mass = solver.points.mass[count:]
+    before = sum(float(part) for part in solver.energies(state).values())
+    scale = 9.8 * float(mass.sum()) * 0.13
+    heights, sheets, found = [], [], []
+    for later in march(solver, state, 0.48, frame=0.04):
+        stage = solver.bound.contact
+        place = stage.positions(later.node_displacement)
+        assert _passed(place, triangles) == 0
+        found.append(gaps(stage, later))
+        energy = sum(float(part) for part in solver.energies(later).values())
+        assert energy < before + 0.02 * scale
+        heights.append(float((mass * later.position[count:, 2]).sum() / mass.sum()))
+        sheets.append(float(later.position[:count, 2].min()))
+    found = torch.cat(found)
+    assert len(found) > 1000
+    assert float((found < 0.5).double().mean()) <= 1e-3
+    lowest = min(range(len(heights)), key=heights.__getitem__)
+    assert sheets[lowest] < -RADIUS  # a deep dent
+    assert max(heights[lowest:]) > heights[lowest] + 0.15  # and back up
+
+
+@pytest.mark.slow
+def test_a_ball_dropped_on_a_sheet_comes_to_rest(march):
+    """With damping it ends at rest in its dent: the sheet carries its weight."""
+    solver, state, triangles = _drop(gravity=(0, 0, -9.8), damping=8.0, stiffness_damping=2e-3)
+    count = SIDE * SIDE
+    end = march(solver, state, 2.0, frame=0.1)[-1]
+    assert _passed(solver.bound.contact.positions(end.node_displacement), triangles) == 0
+    assert float(end.velocity.norm(dim=-1).max()) < 0.02
+    bottom = float(end.position[count:, 2].min())
+    under = float(end.position[:count, 2].min())
+    assert -0.15 < under < -0.02
+    assert 0.5 * THICKNESS < bottom - under < 2 * SPACING
