@@ -39,16 +39,16 @@ def _reference(folder, frames, lift):
 
 
 def test_references_are_described_and_compared_over_the_frames_that_both_have(tmp_path):
-    first = _reference(tmp_path / "blender", 11, 0.0)
-    _reference(tmp_path / "newton", 6, 0.12)
+    first = _reference(tmp_path / "blender", 31, 0.0)
+    _reference(tmp_path / "newton", 26, 0.024)
     known = {"coarser": {"cells": 2, "quality": 8, "chamfer": 0.01, "frames_compared": 3, "corresponding": 1}}
     (first / "uncertainty.json").write_text(json.dumps({"variants": known}))
     found = folds.describe(tmp_path)
     assert list(found["references"]) == ["blender", "newton"]
-    assert found["references"]["newton"]["frames"] == 6
+    assert found["references"]["newton"]["frames"] == 26
     assert found["references"]["blender"]["crossings"] == []
     assert found["references"]["blender"]["uncertainty"]["coarser"]["chamfer"] == 0.01
-    # frames 0 and 5: 0.6 m up, of which the surfaces, which overlap, see a part
+    # frames 0 and 25: 0.6 m up, of which the surfaces, which overlap, see a part
     assert 0.01 < found["apart"]["blender newton"] < 0.25
     options = type("Options", (), {"rows": "free_04", "dataset": str(tmp_path / "nothing")})()
     with pytest.raises(SystemExit, match="has none of blender"):

@@ -16,7 +16,7 @@ from gaussian_swaying.mpm.state import MaterialPoints
 class Contact:
     """Contact of the material with itself: between the layers of a sheet, and between objects.
 
-    It cannot be changed, since the surface of a simulation keeps the thickness it was made with: make another simulation.
+    It cannot be changed, as the surface keeps the thickness that it was made with: make another simulation.
 
     Args:
         thickness: Distance that two surfaces keep [m]; null for the thickness of the material at each place. Obstacles

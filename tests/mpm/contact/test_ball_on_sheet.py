@@ -1,8 +1,7 @@
-"""An elastic ball dropped on a held sheet: it dents the sheet, bounces and comes to rest, and does not pass through."""
+"""An elastic ball dropped on a held sheet: it dents the sheet and bounces, and does not pass through."""
 
 import math
 
-import pytest
 import torch
 
 from gaussian_swaying.geometry.regions import Box, Not
@@ -94,17 +93,3 @@ def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march):
     lowest = min(range(len(heights)), key=heights.__getitem__)
     assert sheets[lowest] < -RADIUS  # a deep dent
     assert max(heights[lowest:]) > heights[lowest] + 0.15  # and back up
-
-
-@pytest.mark.slow
-def test_a_ball_dropped_on_a_sheet_comes_to_rest(march):
-    """With damping it ends at rest in its dent: the sheet carries its weight."""
-    solver, state, triangles = _drop(gravity=(0, 0, -9.8), damping=8.0, stiffness_damping=2e-3)
-    count = SIDE * SIDE
-    end = march(solver, state, 2.0, frame=0.1)[-1]
-    assert _passed(solver.bound.contact.positions(end.node_displacement), triangles) == 0
-    assert float(end.velocity.norm(dim=-1).max()) < 0.02
-    bottom = float(end.position[count:, 2].min())
-    under = float(end.position[:count, 2].min())
-    assert -0.15 < under < -0.02
-    assert 0.5 * THICKNESS < bottom - under < 2 * SPACING

@@ -61,7 +61,7 @@ ROWS = {
 }
 """All rows, by name."""
 
-CROSSED = (50, 249)
+CROSSED = (249,)
 """Frames in which crossings are counted."""
 
 LATTICE = 3
@@ -150,7 +150,7 @@ def describe(dataset: Path) -> Row:
     for a, b in combinations(motions, 2):
         most = min(len(motions[a].positions), len(motions[b].positions))
         one, other = (replace(motions[name], positions=motions[name].positions[:most]) for name in (a, b))
-        apart[f"{a} {b}"] = difference(pattern, one, other, every=5)["chamfer"]
+        apart[f"{a} {b}"] = difference(pattern, one, other, every=25)["chamfer"]
     return {"distance_m": DISTANCE, "references": known, "apart": apart}
 
 

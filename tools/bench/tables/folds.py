@@ -18,6 +18,11 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2f} %"
 
 
+def _count(row: Row) -> str:
+    """Crossings in all counted frames; a dash if none were counted."""
+    return str(sum(row["crossings"])) if row["crossings"] else "-"
+
+
 def _doubt(known: Row) -> float | None:
     """The largest distance of a reference from itself, solved otherwise."""
     found = [row["chamfer"] for row in known.get("uncertainty", {}).values()]
@@ -42,10 +47,10 @@ def rows_table(result: Row) -> list[str]:
             lines.append([fold.title(), *("failed" for _ in names), "-"])
             continue
         near = [_share(row["to"].get(other, {}).get("chamfer_share")) for other in names]
-        lines.append([fold.title(), *near, str(sum(row["crossings"]))])
+        lines.append([fold.title(), *near, _count(row)])
     for name in names:
         near = ["" if other == name else _share(_apart(result, name, other)) for other in names]
-        lines.append([REFERENCES[name], *near, str(sum(known[name]["crossings"]))])
+        lines.append([REFERENCES[name], *near, _count(known[name])])
     lines.append(["the reference itself, solved otherwise", *(_share(_doubt(known[name])) for name in names), ""])
     return [source(result), "", *grid(["", *(REFERENCES[name] for name in names), "crossings"], lines)]
 
