@@ -29,6 +29,7 @@ from gaussian_swaying.fitting.evidence import (
 from gaussian_swaying.fitting.identifiability import check_apart, directions
 from gaussian_swaying.fitting.least_squares import (
     LEAST_GAIN,
+    START,
     Normal,
     Progress,
     central_sensitivities,
@@ -84,7 +85,7 @@ class Course:
     step: int = -1
     place: list[float] = field(default_factory=list)
     matched: list[float] = field(default_factory=list)
-    damping: float = 1e-2
+    damping: float = START
     iteration: int = 0
     stiffening: float = SAFETY
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -261,7 +262,7 @@ class Fit:
                 )
                 self.say(f"{stage} to {times[-1]:.3g} s, {progress.iteration}: {self._shown(course.place)}")
                 keep(course)
-            course.step, course.iteration, course.damping, course.matched = course.step + 1, 0, 1e-2, []
+            course.step, course.iteration, course.damping, course.matched = course.step + 1, 0, START, []
             keep(course)
         place = torch.tensor(course.place, dtype=torch.float64)
         normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)

@@ -18,8 +18,10 @@ STEP = 0.004
 """Step of the finite differences, as a share of the range."""
 HUBER = 1.345
 """Standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)."""
-BETTER, WORSE = 0.1, 10.0
-"""Factors of the damping after a step that lowered the cost, and after one that did not."""
+START = 1e-6
+"""Damping of the first step: nearly none, as damping holds up just what the video hardly tells."""
+BETTER, WORSE, LEAST_DAMPING = 0.03, 30.0, 1e-3
+"""Factors of the damping after a step that lowered the cost, and after one that did not, and its least value then."""
 MOST_DAMPING = 1e4
 """Damping at which the search for a better place ends."""
 LEAST_GAIN = 1e-4
@@ -79,7 +81,7 @@ class Progress:
     """
 
     place: Tensor
-    damping: float = 1e-2
+    damping: float = START
     iteration: int = 0
     normal: Normal | None = None
     scales: dict[str, float] = field(default_factory=dict)
@@ -177,12 +179,14 @@ def iterate(
     there, scales, blocks = linearised(residuals, rescale, trial)
     gain = normal.cost - float(huber([Block(b.kind, b.values[:1], b.cluster) for b in blocks], progress.scales)[0])
     if not gain > 0:
-        progress.damping = max(progress.damping, 0.1) * WORSE
+        progress.damping = max(progress.damping * WORSE, LEAST_DAMPING)
         if moved < 10 * tolerance or progress.damping > MOST_DAMPING:
             progress.done = "no step is better"
         return
     progress.place, progress.normal, progress.scales = trial, there, scales
-    progress.damping *= BETTER
+    damped, progress.damping = progress.damping > LEAST_DAMPING, progress.damping * BETTER
+    if damped:  # a short step says nothing
+        return
     if moved < tolerance:
         progress.done = f"the last step was below {tolerance:g} of every range"
     elif gain < least_gain * normal.cost:

@@ -37,14 +37,14 @@ class Shown:
         fitted: PSNR of the fitted frames [dB].
         predicted: PSNR of the predicted frames [dB]; NaN if there are none.
         picture: Rows of video, simulation and difference, dtype uint8, shape (H, W, 3).
-        times: Time of each row [s].
+        rows: What each row is, such as ``0.5 s, fitted``.
     """
 
     camera: str
     fitted: float
     predicted: float
     picture: Tensor
-    times: tuple[float, ...]
+    rows: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def predictions(
     """
     chosen = {k for part in (range(1, fitted), range(fitted, len(times))) for k in _spread(part)}
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
-    rows: list[list[tuple[float, Tensor]]] = [[] for _ in videos]
+    rows: list[list[tuple[str, Tensor]]] = [[] for _ in videos]
     for k, (time, state) in enumerate(zip(times, states, strict=True)):
         for number, video in enumerate(videos):
             frame = next((f for f, own in enumerate(video.times) if abs(own - time) < 2e-6), None)
@@ -149,11 +149,12 @@ def predictions(
             squares[number][k >= fitted].append(float((shown - real).square().mean()))
             if k in chosen:
                 difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
-                rows[number].append((time, torch.cat([real, shown, difference], 1)))
+                told = f"{time:.3g} s, {'predicted' if k >= fitted else 'fitted'}"
+                rows[number].append((told, torch.cat([real, shown, difference], 1)))
     found = []
     for video, own, row in zip(videos, squares, rows, strict=True):
         picture = (torch.cat([part for _, part in row]) * 255).round().to(torch.uint8)
-        found.append(Shown(video.name, _psnr(own[0]), _psnr(own[1]), picture, tuple(time for time, _ in row)))
+        found.append(Shown(video.name, _psnr(own[0]), _psnr(own[1]), picture, tuple(told for told, _ in row)))
     return found
 
 
@@ -166,7 +167,7 @@ def write_results(
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
     for one in result.shown:
-        iio.imwrite(pictures / f"{one.camera}.png", one.picture.numpy())
+        iio.imwrite(pictures / f"{one.camera}.png", _labelled(one))
     write_table(folder / "values.csv", result.rows())
     write_json(
         folder / "result.json",
@@ -204,6 +205,24 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
     found = parse_text(parser, text, [option(name, value) for name, value in options.items()])
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
+
+
+def _labelled(shown: Shown) -> Any:
+    """The picture with a line of text above, and what each row is, as a NumPy array."""
+    import numpy as np
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = shown.picture.shape[:2]
+    band, row = 22, height // max(len(shown.rows), 1)
+    picture = Image.new("RGB", (width, height + band), (255, 255, 255))
+    picture.paste(Image.fromarray(shown.picture.numpy()), (0, band))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    for column, name in enumerate(("video", "simulation", "difference (grey: none)")):
+        draw.text((column * width // 3 + 6, 3), name, fill=(0, 0, 0), font=font)
+    for number, told in enumerate(shown.rows):
+        where = (6, band + number * row + 3)
+        draw.text(where, told, fill=(255, 255, 255), font=font, stroke_width=1, stroke_fill=(0, 0, 0))
+    return np.asarray(picture)
 
 
 def _spread(places: range) -> list[int]:

@@ -71,13 +71,14 @@ def test_stopped_and_continued(own, tmp_path):
 
 def test_resume_needs_the_same_plan(own, tmp_path):
     sought = [read_unknown("wind.speed", SOUGHT["wind.speed"])]
-    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=0, iterations=1, tracks=40)
+    given = {"stages": ["tracks"], "search": 0, "iterations": 1}
+    plan = Plan([str(own / "base.yaml")], [str(own / "video")], sought, tracks=40, **given)
     with pytest.raises(ValueError, match="nothing to resume"):
         run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
     again = run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     assert again.place == first.place
-    other = Plan([str(own / "base.yaml")], [str(own / "video")], sought, search=0, iterations=1, tracks=50)
+    other = Plan([str(own / "base.yaml")], [str(own / "video")], sought, tracks=50, **given)
     with pytest.raises(ValueError, match="another `tracks`"):
         run_fit(other, tmp_path / "fit", resume=True, device="cpu", progress=False)
 
