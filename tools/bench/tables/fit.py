@@ -41,8 +41,8 @@ def blender(results: list[Row]) -> list[str]:
     for result in results:
         if rows := result.get("blender", {}):
             goals = {name: ONE if "one camera" in name else TWO for name in rows}
-            found = [[n, *_cells(row), _reached(row, goals[n])] for n, row in rows.items()]
-            lines += ["", source(result), "", *grid([*HEAD, "goal reached"], found)]
+            found = [[n, *_cells(row), _base(row), _reached(row, goals[n])] for n, row in rows.items()]
+            lines += ["", source(result), "", *grid([*HEAD, "fitted; changes of scene.yaml", "goal reached"], found)]
     return lines[1:] or ["Not measured yet."]
 
 
@@ -57,6 +57,12 @@ def _cells(row: Row) -> list[str]:
         "" if row["psnr_predicted_db"] is None else f"{row['psnr_predicted_db']:.1f} dB",
         f"{row['seconds']:.0f} s",
     ]
+
+
+def _base(row: Row) -> str:
+    """How much of the video was fitted, and what was changed in the configuration of the case."""
+    known = ", ".join(f"`{name}` {value}" for name, value in row.get("known", {}).items())
+    return (f"{row['until_s']:.3g} s" if "until_s" in row else "") + (f"; {known}" if known else "")
 
 
 def _reached(row: Row, goal: tuple[float, float, float]) -> str:
