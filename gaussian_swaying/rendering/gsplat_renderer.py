@@ -227,6 +227,7 @@ def _rasterize(
         means2d, radii, depths, _TILE, *tiles, packed=ids is not None, n_images=1, image_ids=image, gaussian_ids=index
     )
     offsets = isect_offset_encode(crossings, 1, *tiles).reshape(1, tiles[1], tiles[0])
+    packed = ids is not None
     pixels, alpha = rasterize_to_pixels(
         means2d,
         conics,
@@ -237,10 +238,12 @@ def _rasterize(
         _TILE,
         offsets,
         order,
-        backgrounds=background,
-        packed=ids is not None,
+        backgrounds=None if packed else background,
+        packed=packed,
         absgrad=absgrad,
     )
+    if packed and background is not None:  # gsplat 1.5.3 takes none with packed values
+        pixels = pixels + (1 - alpha) * background
     return pixels, alpha
 
 

@@ -428,11 +428,11 @@ def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_simu
         pytest.skip("gsplat cannot compile its kernels here")
     state, isect_tiles = simulation.start(), gsplat.isect_tiles
 
-    def let_wait(*arguments):
+    def let_wait(*arguments, **options):
         mode = torch.cuda.get_sync_debug_mode()
         torch.cuda.set_sync_debug_mode("default")
         try:
-            return isect_tiles(*arguments)
+            return isect_tiles(*arguments, **options)
         finally:
             torch.cuda.set_sync_debug_mode(mode)
 

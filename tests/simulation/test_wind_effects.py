@@ -113,8 +113,8 @@ def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):
 @pytest.mark.parametrize("uniform", [True, False])
 def test_the_host_waits_once_in_a_frame(make_simulation, uniform):
     simulation = make_simulation(wind=WindField([4.0, 1.0, 0.0]) if uniform else _wind()).to("cuda")
+    state = simulation.start()  # only now is the solver bound to its kernels
     assert simulation.foresees
-    state = simulation.start()
     for _ in range(3):
         state, _ = simulation.advance(state)
     torch.cuda.set_sync_debug_mode("warn")

@@ -91,7 +91,9 @@ def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
     for room, slots in ((64, 32), (2, 1)):
         monkeypatch.setattr(fused_contact, "ROOM", room)
         monkeypatch.setattr(fused_contact, "SLOTS", slots)
-        solver, state = scene(points, Contact(iterations=2), velocity=velocity, transfer="triton")
+        # torch makes the masses of the nodes, on a GPU in no fixed order unless told to
+        settings = {"transfer": "triton", "deterministic": True}
+        solver, state = scene(points, Contact(iterations=2), velocity=velocity, **settings)
         ends.append(solver.rollout(state, 4 * DT, 2))
         rooms.append((solver.fused().touching.room, solver.fused().touching.slots))
     assert rooms[0] == (64, 32)
