@@ -15,7 +15,7 @@ import triton.language as tl
 from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
 from gaussian_swaying.mpm.laws.triton.body import ROW, pk1_adjoint
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
-from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, vector_of
 from gaussian_swaying.mpm.triton.total_kernels import gather
 
 
@@ -116,7 +116,7 @@ def particles_adjoint(
         if ADJOINT is not None:
             first = load3(values, count, index, mask)
             value = (first[0], first[1], first[2], tl.load(values + 3 * count + index, mask, 0.0))
-            vector = vectors + (step * scenes + scene) * 8  # forces.TWIN_VECTOR
+            vector = vector_of(vectors, scenes, step, scene)
             more, by_v, by_vector, by_numbers = ADJOINT(F, v, value, vector, numbers, a, OPTIONS)
             by_F = axpy9(1.0, by_F, 1.0, more)
             if SHARES:

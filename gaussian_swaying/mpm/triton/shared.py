@@ -9,12 +9,15 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import largest, largest_eigenvalue, load3, matmul, transpose
+from gaussian_swaying.mpm.forces import TWIN_VECTOR
 
 SCHEDULE = 4
 """Columns of the schedule, a row per substep: how long forces act [s], the substep [s], the decay of velocities.
 
 Row 0 has a last column: how long forces act in the last substep.
 """
+
+VECTOR = tl.constexpr(TWIN_VECTOR)
 
 # Numbers that differ between bodies and between grids, and are not specialised. Otherwise Triton would compile a kernel
 # again whenever one of them becomes one or a multiple of 16, in the middle of a run, even while a graph is recorded.
@@ -42,6 +45,12 @@ def axis_weights(f, inverse_dx):
 
 
 @triton.jit
+def vector_of(vectors, scenes, step, scene):
+    """Where the vector of a ``forces.ForceTwin`` is for a substep and a scene."""
+    return vectors + (step * scenes + scene) * VECTOR
+
+
+@triton.jit
 def twin_force(
     TWIN: tl.constexpr, OPTIONS: tl.constexpr, SPACE: tl.constexpr, F, velocity, position, index, mask, scene, values,
     count, vectors, scenes, step, numbers, space,
@@ -49,7 +58,7 @@ def twin_force(
     """Force of a ``forces.ForceTwin`` on some particles [N] and their resistance [kg/s]; with SPACE, by their place."""
     first = load3(values, count, index, mask)
     last = tl.load(values + 3 * count + index, mask, 0.0)
-    vector = vectors + (step * scenes + scene) * 16  # forces.TWIN_VECTOR
+    vector = vector_of(vectors, scenes, step, scene)
     value = (first[0], first[1], first[2], last)
     if SPACE:
         force, resistance = TWIN(F, velocity, position, value, vector, numbers, space, OPTIONS)

@@ -73,6 +73,7 @@ class TotalAdjoint:
         self.mass_bar = zeros(nodes)
         self.found = zeros(3, fused.count)
         self.last = torch.zeros(1, dtype=torch.int32, device=self.device)
+        self.rooms = 0
         self.history = zeros(0, nodes, 8)
         self.shares = zeros(0, fused.pieces, 8)
         self._take_rows()
@@ -233,18 +234,19 @@ class TotalAdjoint:
             self._node_stages(offset, partial, width, options, flags)
             self._particles(offset, twin, options, flags, partial, width)
 
-        key = (*options.values(), self.history.data_ptr(), self.shares.data_ptr())
+        key = (*options.values(), *flags.values(), self.rooms)
         fused.repeat(count, ("again", *key), again)
         self._keep(0, flags)
         if flags["WEIGHTS"]:
             self._find_multipliers(count)
         self.last.fill_(count - 1)
         fused.first_step.zero_()
-        fused.repeat(count, ("back", *key, *flags.values()), back)
+        fused.repeat(count, ("back", *key), back)
 
     def _make_room(self, every: int, loaded: bool) -> None:
-        """Buffers for a segment; recorded graphs know their addresses."""
+        """Buffers for a segment; recorded graphs know their addresses, so new ones are counted."""
         if len(self.history) < every + 1:
+            self.rooms += 1
             self.history = torch.zeros(every + 1, self.nodes, 8, device=self.device)
             if self.fused.points is not None:
                 rows = len(self.residual)
@@ -252,6 +254,7 @@ class TotalAdjoint:
                     torch.zeros(every + 1, rows, 4, device=self.device) for _ in range(2)
                 )
         if loaded and len(self.shares) < every:
+            self.rooms += 1
             self.shares = torch.zeros(every, self.fused.pieces, 8, device=self.device)
 
     def sums(self, width: int) -> Tensor:
@@ -448,7 +451,7 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
     """Why gradients through a rollout need torch's autograd; None if the kernels have them."""
     bound = fused.bound
     points = bound.body.points
-    if not fused.plain:
+    if not fused.plain or fused.touching is not None:
         return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
     if any(derivative is None for derivative in fused.laws.adjoints):
         return "a law has no backward kernel (`LawTwin.adjoint`)"
