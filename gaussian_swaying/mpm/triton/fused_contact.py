@@ -31,16 +31,16 @@ LEAST_MARGIN = 0.1
 AHEAD = 8.0
 """For how many substeps of the fastest node lists are made, unless that is more than the reach of contact."""
 
-BLOCK, TALL = 256, 32
+BLOCK, TALL = 128, 32
 """Places, and nodes, of a program at a time."""
 
 WIDE, WIDE_SEARCH = 8, 4
 """How many candidates of each place are looked at together, in a substep and when lists are made; 8 would spill."""
 
-PER_PROCESSOR = 2
+PER_PROCESSOR = 4
 """Programs on each multiprocessor; all of them must run at once."""
 
-_LAUNCH: dict[str, Any] = {"num_warps": 8, "maxnreg": 128}
+_LAUNCH: dict[str, Any] = {"num_warps": 4, "maxnreg": 128}
 
 
 class FusedContact:
