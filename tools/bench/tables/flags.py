@@ -199,6 +199,12 @@ def distance(result: Row, name: str, pattern: str) -> str:
     return f"{100 * result['rows'][name][pattern]['chamfer_share']:.2f} %"
 
 
+@value("flags.tilt", "flags_*")
+def tilt(result: Row, name: str, pattern: str) -> str:
+    """Tilt of the normals of neighbouring centres over 40 cm, from the true ones."""
+    return f"{result['rows'][name][pattern]['tilt']['neighbours']['tilt_40cm_deg']:.2f} degrees"
+
+
 @value("flags.reference_distance", "flags_*", together=True)
 def reference_distance(results: list[Row], name: str, pattern: str) -> str:
     """Distance between the reference and a variant of it; ``_`` in the name stands for a space."""
