@@ -16,9 +16,10 @@ CHANGES = (*VARIES, "places", "room", "slots", "touched_nodes", "last", "chunk",
 MOST_PROGRAMS = tl.constexpr(1024)
 """Most programs that meet; a row of ``peak`` has as many entries."""
 
-LISTED, NEEDED_ROOM, NEEDED_SLOTS, MADE, ROUNDS, ACTING = (tl.constexpr(k) for k in range(6))
+LISTED, NEEDED_ROOM, NEEDED_SLOTS, MADE, ROUNDS, ACTING, WITHIN = (tl.constexpr(k) for k in range(7))
 """Entries of ``status``: candidates of all places; room that is needed for the candidates of a place, and for its
-constraints; how often lists were made; iterations of all substeps; constraints of this substep."""
+constraints; how often lists were made; iterations of all substeps; constraints of this substep; whether an obstacle is
+within reach in it."""
 
 
 @triton.jit
