@@ -17,51 +17,15 @@ from gaussian_swaying.mpm.triton.contact_list_kernels import (
     NEEDED_SLOTS,
     ROUNDS,
     WITHIN,
-    interpolate,
     largest_of,
     meet,
     place_now,
-    three,
+    velocity_now,
 )
 from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
 
 PLANES = tl.constexpr(10)
 """Numbers of a constraint: normal, wanted velocity, and its impulse with and without the momentum of the iteration."""
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact_positions(
-    fields, base, fraction, arm, rest, places, position, moving, status, sx, sy, inverse_dx, ARMS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Where all places are now, shape (C, 3), and their velocity; nothing is within reach yet."""
-    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = p < places
-    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
-    if ARMS:
-        a = load3(arm, places, p, mask)
-        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
-    x = load3(rest, places, p, mask)
-    moved = three(u)
-    for c in tl.static_range(3):
-        tl.store(position + p * 3 + c, x[c] + moved[c], mask)
-    _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
-    if tl.program_id(0) == 0:
-        tl.store(status + ACTING, 0)
-        tl.store(status + WITHIN, 0)
-
-
-@triton.jit
-def _velocity(
-    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
-):
-    """Read the velocity of places."""
-    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
-    if ARMS:
-        a = load3(arm, places, p, mask)
-        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
-    column = tl.arange(0, 4)[None, :]
-    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
 
 
 @triton.jit
@@ -433,7 +397,9 @@ def contact_solve(
                         inverse_dx, ARMS, BLOCK,
                     )  # fmt: skip
                     if WALLS == 0:
-                        _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+                        velocity_now(
+                            fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                        )
             meet(gate, programs)
         for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
@@ -524,7 +490,7 @@ def contact_solve(
                         mask = p < places
                         mask = mask & (tl.load(many + p, mask, 0) > 0)
                         if tl.max(mask.to(tl.int32)) > 0:
-                            _velocity(
+                            velocity_now(
                                 fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
                             )
                     meet(gate, programs)

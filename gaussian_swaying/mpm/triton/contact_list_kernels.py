@@ -106,6 +106,41 @@ def place_now(
 
 
 @triton.jit
+def velocity_now(
+    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Read the velocity of places."""
+    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    column = tl.arange(0, 4)[None, :]
+    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
+
+
+@triton.jit(do_not_specialize=CHANGES)
+def contact_positions(
+    fields, base, fraction, arm, rest, places, position, moving, status, sx, sy, inverse_dx, ARMS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Where all places are now, shape (C, 3), and their velocity; nothing is within reach yet."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < places
+    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    x = load3(rest, places, p, mask)
+    moved = three(u)
+    for c in tl.static_range(3):
+        tl.store(position + p * 3 + c, x[c] + moved[c], mask)
+    velocity_now(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if tl.program_id(0) == 0:
+        tl.store(status + ACTING, 0)
+        tl.store(status + WITHIN, 0)
+
+
+@triton.jit
 def _cell(x, inverse_size):
     return tl.floor(x * inverse_size).to(tl.int32)
 

@@ -216,7 +216,7 @@ class FusedContact:
                 WIDE=WIDE_SEARCH, **launch,
             )  # fmt: skip
         if walls:
-            kernels.contact_positions[(-(-self.places // BLOCK),)](
+            list_kernels.contact_positions[(-(-self.places // BLOCK),)](
                 *where, self.places, self.position, self.moving, self.status, *strides,
                 ARMS=self.arms, BLOCK=BLOCK, num_warps=8,
             )  # fmt: skip
