@@ -61,19 +61,21 @@ SHAPES = {
 
 
 def _ask_kernel(obstacle, place, time, device):
-    """Gap, normal, velocity and whether it counts at places in the kernel of ``total``."""
+    """Gap, normal, velocity, whether it counts and whether one is within 1 cm, at places in the kernel of ``total``."""
     solids = Solids([(obstacle.to(device), 0)], device, steps=1)
     solids.take()
     solids.prepare(time, torch.full_like(time, DT), 1)
     count = len(place)
     gap, valid = (torch.full((count,), -7.0, device=device) for _ in range(2))
     facing, drive = (torch.zeros(count, 3, device=device) for _ in range(2))
+    within = torch.zeros((), dtype=torch.int32, device=device)
     row, whole, window, pose, grids = solids.of(0)
     kernels.obstacle_places[(-(-count // 32),)](
-        place, torch.full_like(gap, 0.02), gap, facing, drive, valid, count, row, whole, window, pose, grids, time,
+        place, torch.zeros(count, 4, device=device), torch.full_like(gap, 0.02), gap, facing, drive, valid, within,
+        count, row, whole, window, pose, grids, time, torch.full_like(time, DT), 0.01,
         KIND=solids.kinds[0], MOVES=solids.moves[0], BLOCK=32,
     )  # fmt: skip
-    return gap, facing, drive, valid
+    return gap, facing, drive, valid, int(within)
 
 
 @pytest.mark.parametrize("moment", [0.0, 7.3 * DT, 40 * DT])
@@ -86,12 +88,14 @@ def test_distance_normal_and_velocity(device, name, moves, moment):
     obstacle = obstacle.in_frame(frame)
     place = (0.9 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.45).to(device)
     time = torch.tensor(moment, dtype=torch.float64, device=device)
-    gap, facing, drive, valid = _ask_kernel(obstacle, place, time, device)
+    gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, device)
     distance, normal, own = obstacle.touch(place.double(), time, DT)
     torch.testing.assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
     torch.testing.assert_close(facing.double(), normal, rtol=0, atol=2e-4)
     torch.testing.assert_close(drive.double(), own, rtol=0, atol=2e-5)
     assert bool((valid == float(obstacle.active(time))).all())
+    ahead = distance - DT * (own * normal).sum(-1)  # the places are at rest
+    assert within == int(bool(obstacle.active(time)) and float(torch.minimum(distance, ahead).min()) < 0.02)
 
 
 def _bodies(device, boundaries):

@@ -16,40 +16,16 @@ from gaussian_swaying.mpm.triton.contact_list_kernels import (
     MOST_PROGRAMS,
     NEEDED_SLOTS,
     ROUNDS,
-    interpolate,
+    WITHIN,
     largest_of,
     meet,
     place_now,
+    velocity_now,
 )
 from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
 
 PLANES = tl.constexpr(10)
 """Numbers of a constraint: normal, wanted velocity, and its impulse with and without the momentum of the iteration."""
-
-
-@triton.jit(do_not_specialize=CHANGES)
-def contact_positions(
-    fields, base, fraction, arm, rest, places, position, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
-):
-    """Where all places are now, shape (C, 3)."""
-    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = p < places
-    x, _a, _b, _c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
-    for c in tl.static_range(3):
-        tl.store(position + p * 3 + c, x[c], mask)
-
-
-@triton.jit
-def _velocity(
-    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
-):
-    """Read the velocity of places."""
-    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
-    if ARMS:
-        a = load3(arm, places, p, mask)
-        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
-    column = tl.arange(0, 4)[None, :]
-    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
 
 
 @triton.jit
@@ -195,6 +171,17 @@ def _constrain_walls(
 
 
 @triton.jit
+def _mark_nodes(base, marked, p, mask, sx, sy):
+    """Mark the nodes around places."""
+    one = tl.full(p.shape, 1, tl.int32)
+    node = tl.load(base + p, mask, 0)
+    for i in range(3):
+        for j in range(3):
+            for k in tl.static_range(3):
+                tl.store(marked + node + i * sx + j * sy + k, one, mask)
+
+
+@triton.jit
 def _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr):
     """Bound of how much unit impulses at all constraints move each place, as ``Rows.mobility``."""
     f = load3(fraction, places, p, mask)
@@ -316,17 +303,25 @@ def _impulses(
 
 @triton.jit
 def _count_nodes(
-    entry_start, entry_place, entry_weight, reached, total, touched, nodes, many, PAIRS: tl.constexpr,
+    entry_start, entry_place, entry_weight, reached, marked, total, touched, nodes, many, WALLS: tl.constexpr,
     programs, TALL: tl.constexpr,
 ):  # fmt: skip
-    """How much unit impulses at all constraints move each node, at most; zero where there are none."""
+    """How much unit impulses at all constraints move each node, at most; zero where there are none.
+
+    Nodes far from all constraints are not summed: they are not marked, or without obstacles have no pairs around them.
+    """
     entry = tl.arange(0, 32)[None, :]
     for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
         n = first + tl.arange(0, TALL)
         mask = n < nodes
         begin = tl.load(entry_start + n, mask, 0)
         length = tl.load(entry_start + n + 1, mask, 0) - begin
-        if PAIRS:
+        node = tl.load(touched + n, mask, 0)
+        if WALLS > 0:
+            length = tl.where(tl.load(marked + node, mask, 0) > 0, length, 0)
+            tl.debug_barrier()  # several threads have read it
+            tl.store(marked + node, tl.zeros([TALL], tl.int32), mask)
+        else:
             length = tl.where(tl.load(reached + n, mask, 0) > 0, length, 0)
         found = tl.zeros([TALL, 32], tl.float32)
         for k in range(0, tl.max(length), 32):
@@ -334,7 +329,7 @@ def _count_nodes(
             e = begin[:, None] + k + entry
             count = tl.load(many + tl.load(entry_place + e, real, 0), real, 0)
             found += tl.abs(tl.load(entry_weight + e, real, 0.0)) * count.to(tl.float32)
-        tl.store(total + tl.load(touched + n, mask, 0), tl.sum(found, 1), mask)
+        tl.store(total + node, tl.sum(found, 1), mask)
 
 
 @triton.jit
@@ -365,41 +360,47 @@ def _push_nodes(
 def contact_solve(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, candidates, near, room,
     wall_gap, wall_normal, wall_drive, wall_valid, wall_friction, pressed,
-    row, moving, many, other, data, slots, impulse,
-    touched, entry_start, entry_place, entry_weight, reached, total, touched_nodes,
+    pressed_sum, row, moving, many, other, data, slots, impulse,
+    touched, entry_start, entry_place, entry_weight, reached, marked, total, touched_nodes,
     peak, gate, status,
     schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, stretch, push, most, tolerance, friction,
     iterations,
     PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
-    """The impulses of a substep, added to the velocities of the nodes; see ``resolve``."""
+    """The impulses of a substep, added to the velocities of the nodes; see ``resolve``.
+
+    Nothing is done if no pairs are listed and no obstacle is within reach. With obstacles, ``contact_positions`` has
+    read the velocities. What obstacles press is added to ``pressed_sum``, float64.
+    """
     pid = tl.program_id(0)
     programs = tl.num_programs(0)
     lane = tl.arange(0, BLOCK)
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
-    listed = 1
+    listed = 0
     limit = reach
-    if WALLS == 0:
-        listed = tl.load(status + LISTED)
+    if WALLS > 0:
+        listed = tl.load(status + WITHIN)
     if PAIRS:
+        listed += tl.load(status + LISTED)
         limit += slack + 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
     if listed > 0:
-        if pid == 0:
-            tl.store(status + ACTING, 0)
-        for first in range(pid * BLOCK, places, programs * BLOCK):
-            p = first + lane
-            mask = p < places
-            some = 1
-            if WALLS == 0:
-                some = tl.max(tl.load(near + p, mask, 0))
-            if some > 0:
-                _place(
-                    fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy,
-                    inverse_dx, ARMS, BLOCK,
-                )  # fmt: skip
-                _velocity(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
-        meet(gate, programs)
+        if PAIRS:
+            if pid == 0:
+                tl.store(status + ACTING, 0)
+            for first in range(pid * BLOCK, places, programs * BLOCK):
+                p = first + lane
+                mask = p < places
+                if tl.max(tl.load(near + p, mask, 0)) > 0:
+                    _place(
+                        fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy,
+                        inverse_dx, ARMS, BLOCK,
+                    )  # fmt: skip
+                    if WALLS == 0:
+                        velocity_now(
+                            fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
+                        )
+            meet(gate, programs)
         for first in range(pid * BLOCK, places, programs * BLOCK):
             p = first + lane
             mask = p < places
@@ -419,6 +420,8 @@ def contact_solve(
                         moving, wall_gap, wall_normal, wall_drive, wall_valid, pressed, data, other, slots, places, p,
                         mask, count, dt, slack, push, most, WALLS, BLOCK,
                     )  # fmt: skip
+                    if tl.max(count) > 0:
+                        _mark_nodes(base, marked, p, mask & (count > 0), sx, sy)
                 tl.store(many + p, count, mask)
                 for c in tl.static_range(8):
                     tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
@@ -427,8 +430,8 @@ def contact_solve(
         meet(gate, programs)
         if tl.load(status + ACTING) > 0:
             _count_nodes(
-                entry_start, entry_place, entry_weight, reached, total, touched, touched_nodes, many,
-                PAIRS & (WALLS == 0), programs, TALL,
+                entry_start, entry_place, entry_weight, reached, marked, total, touched, touched_nodes, many, WALLS,
+                programs, TALL,
             )  # fmt: skip
             meet(gate, programs)
             for first in range(pid * BLOCK, places, programs * BLOCK):
@@ -487,9 +490,20 @@ def contact_solve(
                         mask = p < places
                         mask = mask & (tl.load(many + p, mask, 0) > 0)
                         if tl.max(mask.to(tl.int32)) > 0:
-                            _velocity(
+                            velocity_now(
                                 fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK
                             )
                     meet(gate, programs)
+            if WALLS > 0:
+                tl.debug_barrier()  # another thread of this program may have written what is read next
+                for first in range(pid * BLOCK, places, programs * BLOCK):
+                    p = first + lane
+                    mask = p < places
+                    mask = mask & (tl.load(many + p, mask, 0) > 0)
+                    if tl.max(mask.to(tl.int32)) > 0:
+                        for k in range(3 * WALLS):
+                            at = (k // 3 * places + p) * 3 + k % 3
+                            sum_ = tl.load(pressed_sum + at, mask, 0.0) + tl.load(pressed + at, mask, 0.0)
+                            tl.store(pressed_sum + at, sum_, mask)
             if pid == 0:
                 tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)

@@ -16,9 +16,10 @@ CHANGES = (*VARIES, "places", "room", "slots", "touched_nodes", "last", "chunk",
 MOST_PROGRAMS = tl.constexpr(1024)
 """Most programs that meet; a row of ``peak`` has as many entries."""
 
-LISTED, NEEDED_ROOM, NEEDED_SLOTS, MADE, ROUNDS, ACTING = (tl.constexpr(k) for k in range(6))
+LISTED, NEEDED_ROOM, NEEDED_SLOTS, MADE, ROUNDS, ACTING, WITHIN = (tl.constexpr(k) for k in range(7))
 """Entries of ``status``: candidates of all places; room that is needed for the candidates of a place, and for its
-constraints; how often lists were made; iterations of all substeps; constraints of this substep."""
+constraints; how often lists were made; iterations of all substeps; constraints of this substep; whether an obstacle is
+within reach in it."""
 
 
 @triton.jit
@@ -102,6 +103,41 @@ def place_now(
     x = load3(rest, places, p, mask)
     u0, u1, u2 = three(u)
     return (x[0] + u0, x[1] + u1, x[2] + u2), three(d0), three(d1), three(d2)
+
+
+@triton.jit
+def velocity_now(
+    fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
+):
+    """Read the velocity of places."""
+    v, d0, d1, d2 = interpolate(fields + 4, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+        v += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    column = tl.arange(0, 4)[None, :]
+    tl.store(moving + p[:, None] * 4 + column, v, mask[:, None] & (column < 3))
+
+
+@triton.jit(do_not_specialize=CHANGES)
+def contact_positions(
+    fields, base, fraction, arm, rest, places, position, moving, status, sx, sy, inverse_dx, ARMS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Where all places are now, shape (C, 3), and their velocity; nothing is within reach yet."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < places
+    u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if ARMS:
+        a = load3(arm, places, p, mask)
+        u += a[0][:, None] * d0 + a[1][:, None] * d1 + a[2][:, None] * d2
+    x = load3(rest, places, p, mask)
+    moved = three(u)
+    for c in tl.static_range(3):
+        tl.store(position + p * 3 + c, x[c] + moved[c], mask)
+    velocity_now(fields, base, fraction, arm, moving, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
+    if tl.program_id(0) == 0:
+        tl.store(status + ACTING, 0)
+        tl.store(status + WITHIN, 0)
 
 
 @triton.jit

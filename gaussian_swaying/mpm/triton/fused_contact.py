@@ -85,7 +85,7 @@ class FusedContact:
         """No place moves farther than this times the node that moves farthest."""
         many, walls = self.places, len(stage.obstacles)
         self.walls = walls
-        whole = {"dtype": torch.int32}
+        whole: dict[str, Any] = {"dtype": torch.int32}
         self.before = self._zeros(len(active), 4)
         self.last = (1 << max(many - 1, 0).bit_length()) - 1
         self.counts, self.rank = self._zeros(self.last + 1, **whole), self._zeros(many, **whole)
@@ -102,6 +102,9 @@ class FusedContact:
         self.wall_gap, self.wall_valid = self._zeros(max(walls, 1), many), self._zeros(max(walls, 1), many)
         self.wall_normal, self.wall_drive = self._zeros(max(walls, 1), many, 3), self._zeros(max(walls, 1), many, 3)
         self.pressed = self._zeros(max(walls, 1), many, 3)
+        self.pressed_sum = self._zeros(max(walls, 1), many, 3, dtype=torch.float64)
+        self.marked = self._zeros(len(fields), **whole)
+        self.within = self.status[int(list_kernels.WITHIN.value)]
         self.friction = torch.tensor([float(b.friction) for _, b in stage.obstacles] or [0.0], device=self.device)
         touched = [obstacle for _, obstacle in stage.obstacles if is_known(obstacle)]
         self.solids = Solids([(obstacle, 0) for obstacle in touched], self.device, steps=1)
@@ -175,7 +178,13 @@ class FusedContact:
         """Bring the tables of the obstacles up to date before a rollout; not recorded."""
         self.solids.take()
 
-    def apply(self, schedule: Tensor, first_step: Tensor, offset: int, time: Tensor, dt: Tensor, taken: Tensor) -> None:
+    def add_taken(self, taken: Tensor) -> None:
+        """Add what each boundary took since ``pressed_sum`` was zero [N s], to (scenes, B, 3), float64."""
+        scenes = self.stage.scenes
+        for k, (number, _) in enumerate(self.stage.obstacles):
+            taken[:, number] -= self.pressed_sum[k].view(scenes, self.places // scenes, 3).sum(1)
+
+    def apply(self, schedule: Tensor, first_step: Tensor, offset: int, time: Tensor, dt: Tensor) -> None:
         """Change the velocities of the nodes by the impulses of a substep; can be recorded.
 
         Args:
@@ -184,7 +193,6 @@ class FusedContact:
             offset: Number of this one after it.
             time: Time now [s], scalar float64 tensor.
             dt: Substep [s], scalar float64 tensor.
-            taken: What each boundary took [N s], shape (scenes, B, 3), float64; it is added to.
         """
         stage = self.stage
         if self.places == 0:
@@ -208,16 +216,18 @@ class FusedContact:
                 WIDE=WIDE_SEARCH, **launch,
             )  # fmt: skip
         if walls:
-            kernels.contact_positions[(-(-self.places // BLOCK),)](
-                *where, self.places, self.position, *strides, ARMS=self.arms, BLOCK=BLOCK, num_warps=8
-            )
+            list_kernels.contact_positions[(-(-self.places // BLOCK),)](
+                *where, self.places, self.position, self.moving, self.status, *strides,
+                ARMS=self.arms, BLOCK=BLOCK, num_warps=8,
+            )  # fmt: skip
             self.solids.prepare(time, dt, 1)
             for k, (number, (_, obstacle)) in enumerate(zip(self.numbers, stage.obstacles, strict=True)):
                 if number is not None:
                     obstacle_kernels.obstacle_places[(-(-self.places // BLOCK),)](
-                        self.position, self.thickness, self.wall_gap[k], self.wall_normal[k], self.wall_drive[k],
-                        self.wall_valid[k], self.places, *self.solids.of(number), time,
-                        KIND=self.solids.kinds[number], MOVES=self.solids.moves[number], BLOCK=BLOCK, num_warps=4,
+                        self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
+                        self.wall_drive[k], self.wall_valid[k], self.within, self.places, *self.solids.of(number),
+                        time, dt, SLACK * dx, KIND=self.solids.kinds[number], MOVES=self.solids.moves[number],
+                        BLOCK=BLOCK, num_warps=4,
                     )  # fmt: skip
                     continue
                 gap, normal, drive = obstacle.touch(self.position, time, dt)
@@ -225,14 +235,13 @@ class FusedContact:
                 self.wall_normal[k].copy_(normal)
                 self.wall_drive[k].copy_(drive)
                 self.wall_valid[k].copy_(obstacle.active(time).expand(self.places))
+                self.within.fill_(1)
         kernels.contact_solve[(self.programs,)](
             *where, self.facing, self.radius, self.thickness, self.places, self.candidates, self.near, self.room,
             self.wall_gap, self.wall_normal, self.wall_drive, self.wall_valid, self.friction, self.pressed,
-            self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
-            self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.total,
+            self.pressed_sum, self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
+            self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.marked, self.total,
             len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, self.stretch, PUSH,
             PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
             stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **launch,
         )  # fmt: skip
-        for k, (number, _) in enumerate(stage.obstacles):
-            taken[:, number] -= self.pressed[k].view(stage.scenes, -1, 3).sum(1, dtype=torch.float64)

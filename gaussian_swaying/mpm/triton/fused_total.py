@@ -186,7 +186,8 @@ class FusedTotal(Fused):
 
         def begin(_: int) -> None:
             part.begin(len(self.vectors))
-            for buffer in (self.taken, self.impulse, *([] if self.points is None else [self.residual])):
+            more = [] if self.touching is None or not self.touching.walls else [self.touching.pressed_sum]
+            for buffer in (self.taken, self.impulse, *more, *([] if self.points is None else [self.residual])):
                 buffer.zero_()
 
         key = (part.loaded, self.numbers.data_ptr(), part.key)
@@ -245,8 +246,7 @@ class FusedTotal(Fused):
             SOURCES=triton.next_power_of_2(len(self.source)), num_warps=4,
         )  # fmt: skip
         if self.touching is not None:
-            taken = self.impulse.view(self.scenes, -1, 3)
-            self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt, taken)
+            self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt)
         if self.plain and not moves:
             kernels.total_end[(-(-nodes // block),)](
                 self.active, self.inverse_mass, self.held, nodes, self.fields, self.schedule, self.first_step, offset,
@@ -278,6 +278,8 @@ class FusedTotal(Fused):
             for s, own in enumerate(self.own_nodes):
                 for k, nodes in enumerate(own):
                     total[s, k] += self.taken[nodes, :3].sum(0, dtype=torch.float64)
+        if self.touching is not None:
+            self.touching.add_taken(total)
         if self.points is not None:
             total += self.points.share @ self.residual[1, :, :3].double().reshape(self.scenes, -1, 3)
         return total.reshape(self.impulse.shape)

@@ -268,17 +268,30 @@ def acts(window, now):
 
 @triton.jit(do_not_specialize=VARIES)
 def obstacle_places(
-    position, thickness, gap, facing, drive, valid, places, row, whole, window, pose, grids, time,
-    KIND: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
+    position, moving, thickness, gap, facing, drive, valid, within, places, row, whole, window, pose, grids, time, dt,
+    slack, KIND: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Constraints of all places with one obstacle in ``total``: gap, normal, velocity, and whether it acts."""
+    """Constraints of all places with one obstacle in ``total``: gap, normal, velocity, and whether it acts.
+
+    ``within`` becomes one if a place is closer than ``slack``, now or after a substep with its velocity ``moving``.
+    """
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < places
     at = position + k * 3
     x = (tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0))
     distance, normal, own = touch(x, row, whole, pose, grids, mask, KIND, MOVES)
-    tl.store(gap + k, distance - 0.5 * tl.load(thickness + k, mask, 0.0), mask)
-    tl.store(valid + k, tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance), mask)
+    distance -= 0.5 * tl.load(thickness + k, mask, 0.0)
+    on = tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance)
+    v = moving + k * 4
+    v0 = tl.load(v, mask, 0.0) - own[0]
+    v1 = tl.load(v + 1, mask, 0.0) - own[1]
+    v2 = tl.load(v + 2, mask, 0.0) - own[2]
+    ahead = distance + tl.load(dt).to(tl.float32) * (v0 * normal[0] + v1 * normal[1] + v2 * normal[2])
+    close = mask & (tl.minimum(distance, ahead) < slack)
+    if tl.max(tl.where(close, on, 0.0)) > 0:
+        tl.store(within, 1)
+    tl.store(gap + k, distance, mask)
+    tl.store(valid + k, on, mask)
     for c in tl.static_range(3):
         tl.store(facing + k * 3 + c, normal[c], mask)
         tl.store(drive + k * 3 + c, own[c], mask)

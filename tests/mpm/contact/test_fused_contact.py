@@ -43,6 +43,36 @@ def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
     torch.testing.assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-6)
 
 
+def test_obstacles_alone_do_what_they_do_in_torch(sheet, scene, device):
+    """One that the sheet falls onto, one that it does not reach, and one for a short time; there are no pairs."""
+    points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
+    velocity = torch.zeros_like(points.position)
+    velocity[:, 2] = -12.0
+    boundaries = [
+        BallObstacle([0.04, 0.04, -0.08], 0.05, 0.4),
+        BallObstacle([0.04, 0.04, -0.5], 0.05),
+        BallObstacle([0.0, 0.0, -0.06], 0.05, start=3 * DT, end=5 * DT),
+    ]
+    ends, taken = [], []
+    for transfer in ("torch", "triton"):
+        solver, state = scene(points, None, boundaries, velocity=velocity, transfer=transfer)
+        if transfer == "triton":
+            early = solver.rollout(state, DT / 8, 2)
+            assert solver.fused().touching.rounds == 0
+            assert float(early.impulse.abs().max()) == 0.0
+        for _ in range(3):
+            state = solver.rollout(state, DT, 3)
+        ends.append(state)
+        taken.append(state.impulse)
+    assert solver.fused().touching.rounds > 0
+    assert float((ends[0].velocity - velocity).abs().max()) > 3.0
+    assert bool((taken[0].abs().amax(-1) > 1e-5).equal(torch.tensor([True, False, True], device=device)))
+    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=2e-5)
+    torch.testing.assert_close(ends[1].velocity, ends[0].velocity, rtol=0, atol=1e-2)
+    torch.testing.assert_close(taken[1], taken[0], rtol=0, atol=1e-4 * float(taken[0].abs().max()) + 1e-7)
+    assert float(taken[1][1].abs().max()) == 0.0
+
+
 def test_many_substeps_use_the_lists_again(sheet, scene, device, monkeypatch):
     """A sheet that falls onto another is stopped as in torch, with lists that serve several substeps."""
     points, _, _ = _collision(sheet, device)
