@@ -309,6 +309,82 @@ def measure(
     return Measurement(solver, substeps, parts, [cfl, wind_work])
 
 
+@dataclass(frozen=True)
+class SceneDiagnostics(FrameDiagnostics):
+    """Those of the first scene of a batch, with those of every one.
+
+    Attributes:
+        each: The diagnostics of each scene; substeps and Courant number are those of all.
+    """
+
+    each: tuple[FrameDiagnostics, ...] = ()
+
+
+class SceneMeasurement(Measurement):
+    """As :class:`Measurement`, for each scene of a batch."""
+
+    def read(self, check: bool = False) -> SceneDiagnostics:
+        """Wait for the measurements (one GPU synchronisation); see :func:`diagnose`."""
+        found = self._wait()
+        if check:
+            _raise_if_bad(self._solver, found["verdict"], found["time"][0])
+        scenes = int(found["scenes"][0])
+        rows = [found["each"][k::scenes] for k in range(scenes)]
+        shared: dict[str, Any] = {"time": found["time"][0], "substeps": self._substeps, "cfl": self.cfl, "torn": 0}
+        each = []
+        for row in rows:
+            own: dict[str, Any] = dict(zip(_OF_SCENE, row[: len(_OF_SCENE)], strict=True))
+            own |= {name: int(own[name]) for name in ("lost", *_PARTICLES)}
+            support = tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))
+            each.append(FrameDiagnostics(**shared, **own, support=support))
+        first = {name: getattr(each[0], name) for name in FrameDiagnostics.__dataclass_fields__}
+        return SceneDiagnostics(**first, each=tuple(each))
+
+
+_OF_SCENE = tuple(
+    name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "torn", "support")
+)
+
+
+def measure_scenes(
+    solver: MPMSolver, state: MPMState, substeps: int, cfl: Tensor | float, before: MPMState, more: Tensor | None = None
+) -> SceneMeasurement:
+    """As :func:`measure`, for each scene of a batch of shape (B,); torn particles are not counted."""
+    moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
+    energies, momenta = solver.energies(state), solver.momenta(state)
+    J = determinant(state.F_total)
+    F = state.F_total.double()
+    squares = symmetric_eigenvalues(matmul3(F.mT, F))
+    columns = {
+        **energies,
+        "wind_work": state.work - before.work,
+        **{f"momentum_{axis}": momenta["linear"][..., k] for k, axis in enumerate("xyz")},
+        **{f"angular_momentum_{axis}": momenta["angular"][..., k] for k, axis in enumerate("xyz")},
+        "lost": state.lost.sum(-1),
+        "J_min": J.amin(-1),
+        "J_max": J.amax(-1),
+        "stretch_min": squares[..., -1].amin(-1).clamp(min=0).sqrt(),
+        "stretch_max": squares[..., 0].amax(-1).clamp(min=0).sqrt(),
+        "displacement_mean": moved.mean(-1),
+        "displacement_max": moved.amax(-1),
+        "moved_particle": moved.argmax(-1),
+        "compressed_particle": squares[..., -1].argmin(-1),
+        "stretched_particle": squares[..., 0].argmax(-1),
+    }
+    support = support_force(before, state).flatten(-2)
+    each = [columns[name].double() for name in _OF_SCENE] + list(support.double().unbind(-1))
+    parts = {
+        "time": state.time[None],
+        "each": torch.cat(each),
+        "scenes": torch.full_like(state.time[None], len(moved)),
+        "given": state.time[None][:0] if not isinstance(cfl, Tensor) else cfl.to(state.time).reshape(1),
+        "verdict": _verdict(solver, state, moved),
+        "outran": _outran(before, state),
+        "more": state.time[None][:0] if more is None else more,
+    }
+    return SceneMeasurement(solver, substeps, parts, [cfl])
+
+
 class Gauge:
     """:func:`measure` from a CUDA graph, where possible: some 150 small kernels take longer to start than to run.
 
