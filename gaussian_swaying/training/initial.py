@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
@@ -61,3 +63,17 @@ def gaussians_from_points(
         opacities=torch.full((count,), math.log(opacity / (1.0 - opacity))),
         sh=sh,
     )
+
+
+def gaussians_from_file(path: str, sh_degree: int) -> GaussianCloud:
+    """The Gaussians of a splat, with spherical harmonics up to a degree; those that it lacks are zero.
+
+    Args:
+        path: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads.
+        sh_degree: The degree, 0 to 3.
+    """
+    cloud = read_gaussians(path)
+    wanted = (sh_degree + 1) ** 2
+    sh = cloud.sh[:, :wanted]
+    missing = sh.new_zeros(len(cloud), wanted - sh.shape[1], 3)
+    return replace(cloud, sh=torch.cat([sh, missing], 1))

@@ -18,20 +18,22 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
+from gaussian_swaying.training.checkpoints import check_settings, stored_gaussians
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
 from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged
+from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
 from gaussian_swaying.training.panels import LPIPS_SIDE, lpips_metric, panel
-from gaussian_swaying.training.random_stream import random_state, set_random_state
+from gaussian_swaying.training.parallel import check_alike, scaled_adam, share_gradients, steps_of
+from gaussian_swaying.training.random_stream import mixed_seed, random_state, set_random_state
 from gaussian_swaying.training.rates import LearningRates, means_rate
+from gaussian_swaying.training.strategy import count_steps
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 
 _CLOCK_STEP = 20_000_000  # [ns] by which file times may lag behind the clock
@@ -40,7 +42,9 @@ _CLOCK_STEP = 20_000_000  # [ns] by which file times may lag behind the clock
 class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
-    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one.
+    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one. On
+    several devices (``trainer.devices``) a step takes one image on each, and everything that is given in steps still
+    counts images, see :mod:`~gaussian_swaying.training.parallel`.
     Random numbers come from a separate stream, which starts from the seed and is stored in checkpoints. So nothing else
     changes them, and a resumed run continues exactly.
 
@@ -147,13 +151,7 @@ class SplatTrainer(lightning.LightningModule):
             check_positive("scene_scale", self.scene_scale)
         if self.model is None:
             if self.init_ply is not None:
-                cloud = read_gaussians(self.init_ply)
-                wanted = (self.sh_degree + 1) ** 2
-                sh = cloud.sh[:, :wanted]
-                missing = sh.new_zeros(len(cloud), wanted - sh.shape[1], 3)
-                cloud = GaussianCloud(
-                    cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.cat([sh, missing], 1), cloud.normals
-                )
+                cloud = gaussians_from_file(self.init_ply, self.sh_degree)
             elif hasattr(datamodule, "initial_cloud"):
                 cloud = datamodule.initial_cloud(self.sh_degree)
             else:
@@ -170,16 +168,14 @@ class SplatTrainer(lightning.LightningModule):
             "means": self.rates.means * self.scene_scale
         }
         return [
-            torch.optim.Adam([getattr(self.splat, name)], lr=rates[name], eps=1e-15, fused=fused) for name in PARAMETERS
+            torch.optim.Adam([getattr(self.splat, name)], fused=fused, **scaled_adam(rates[name], self.devices))
+            for name in PARAMETERS
         ]
 
     def on_fit_start(self) -> None:
         """Refuse settings that would silently train wrongly."""
         self._begun = time.time_ns()
-        if self.trainer.world_size > 1:
-            raise ValueError(
-                f"Expected one device for training, but got {self.trainer.world_size}: use trainer.devices 1."
-            )
+        count_steps(self.trainer)
         if self.trainer.precision not in ("32-true", "32"):
             raise ValueError(
                 f"Expected `trainer.precision` to be 32-true, but got {self.trainer.precision}: splats need float32."
@@ -189,7 +185,13 @@ class SplatTrainer(lightning.LightningModule):
         """Attach the Gaussians and their optimisers to the densification, after a checkpoint has been read."""
         assert self.scene_scale is not None
         optimizers = dict(zip(PARAMETERS, self._raw_optimizers(), strict=True))
-        self.densification.attach(self.splat, optimizers, self.scene_scale)
+        self.densification.attach(self.splat, optimizers, self.scene_scale, self.devices)
+        check_alike([getattr(self.splat, name) for name in PARAMETERS])
+
+    @property
+    def devices(self) -> int:
+        """Number of devices that train together; a step takes so many images."""
+        return self.trainer.world_size
 
     def _raw_optimizers(self) -> list[torch.optim.Optimizer]:
         found = self.optimizers(use_pl_optimizer=False)
@@ -243,7 +245,9 @@ class SplatTrainer(lightning.LightningModule):
     def training_step(self, batch: Mapping[str, Any], batch_idx: int) -> STEP_OUTPUT:
         """One image: picture, losses, gradients, six optimisers, densification."""
         outside = random_state(self.device)
-        if self._random:
+        if self.devices > 1:  # other backgrounds on each device
+            torch.manual_seed(mixed_seed(self.seed, self.global_step, 1 + self.global_rank))
+        elif self._random:
             set_random_state(self._random, self.device)
         else:
             torch.manual_seed(self.seed)
@@ -257,12 +261,13 @@ class SplatTrainer(lightning.LightningModule):
         optimizers = self._raw_optimizers()
         means_optimizer, *others = optimizers
         assert self.scene_scale is not None
+        images = step * self.devices  # before this step
         rate = means_rate(self.rates, self.scene_scale, step, int(self.trainer.max_steps))
-        means_optimizer.param_groups[0]["lr"] = rate
+        means_optimizer.param_groups[0]["lr"] = rate * math.sqrt(self.devices)
         target, alpha, background = self._target(batch, train=True)
-        needs = self.loss.needs(step)
+        needs = self.loss.needs(images)
         output = self.render(
-            batch["camera"], background, self.active_degree(step), self.densification.absgrad, bool(needs)
+            batch["camera"], background, self.active_degree(images), self.densification.absgrad, bool(needs)
         )
         self._check_pending()  # of the previous step: gsplat has already waited for the GPU
         splat = self.splat
@@ -276,7 +281,7 @@ class SplatTrainer(lightning.LightningModule):
             splat.quats,
             splat.scales,
             splat.opacity(),
-            step,
+            images,
             camera,
             surface,
             self._other_view(batch, background) if "other_view" in needs else None,
@@ -286,9 +291,13 @@ class SplatTrainer(lightning.LightningModule):
             loss = loss + 0.0 * splat.means.sum()
         self.densification.before_backward(step, output.screen)
         self.manual_backward(loss)
+        mean = loss.detach()
+        if self.devices > 1:
+            mean = share_gradients([getattr(splat, name) for name in PARAMETERS], loss)
+            torch.manual_seed(mixed_seed(self.seed, step))  # the same changes on all devices
         if self._pending is None:
             self._pending = PendingLoss(self.device)
-        self._pending.send(step, loss.detach())
+        self._pending.send(images, mean)
         if self.device.type != "cuda":
             self._check_pending()
         # Lightning counts a step of its wrapper as one of `max_steps`: it wraps one optimiser only.
@@ -301,10 +310,10 @@ class SplatTrainer(lightning.LightningModule):
         self.densification.after_step(step, output.screen)
         if len(splat) == 0:
             raise ValueError(
-                f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
+                f"No Gaussian is left at image {images}: lower `densification.prune_opacity`, or the weights of the "
                 "losses that lower opacities."
             )
-        if step % self.log_every == 0 or step + 1 == self.trainer.max_steps:
+        if step % steps_of(self.log_every, self.devices) == 0 or step + 1 == self.trainer.max_steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
 
@@ -377,15 +386,17 @@ class SplatTrainer(lightning.LightningModule):
         self._check_pending()
         for name in PARAMETERS:
             if not bool(torch.isfinite(getattr(self.splat, name)).all()):
-                raise TrainingDiverged(self.global_step, f"a value of `{name}`", self.last_checkpoint())
+                raise TrainingDiverged(self.global_step * self.devices, f"a value of `{name}`", self.last_checkpoint())
+        check_alike([getattr(self.splat, name) for name in PARAMETERS])
         checkpoint["splat_training"] = {
+            "devices": self.devices,
             "densification": self.densification.state_dict(),
             "kind": type(self.densification).__name__,
             "scene_scale": self.scene_scale,
             "sh_degree": self.sh_degree,
             "seed": self.seed,
             "random": self._random,
-            "seen": self.global_step,
+            "seen": self.global_step * self.devices,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -393,20 +404,9 @@ class SplatTrainer(lightning.LightningModule):
         stored = checkpoint.get("splat_training")
         if stored is None:
             raise ValueError("The checkpoint has no Gaussians: it was not written by this package.")
-        if stored["sh_degree"] != self.sh_degree:
-            raise ValueError(
-                f"The checkpoint was trained with `sh_degree` {stored['sh_degree']}, but the configuration says "
-                f"{self.sh_degree}: use the same."
-            )
-        state = {name: checkpoint["state_dict"][f"model.{name}"] for name in PARAMETERS}
+        check_settings(stored, self.sh_degree, self.devices if self.trainer.state.fn == "fit" else None)
         device = self.device if self.model is None else self.model.means.device
-        cloud = GaussianCloud(
-            state["means"],
-            state["quats"],
-            state["scales"],
-            state["opacities"],
-            torch.cat([state["sh0"], state["shN"]], 1),
-        )
+        cloud = stored_gaussians(checkpoint["state_dict"])
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
         self._random = {name: state.cpu() for name, state in stored["random"].items()}
@@ -449,7 +449,8 @@ class SplatTrainer(lightning.LightningModule):
     def _evaluate(self, batch: Mapping[str, Any], batch_idx: int, stage: str) -> None:
         target, _, background = self._target(batch, train=False)
         fitting = self.trainer.state.fn == "fit"
-        degree = self.active_degree(max(self.global_step - 1, 0)) if fitting else self._degree_reached()
+        images = self.global_step * self.devices if fitting else self._seen
+        degree = self.active_degree(max(images - 1, 0)) if fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
         one, two = (rearrange(picture, "h w c -> 1 c h w").float() for picture in (image, target))
         values = {"psnr": peak_signal_noise_ratio(one, two, data_range=1.0)}
@@ -461,9 +462,8 @@ class SplatTrainer(lightning.LightningModule):
             values["lpips"] = self._lpips[0].to(self.device)(one, two)
         for name, value in values.items():
             self._metrics.setdefault(name, []).append(value)
-        if batch_idx < self.panels and not self.trainer.sanity_checking:
-            step = self.global_step if fitting else self._seen
-            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}", step)
+        if batch_idx < self.panels and not self.trainer.sanity_checking and self.trainer.is_global_zero:
+            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}", images)
 
     def _log_metrics(self, stage: str) -> None:
         for name, values in self._metrics.items():
@@ -497,7 +497,9 @@ class SplatTrainer(lightning.LightningModule):
     def on_train_end(self) -> None:
         """Check the last loss and write ``point_cloud.ply``."""
         self._check_pending()
-        self.export(self.folder / "point_cloud.ply")
+        check_alike([getattr(self.splat, name) for name in PARAMETERS])
+        if self.trainer.is_global_zero:
+            self.export(self.folder / "point_cloud.ply")
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Write the Gaussians as a 3DGS file, without those that are not finite.

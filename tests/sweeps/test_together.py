@@ -18,7 +18,7 @@ from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.together import grouped, make_together
 
-FIXED = {"solver.substep": 4e-3, "frames": 5}
+FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
 
 
