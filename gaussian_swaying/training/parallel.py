@@ -57,7 +57,8 @@ def check_alike(parameters: Sequence[Tensor]) -> None:
     """Raise RuntimeError if the devices do not hold the same parameters any more."""
     if not several_devices():
         return
-    sums = [parameter.detach().double().sum() for parameter in parameters]
+    flat = [parameter.detach().double().flatten() for parameter in parameters]
+    sums = [(values * torch.arange(1, len(values) + 1, device=values.device)).sum() for values in flat]  # with places
     own = torch.stack([sums[0].new_tensor(len(parameters[0])), *sums])
     found = [torch.empty_like(own) for _ in range(distributed.get_world_size())]
     distributed.all_gather(found, own)

@@ -96,8 +96,9 @@ class RunFolder(Callback):
             self._take_all(trainer, pl_module)
         if self.loggers is not None:
             trainer.loggers = self.loggers()
+        place = Path(trainer.log_dir or self.root)  # the processes agree on it
         if self.save_config is not None and trainer.is_global_zero:
-            self.save_config(Path(trainer.log_dir or self.root))
+            self.save_config(place)
         self.begun = True
         self._newest = pl_module.last_checkpoint
 
