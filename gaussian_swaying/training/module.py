@@ -404,7 +404,8 @@ class SplatTrainer(lightning.LightningModule):
         stored = checkpoint.get("splat_training")
         if stored is None:
             raise ValueError("The checkpoint has no Gaussians: it was not written by this package.")
-        check_settings(stored, self.sh_degree, self.devices if self.trainer.state.fn == "fit" else None)
+        fitting = self._trainer is not None and self.trainer.state.fn == "fit"
+        check_settings(stored, self.sh_degree, self.devices if fitting else None)
         device = self.device if self.model is None else self.model.means.device
         cloud = stored_gaussians(checkpoint["state_dict"])
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
