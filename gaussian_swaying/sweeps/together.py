@@ -63,9 +63,13 @@ def run_together(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
 
 def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
     """The simulation of all runs of a job, and how many frames they have."""
-    settings = [parse_run(parser, job.config, job.frames, run) for run in job.runs]
-    for one in settings:
-        one.device = job.device
+    settings = [parse_run(parser, job.config, job.frames, job.runs[0])]
+    settings[0].device = job.device
+    for run in job.runs[1:]:  # parsing takes longer than a frame of all
+        settings.append(settings[0].clone())
+        for name in ALIKE:
+            if name in run:
+                settings[-1][name] = _as_parsed(name, run[name])
     first = Simulation.from_settings(parser, settings[0])
     first.start()  # with all checks of a run
     given = parser.instantiate(settings[0]).material
@@ -76,6 +80,13 @@ def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
         text = config_text(parser, one)
         members.append(variant(first, wind, parts.material, given, parts.recorder, text))
     return Together(members), settings[0].frames
+
+
+def _as_parsed(name: str, value: Any) -> Any:
+    """The value of an axis as the parser would make it; its numbers were checked with the plan."""
+    if name == "wind.seed":
+        return int(value)
+    return [float(part) for part in value] if isinstance(value, list) else float(value)
 
 
 __all__ = ["grouped", "make_together", "run_together"]

@@ -50,6 +50,8 @@ def test_together_as_alone(tmp_path, sweep_file):
                 assert float(other[name]) == pytest.approx(float(one[name]), rel=2e-4, abs=1e-7), name
             except ValueError:
                 assert one[name] == other[name], name
+        texts = [(folder / "runs" / one["run"] / "config.yaml").read_text() for folder in (alone, together)]
+        assert texts[0] == texts[1]
         a, b = (_motion(folder, one["run"]) for folder in (alone, together))
         assert a.keys() == b.keys()
         for entry in a:
