@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -311,13 +312,14 @@ def measure(
 
 @dataclass(frozen=True)
 class SceneDiagnostics(FrameDiagnostics):
-    """Those of the first scene of a batch, with those of every one.
+    """Those of the first scene of a batch; ``make`` makes those of every one when they are asked for."""
 
-    Attributes:
-        each: The diagnostics of each scene; substeps and Courant number are those of all.
-    """
+    make: Callable[[], tuple[FrameDiagnostics, ...]] = field(default=tuple, repr=False, compare=False)
 
-    each: tuple[FrameDiagnostics, ...] = ()
+    @cached_property
+    def each(self) -> tuple[FrameDiagnostics, ...]:
+        """The diagnostics of each scene; substeps and Courant number are those of all."""
+        return self.make()
 
 
 class SceneMeasurement(Measurement):
@@ -329,16 +331,15 @@ class SceneMeasurement(Measurement):
         if check:
             _raise_if_bad(self._solver, found["verdict"], found["time"][0])
         scenes = int(found["scenes"][0])
-        rows = [found["each"][k::scenes] for k in range(scenes)]
         shared: dict[str, Any] = {"time": found["time"][0], "substeps": self._substeps, "cfl": self.cfl, "torn": 0}
-        each = []
-        for row in rows:
+
+        def one(scene: int) -> dict[str, Any]:
+            row = found["each"][scene::scenes]
             own: dict[str, Any] = dict(zip(_OF_SCENE, row[: len(_OF_SCENE)], strict=True))
             own |= {name: int(own[name]) for name in ("lost", *_PARTICLES)}
-            support = tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))
-            each.append(FrameDiagnostics(**shared, **own, support=support))
-        first = {name: getattr(each[0], name) for name in FrameDiagnostics.__dataclass_fields__}
-        return SceneDiagnostics(**first, each=tuple(each))
+            return shared | own | {"support": tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))}
+
+        return SceneDiagnostics(**one(0), make=lambda: tuple(FrameDiagnostics(**one(k)) for k in range(scenes)))
 
 
 _OF_SCENE = tuple(

@@ -253,6 +253,12 @@ class Run:
                 }
             )
 
+    @property
+    def recording(self) -> bool:
+        """Whether anything is written in a frame."""
+        recorder = self.recorder
+        return recorder.images or recorder.ply_every > 0 or recorder.trajectory or recorder.nodes
+
     def record(self, state: MPMState, frame: int) -> None:
         """Draw, export and record the requested outputs of a frame."""
         recorder, walls = self.recorder, self.walls

@@ -190,7 +190,8 @@ class Together(Simulation):
                 launched = self.launch(state) if frame + 1 < frames else None
                 assert isinstance(health, SceneDiagnostics)
                 for index, run in runs.items():
-                    run.record(state.scene(index), frame)
+                    if run.recording:
+                        run.record(state.scene(index), frame)
                     run.log.append(health.each[index].as_dict())
                 if launched is not None:
                     state, health = launched.finish()

@@ -310,7 +310,7 @@ class SplatTrainer(lightning.LightningModule):
         self.densification.after_step(step, output.screen)
         if len(splat) == 0:
             raise ValueError(
-                f"No Gaussian is left at image {images}: lower `densification.prune_opacity`, or the weights of the "
+                f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
                 "losses that lower opacities."
             )
         if step % steps_of(self.log_every, self.devices) == 0 or step + 1 == self.trainer.max_steps:
