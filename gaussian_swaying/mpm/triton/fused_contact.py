@@ -89,7 +89,7 @@ class FusedContact:
         self.before = self._zeros(len(active), 4)
         self.last = (1 << max(many - 1, 0).bit_length()) - 1
         self.counts, self.rank = self._zeros(self.last + 1, **whole), self._zeros(many, **whole)
-        self.start = torch.full((self.last + 2,), many, device=self.device, **whole)
+        self.start = torch.full((self.last + 2,), many, device=self.device, dtype=torch.int32)
         self.item, self.ordered = self._zeros(many, **whole), self._zeros(many, **whole)
         self.now, self.sorted = self._zeros(many, 4), self._zeros(many, 4)
         self.near, self.many = self._zeros(many, **whole), self._zeros(many, **whole)
