@@ -42,11 +42,18 @@ def stream_start(seed: int, stream: int) -> int:
     return _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
 
 
-def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tensor:
+def _stream_key(seed: int | Tensor, stream: int, device: torch.device) -> Tensor:
+    """Where the counters start, on the device: nothing is copied from the host, so a CUDA graph can record it."""
+    if isinstance(seed, Tensor):
+        return (seed * _signed(0x9E3779B97F4A7C15) + (stream + 1))[..., None]
+    return torch.full((), stream_start(seed, stream), dtype=torch.int64, device=device)
+
+
+def counter_uniform(seed: int | Tensor, stream: int, counter: Tensor, lanes: int) -> Tensor:
     """Uniform numbers in (0, 1) that depend only on seed, stream, counter and lane.
 
     Args:
-        seed: Seed of the run.
+        seed: Seed of the run; or of each of several runs, int64, shape (B,), for counters of shape (..., B).
         stream: Number of the generator within the run.
         counter: Integers, shape (...), int64.
         lanes: Independent numbers per counter.
@@ -54,20 +61,19 @@ def counter_uniform(seed: int, stream: int, counter: Tensor, lanes: int) -> Tens
     Returns:
         float64, shape (..., lanes).
     """
-    # filled on the device: nothing is copied from the host, so a CUDA graph can record it
-    key = _mix(torch.full((), stream_start(seed, stream), dtype=torch.int64, device=counter.device))
+    key = _mix(_stream_key(seed, stream, counter.device))
     lane = torch.arange(lanes, device=counter.device)
     bits = _mix(_mix(key + counter[..., None] * _signed(0x9E3779B97F4A7C15)) + lane * _signed(0xD1B54A32D192ED03))
     return (((bits >> 11) & ((1 << 53) - 1)).double() + 0.5) / float(1 << 53)
 
 
-def counter_normal(seed: int, stream: int, counter: Tensor, lanes: int) -> Tensor:
+def counter_normal(seed: int | Tensor, stream: int, counter: Tensor, lanes: int) -> Tensor:
     """Standard normal numbers, shape (..., lanes), float64, by Box-Muller from :func:`counter_uniform`."""
     u = counter_uniform(seed, stream, counter, 2 * lanes)
     return (-2 * u[..., :lanes].log()).sqrt() * (2 * math.pi * u[..., lanes:]).cos()
 
 
-def sample_index(time: Tensor, interval: float) -> Tensor:
+def sample_index(time: Tensor, interval: float | Tensor) -> Tensor:
     """Index of the sample at a time [s]; a time less than 1e-6 intervals before the next sample belongs to that one."""
     return torch.floor(time / interval + 1e-6).long()
 

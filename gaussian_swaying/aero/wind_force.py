@@ -17,6 +17,7 @@ from gaussian_swaying.aero.force import AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.geometry.patches import compiles, deform_patch
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, ForceTwin, Given
 from gaussian_swaying.mpm.state import MPMState
@@ -32,7 +33,8 @@ class WindForce(Force):
 
     Args:
         aero: Coefficients and law of the force.
-        wind: The wind, or a list with one wind for each scene of a batch.
+        wind: The wind; or one for each scene of a batch, as a list or a
+            :class:`~gaussian_swaying.aero.wind_batch.WindBatch`, which is faster for many.
         normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
             :class:`~gaussian_swaying.aero.patches.Patches`, those of the scenes of a batch one after the other.
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
@@ -54,7 +56,11 @@ class WindForce(Force):
     """
 
     def __init__(
-        self, aero: AeroForce, wind: Wind | Sequence[Wind], normal: Tensor | Patches, area: Tensor | None = None
+        self,
+        aero: AeroForce,
+        wind: Wind | WindBatch | Sequence[Wind],
+        normal: Tensor | Patches,
+        area: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.sums: PatchSums | None = None
@@ -74,12 +80,14 @@ class WindForce(Force):
         self.register_buffer("area", area, persistent=False)
         self.normal: Tensor
         self.area: Tensor
-        self._shared = isinstance(wind, nn.Module)
+        self._shared = isinstance(wind, nn.Module) and not isinstance(wind, WindBatch)
         self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
-        if not self._shared and normal.shape[:-2] != (len(self._fields),):
-            raise ValueError(
-                f"Expected one `wind` for each of the {tuple(normal.shape[:-2])} scenes, but got {len(self._fields)}."
-            )
+        if not self._shared:
+            winds, scenes = len(wind), tuple(normal.shape[:-2])  # type: ignore[arg-type]
+            if scenes != (winds,) and not (isinstance(wind, WindBatch) and scenes == ()):  # () for all scenes alike
+                raise ValueError(f"Expected one `wind` for each of the {scenes} scenes, but got {winds}.")
+            if self.sums is not None:
+                raise ValueError("Patches of several directions on a point need one wind: simulate one by one.")
         self._key: tuple[tuple[object, ...], ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
         self._space: Packed | None = None
@@ -92,18 +100,19 @@ class WindForce(Force):
     @property
     def wind(self) -> nn.Module | tuple[nn.Module, ...]:
         """The wind, or one wind for each scene of a batch."""
-        return self._fields[0] if self._shared else tuple(self._fields)
+        return self._fields[0] if self._shared or isinstance(self._fields[0], WindBatch) else tuple(self._fields)
 
     @property
     def uniform(self) -> bool:
         """Whether the wind is the same everywhere in a scene."""
-        return all(isinstance(wind, WindField) and wind.uniform for wind in self._fields)
+        return all(isinstance(w, WindBatch) or (isinstance(w, WindField) and w.uniform) for w in self._fields)
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
         """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
         return all(
-            wind.recordable and (isinstance(wind, SpatialWind) or type(wind) is WindField) for wind in self._fields
+            wind.recordable and (isinstance(wind, (SpatialWind, WindBatch)) or type(wind) is WindField)
+            for wind in self._fields
         )
 
     @property
@@ -160,6 +169,8 @@ class WindForce(Force):
         times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
         if self._shared:
             return _blow(self._fields[0], times)
+        if isinstance(self._fields[0], WindBatch):
+            return self._fields[0](times)[:, :, None]
         return torch.stack([_blow(wind, times) for wind in self._fields], dim=1)[:, :, None]
 
     def air(self, time: Tensor, position: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli.continuing import command
@@ -39,9 +40,49 @@ def build_parser() -> argparse.ArgumentParser:
         help="how often a failed run is tried again; three times as often if its process was killed",
     )
     add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    add(
+        "--together",
+        type=int,
+        default=1,
+        metavar="N",
+        help="simulate up to N runs of equal shape as one, which a GPU does many times faster if they are small; they "
+        "then take substeps of the same length",
+    )
+    add(
+        "--per-gpu",
+        type=_number_or_auto,
+        default=1,
+        metavar="N",
+        help="jobs at a time on each GPU; auto for as many as its memory holds, by what the first ones took",
+    )
+    add(
+        "--ray",
+        nargs="?",
+        const="local",
+        metavar="ADDRESS",
+        help="let Ray do the runs, on this machine or on the cluster at an address; needs gaussian-swaying[ray]",
+    )
+    add(
+        "--part",
+        type=_part,
+        metavar="I/N",
+        help="do only the I-th of N parts; other processes do the others in the same folder, as in a SLURM array. "
+        "It continues what is there",
+    )
+    add("--parquet", action="store_true", help="also write sweep.parquet; needs gaussian-swaying[parquet]")
+    add("--shards", type=int, metavar="N", help="also write the runs as WebDataset shards, N runs in each")
     add("--picture", default="last", choices=("last", "middle"), help="frame of the contact sheet")
     add("--list", action="store_true", help="print the runs and end")
     return parser
+
+
+def _number_or_auto(text: str) -> int | None:
+    return None if text == "auto" else int(text)
+
+
+def _part(text: str) -> tuple[int, int]:
+    number, _, parts = text.partition("/")
+    return int(number), int(parts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,8 +121,12 @@ def explain(error: BaseException) -> str:
 def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[str]) -> int:
     """Do the runs that are missing, and report; the folder is put into ``begun`` once it is the sweep's."""
     from gaussian_swaying.sweeps.plan import make_plan, read_sweep
-    from gaussian_swaying.sweeps.record import TABLE
+    from gaussian_swaying.sweeps.record import PARQUET, TABLE
+    from gaussian_swaying.sweeps.shards import SHARDS
     from gaussian_swaying.sweeps.sweep import run_sweep
+
+    if options.shards is not None and (options.shards < 1 or options.part is not None):
+        raise ValueError("Expected `--shards` to be at least 1, and without `--part`: write them when all is done.")
 
     file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
     parser = Simulation.parser()
@@ -104,10 +149,17 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
             picture=options.picture,
             explain=explain,
             started=lambda: begun.append(folder),
+            together=options.together,
+            per_gpu=options.per_gpu,
+            ray=options.ray,
+            part=options.part,
+            parquet=options.parquet,
         )
     counts = Counter(result["status"] for result in results.values())
     print(f"{len(results)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}")
-    for file in (folder / "runs", folder / TABLE, *sorted(folder.glob("contact_sheet*.png"))):
+    tables = [folder / name for name in (TABLE, PARQUET) if (folder / name).exists()]  # the last part writes them
+    shards = [folder / SHARDS] if _write_shards(folder, options.shards, results) else []
+    for file in (folder / "runs", *tables, *sorted(folder.glob("contact_sheet*.png")), *shards):
         print(f"wrote {file}")
     failed = [name for name, result in sorted(results.items()) if result["status"] != "complete"]
     if failed:
@@ -117,3 +169,15 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
             file=sys.stderr,
         )
     return 2 if failed else 0
+
+
+def _write_shards(folder: Path, count: int | None, results: dict[str, dict[str, Any]]) -> bool:
+    """Write the shards with all that was recorded, if they are wanted and there is a complete run."""
+    from gaussian_swaying.sweeps.shards import write_shards
+
+    complete = [name for name, result in results.items() if result["status"] == "complete"]
+    if count is None or not complete:
+        return False
+    place = folder / "runs" / complete[0]
+    write_shards(folder, count, frames=(place / "frames").is_dir(), positions=(place / "trajectory.npz").exists())
+    return True

@@ -35,6 +35,7 @@ from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.quiet import silence_advertisements, silence_warnings
 from gaussian_swaying.training.run_folder import RunFolder
+from gaussian_swaying.training.strategy import SplatParallel
 
 TRAINER_DEFAULTS: dict[str, Any] = {
     "max_steps": 60_000,
@@ -103,6 +104,10 @@ class TrainCLI(LightningCLI):
         plugins = list(plugins) if isinstance(plugins, (list, tuple)) else [plugins]
         if not any(isinstance(plugin, CheckpointIO) for plugin in plugins):
             kwargs["plugins"] = [*plugins, SealedCheckpoints()]
+        if settings.get("devices") not in (None, 1, "1") or settings.get("num_nodes") not in (None, 1):
+            if settings.get("strategy") in (None, "auto", "ddp"):
+                kwargs["strategy"] = SplatParallel()
+            kwargs["use_distributed_sampler"] = False  # the data know which images are whose
         return super().instantiate_trainer(**kwargs)
 
     def _save_config(self, folder: Path) -> None:
@@ -125,8 +130,8 @@ class TrainCLI(LightningCLI):
         """Also write a checkpoint after the last image, if ``every_n_train_steps`` does not divide their number."""
         if not self.run_folder.begun:
             raise ValueError(
-                f"The run has already trained on {self.trainer.global_step} images, and `trainer.max_steps` is "
-                f"{self.trainer.max_steps}: raise it."
+                f"The run has already trained on {self.trainer.global_step * self.trainer.world_size} images, and "
+                f"`trainer.max_steps` is {self.trainer.max_steps * self.trainer.world_size}: raise it."
             )
         try:
             checkpoint = self._get(self.config_init, "checkpoint")
@@ -225,6 +230,8 @@ def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
             raise
         raise (stop.__context__ if isinstance(stop.__context__, KeyboardInterrupt) else KeyboardInterrupt()) from None
     run_folder.release()
+    if not cli.trainer.is_global_zero:
+        return 130 if cli.trainer.interrupted else 0
     made = ("point_cloud.ply", "panels", "checkpoints", "csv", "tensorboard") if cli.subcommand == "fit" else ("csv",)
     for name in made:
         path = cli.model.folder / name

@@ -203,6 +203,13 @@ class MaterialPoints:
         position = torch.cat([part.position for part in parts], -2)
         return cls(position, **fields, laws=tuple(laws), law_index=torch.cat(index, -1) if len(laws) > 1 else None)
 
+    @classmethod
+    def stack(cls, parts: Sequence[MaterialPoints]) -> MaterialPoints:
+        """Independent scenes with as many points each and the same laws, as one batch of shape (B, P, ·)."""
+        fields = {name: torch.stack([getattr(part, name) for part in parts]) for name in ("position", *_FIELDS)}
+        index = [part.law_index for part in parts if part.law_index is not None]
+        return cls(**fields, laws=parts[0].laws, law_index=torch.stack(index) if index else None)
+
     @property
     def count(self) -> int:
         """Number of points P of one scene."""
@@ -260,6 +267,14 @@ class MPMState:
     def replace(self, **changes: Any) -> MPMState:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+    def scene(self, index: int) -> MPMState:
+        """One scene of a batch; its tensors are views."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        own = {k: v[index] for k, v in fields.items() if isinstance(v, Tensor) and k != "time"}
+        if self.F_total is self.F_elastic:
+            own["F_total"] = own["F_elastic"]
+        return self.replace(**own)
 
     def tensors(self) -> list[Tensor]:
         """The fields that may require a gradient."""

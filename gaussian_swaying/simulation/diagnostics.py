@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -307,6 +308,82 @@ def measure(
         "more": stretch[:0] if more is None else more,
     }
     return Measurement(solver, substeps, parts, [cfl, wind_work])
+
+
+@dataclass(frozen=True)
+class SceneDiagnostics(FrameDiagnostics):
+    """Those of the first scene of a batch; ``make`` makes those of every one when they are asked for."""
+
+    make: Callable[[], tuple[FrameDiagnostics, ...]] = field(default=tuple, repr=False, compare=False)
+
+    @cached_property
+    def each(self) -> tuple[FrameDiagnostics, ...]:
+        """The diagnostics of each scene; substeps and Courant number are those of all."""
+        return self.make()
+
+
+class SceneMeasurement(Measurement):
+    """As :class:`Measurement`, for each scene of a batch."""
+
+    def read(self, check: bool = False) -> SceneDiagnostics:
+        """Wait for the measurements (one GPU synchronisation); see :func:`diagnose`."""
+        found = self._wait()
+        if check:
+            _raise_if_bad(self._solver, found["verdict"], found["time"][0])
+        scenes = int(found["scenes"][0])
+        shared: dict[str, Any] = {"time": found["time"][0], "substeps": self._substeps, "cfl": self.cfl, "torn": 0}
+
+        def one(scene: int) -> dict[str, Any]:
+            row = found["each"][scene::scenes]
+            own: dict[str, Any] = dict(zip(_OF_SCENE, row[: len(_OF_SCENE)], strict=True))
+            own |= {name: int(own[name]) for name in ("lost", *_PARTICLES)}
+            return shared | own | {"support": tuple(zip(*[iter(row[len(_OF_SCENE) :])] * 3, strict=True))}
+
+        return SceneDiagnostics(**one(0), make=lambda: tuple(FrameDiagnostics(**one(k)) for k in range(scenes)))
+
+
+_OF_SCENE = tuple(
+    name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "torn", "support")
+)
+
+
+def measure_scenes(
+    solver: MPMSolver, state: MPMState, substeps: int, cfl: Tensor | float, before: MPMState, more: Tensor | None = None
+) -> SceneMeasurement:
+    """As :func:`measure`, for each scene of a batch of shape (B,); torn particles are not counted."""
+    moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
+    energies, momenta = solver.energies(state), solver.momenta(state)
+    J = determinant(state.F_total)
+    F = state.F_total.double()
+    squares = symmetric_eigenvalues(matmul3(F.mT, F))
+    columns = {
+        **energies,
+        "wind_work": state.work - before.work,
+        **{f"momentum_{axis}": momenta["linear"][..., k] for k, axis in enumerate("xyz")},
+        **{f"angular_momentum_{axis}": momenta["angular"][..., k] for k, axis in enumerate("xyz")},
+        "lost": state.lost.sum(-1),
+        "J_min": J.amin(-1),
+        "J_max": J.amax(-1),
+        "stretch_min": squares[..., -1].amin(-1).clamp(min=0).sqrt(),
+        "stretch_max": squares[..., 0].amax(-1).clamp(min=0).sqrt(),
+        "displacement_mean": moved.mean(-1),
+        "displacement_max": moved.amax(-1),
+        "moved_particle": moved.argmax(-1),
+        "compressed_particle": squares[..., -1].argmin(-1),
+        "stretched_particle": squares[..., 0].argmax(-1),
+    }
+    support = support_force(before, state).flatten(-2)
+    each = [columns[name].double() for name in _OF_SCENE] + list(support.double().unbind(-1))
+    parts = {
+        "time": state.time[None],
+        "each": torch.cat(each),
+        "scenes": torch.full_like(state.time[None], len(moved)),
+        "given": state.time[None][:0] if not isinstance(cfl, Tensor) else cfl.to(state.time).reshape(1),
+        "verdict": _verdict(solver, state, moved),
+        "outran": _outran(before, state),
+        "more": state.time[None][:0] if more is None else more,
+    }
+    return SceneMeasurement(solver, substeps, parts, [cfl])
 
 
 class Gauge:

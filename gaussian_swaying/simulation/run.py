@@ -42,7 +42,7 @@ def run(
     for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
         simulation.painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
     state = simulation.start()  # errors are raised before anything is written
-    splat = _splat(simulation)
+    splat = splat_checksum(simulation)
 
     def check(checkpoint: dict[str, Any]) -> None:
         _check_checkpoint(simulation, checkpoint, state, output, frames, splat)
@@ -59,7 +59,7 @@ def run(
         recorder.release()
 
 
-def _splat(simulation: Simulation) -> str | None:
+def splat_checksum(simulation: Simulation) -> str | None:
     """Checksum of the splat's file, to distinguish it from another file with the same name."""
     path = simulation.scene.source
     return None if path is None else sha256(Path(path))
@@ -112,7 +112,7 @@ def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tupl
         simulation: The simulation.
         log: Diagnostics of its frames.
     """
-    scene, points = simulation.scene, simulation.scene.points
+    scene, points = simulation.scene, simulation.solver.points
     where = scene.frame.point_to_scene(points.position.double().cpu())
     elastic = simulation.solver.laws.elastic_particles()
     size = scene.size * scene.frame.metres_per_unit
@@ -180,21 +180,43 @@ class Run:
                     for sentence in run_health(simulation, self.log[:done])[1]:
                         print(f"warning: {sentence}", file=sys.stderr)
             simulation.progress = None
-            summary: dict[str, Any] = {"status": status, "reason": reason}
-            summary |= self.summary(state, self.log[:done]) | settings
-            if recorder.images and "force" in recorder.renders:
-                summary["force_scale_Pa"] = self.force_end
-            # a run that was stopped early gets its video too, so that nothing recorded is lost
-            simulation.files = []
-            try:
-                with walls("writing"):
-                    simulation.files = recorder.close(done, summary, release=False)
-            except OSError as error:
-                if status == "complete":
-                    raise
-                print(f"{error}", file=sys.stderr)  # the error that stopped the run matters more
+            summary = self.close(status, reason, state, done, settings)
         summary["wall_s"] = walls.read(wait=True)
         recorder.write_summary(summary)
+        return summary
+
+    def close(
+        self, status: str, reason: str | None, state: MPMState, done: int, settings: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Write everything that is left.
+
+        Args:
+            status: ``complete``, or how the run ended.
+            reason: Why, if it is not complete.
+            state: The last state.
+            done: Number of frames.
+            settings: Further entries of the summary.
+
+        Returns:
+            The summary.
+
+        Raises:
+            OSError: If the run is complete and something could not be written.
+        """
+        simulation, recorder = self.simulation, self.recorder
+        summary: dict[str, Any] = {"status": status, "reason": reason}
+        summary |= self.summary(state, self.log[:done]) | settings
+        if recorder.images and "force" in recorder.renders:
+            summary["force_scale_Pa"] = self.force_end
+        # a run that was stopped early gets its video too, so that nothing recorded is lost
+        simulation.files = []
+        try:
+            with self.walls("writing"):
+                simulation.files = recorder.close(done, summary, release=False)
+        except OSError as error:
+            if status == "complete":
+                raise
+            print(f"{error}", file=sys.stderr)  # the error that stopped the run matters more
         return summary
 
     def warm_up(self, state: MPMState, frame: int) -> None:
@@ -230,6 +252,12 @@ class Run:
                     "nodes": None if state.node_displacement is None else len(self.nodes(state.grid)),
                 }
             )
+
+    @property
+    def recording(self) -> bool:
+        """Whether anything is written in a frame."""
+        recorder = self.recorder
+        return recorder.images or recorder.ply_every > 0 or recorder.trajectory or recorder.nodes
 
     def record(self, state: MPMState, frame: int) -> None:
         """Draw, export and record the requested outputs of a frame."""

@@ -1,25 +1,22 @@
-"""Worker processes: each does one run at a time, and one that dies is replaced."""
+"""Worker processes of this machine: each does one job at a time, and one that dies is replaced."""
 
 from __future__ import annotations
 
 import itertools
 import os
 import signal
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection as connections
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any
 
-from gaussian_swaying.sweeps.record import failure, read_result
-from gaussian_swaying.sweeps.worker import Explain, Job, first_line, work
+from gaussian_swaying.sweeps.backend import PACKED, Outcome, lost
+from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.worker import Explain, first_line, work
 
-POLL_S = 1.0
-KILLED = 3  # times as many retries for a run whose process was killed, as the reason may be outside of it
 PATIENCE_S = 300.0  # how long a worker may take to write what it has when the sweep is stopped
 
 
@@ -33,72 +30,88 @@ class _Worker:
     job: Job | None = None
 
 
-def run_jobs(
-    jobs: Sequence[Job],
-    workers: int,
-    threads: int,
-    ended: Callable[[Job, dict[str, Any]], None],
-    retries: int = 1,
-    explain: Explain = first_line,
-    tick: Callable[[int], None] = lambda running: None,
-    gpus: Sequence[str] = (),
-) -> None:
-    """Do runs in worker processes. A failed run is tried again; one that fails too often never stops the rest.
-
-    If this is interrupted (Ctrl-C, or an exception of a callback), the workers end their runs in order, at a frame.
+class Pool:
+    """A :class:`~gaussian_swaying.sweeps.backend.Backend` of processes, which are started when they are needed.
 
     Args:
-        jobs: The runs.
         workers: Processes at a time.
         threads: Threads of torch in each.
-        ended: Called with each run and its result, in the order in which they end.
-        retries: How often a failed run is tried again; three times as often if its process was killed.
         explain: Makes a sentence of an error; a function of a module, as it is called in the workers.
-        tick: Called about once a second with the number of runs that are being done.
         gpus: The GPUs as in ``CUDA_VISIBLE_DEVICES``; the workers take them in turn.
+        most: Processes at a time once the memory of a job on a GPU is known; ``workers`` if None.
     """
-    waiting, pool = deque(jobs), list[_Worker]()
-    try:
-        while waiting or any(worker.job for worker in pool):
-            running = sum(worker.job is not None for worker in pool)
-            for worker in _hire(pool, min(workers, running + len(waiting)), threads, explain, gpus):
-                if waiting:
-                    _give(worker, waiting.popleft())
-            busy = [worker for worker in pool if worker.job is not None]
-            ready = connections.wait([worker.connection for worker in busy], POLL_S)
-            for worker in (worker for worker in busy if worker.connection in ready):
-                job, worker.job = worker.job, None
-                assert job is not None
-                result, after = _receive(worker, job)
-                if after != "ready":
-                    _dismiss(worker)
-                    pool.remove(worker)
-                limit = retries * (KILLED if after == "killed" else 1)
-                if result["status"] != "complete" and job.attempt <= limit:
-                    # from the checkpoint, unless that has been tried
-                    waiting.append(job.again(resume=after == "killed" or job.attempt == 1))
-                    continue
-                ended(job, result)
-            tick(sum(worker.job is not None for worker in pool))
-    except BaseException:
-        _stop(pool)
-        raise
-    for worker in pool:
-        _dismiss(worker)
 
+    def __init__(
+        self,
+        workers: int,
+        threads: int,
+        explain: Explain = first_line,
+        gpus: Sequence[str] = (),
+        most: int | None = None,
+    ) -> None:
+        self.workers, self.threads, self.explain, self.gpus, self.most = workers, threads, explain, gpus, most
+        self._workers: list[_Worker] = []
+        self._share = 0.0
 
-def _hire(pool: list[_Worker], count: int, threads: int, explain: Explain, gpus: Sequence[str]) -> list[_Worker]:
-    """The workers without a job, after starting those that are missing."""
-    context = get_context("spawn")  # a fork would copy the threads and the GPU of this process
-    while len(pool) < count:
-        place = next(place for place in itertools.count() if place not in {worker.place for worker in pool})
+    def free(self) -> bool:
+        """See ``Backend.free``."""
+        return sum(worker.job is not None for worker in self._workers) < self.workers
+
+    def submit(self, job: Job) -> None:
+        """See ``Backend.submit``."""
+        idle = next((worker for worker in self._workers if worker.job is None), None) or self._hire()
+        idle.job = job
+        with suppress(OSError):  # it was killed while it had nothing to do; `_receive` notices
+            idle.connection.send(job)
+
+    def wait(self, seconds: float) -> list[tuple[Job, Outcome]]:
+        """See ``Backend.wait``."""
+        busy = [worker for worker in self._workers if worker.job is not None]
+        ready = connections.wait([worker.connection for worker in busy], seconds)
+        found = []
+        for worker in (worker for worker in busy if worker.connection in ready):
+            job, worker.job = worker.job, None
+            assert job is not None
+            outcome, again = _receive(worker, job)
+            if not again:
+                _dismiss(worker)
+                self._workers.remove(worker)
+            found.append((job, outcome))
+        return found
+
+    def pack(self, share: float) -> None:
+        """See ``Backend.pack``: as many processes to a GPU as its memory holds, by the largest job so far."""
+        if self.most is not None and self.gpus and share > self._share:
+            self._share = share
+            self.workers = min(self.most, len(self.gpus) * max(1, int(PACKED / share)))
+
+    def close(self) -> None:
+        """See ``Backend.close``."""
+        for worker in self._workers:
+            _dismiss(worker)
+
+    def stop(self) -> None:
+        """Let all workers end their runs at a frame; an impatient second Ctrl-C kills them."""
+        try:
+            for worker in self._workers:
+                worker.process.terminate()
+            for worker in self._workers:
+                worker.process.join(PATIENCE_S)
+        finally:
+            for worker in self._workers:
+                worker.process.kill()
+
+    def _hire(self) -> _Worker:
+        context = get_context("spawn")  # a fork would copy the threads and the GPU of this process
+        taken = {worker.place for worker in self._workers}
+        place = next(place for place in itertools.count() if place not in taken)
         ours, theirs = context.Pipe()
-        process = context.Process(target=work, args=(theirs, threads, explain), daemon=True)
-        with _environment(**variables(place, threads, gpus)), _without_ctrl_c():
+        process = context.Process(target=work, args=(theirs, self.threads, self.explain), daemon=True)
+        with _environment(**variables(place, self.threads, self.gpus)), _without_ctrl_c():
             process.start()
         theirs.close()  # so that the end of the worker closes the connection
-        pool.append(_Worker(process, ours, place))
-    return [worker for worker in pool if worker.job is None]
+        self._workers.append(_Worker(process, ours, place))
+        return self._workers[-1]
 
 
 @contextmanager
@@ -121,7 +134,7 @@ def variables(place: int, threads: int, gpus: Sequence[str]) -> dict[str, str]:
     Args:
         place: Its number among the workers that run at the same time.
         threads: Its threads.
-        gpus: As in :func:`run_jobs`.
+        gpus: As in :class:`Pool`.
 
     Example:
         >>> [variables(place, 2, ["0", "3"])["CUDA_VISIBLE_DEVICES"] for place in range(3)]
@@ -146,23 +159,14 @@ def _environment(**values: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _give(worker: _Worker, job: Job) -> None:
-    worker.job = job
-    with suppress(OSError):  # it was killed while it had nothing to do; `_receive` notices
-        worker.connection.send(job)
-
-
-def _receive(worker: _Worker, job: Job) -> tuple[dict[str, Any], str]:
-    """The result of a run, and what the worker is then: ``ready``, ``ending`` or ``killed``."""
+def _receive(worker: _Worker, job: Job) -> tuple[Outcome, bool]:
+    """How a job ended, and whether the worker can do another one."""
     try:
-        result, ready = worker.connection.recv()
-        return result, "ready" if ready else "ending"
+        done = worker.connection.recv()
+        return Outcome(done.results, share=done.share), done.ready
     except (EOFError, OSError):
         worker.process.join(PATIENCE_S)
-        written = read_result(job.folder, job.name)
-        if written is not None and written["status"] == "complete":  # it was killed after its last step
-            return written, "killed"
-        return failure("failed", _how_it_ended(worker.process.exitcode), job.attempt), "killed"
+        return lost(job, _how_it_ended(worker.process.exitcode)), False
 
 
 def _how_it_ended(code: int | None) -> str:
@@ -187,16 +191,4 @@ def _dismiss(worker: _Worker) -> None:
         worker.process.join()
 
 
-def _stop(pool: list[_Worker]) -> None:
-    """Let all workers end their runs at a frame; an impatient second Ctrl-C kills them."""
-    try:
-        for worker in pool:
-            worker.process.terminate()
-        for worker in pool:
-            worker.process.join(PATIENCE_S)
-    finally:
-        for worker in pool:
-            worker.process.kill()
-
-
-__all__ = ["run_jobs", "variables"]
+__all__ = ["Pool", "variables"]

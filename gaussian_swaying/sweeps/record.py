@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gaussian_swaying._files import remove_temporaries, write_json, write_table
+from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.runs.folder import hold_folder
 from gaussian_swaying.runs.lock import FolderLock
@@ -20,8 +21,9 @@ from gaussian_swaying.simulation.recording.checkpoint import first_change
 from gaussian_swaying.sweeps.plan import Plan
 
 SWEEP, TABLE, TIMES = "sweep.json", "sweep.csv", "times.csv"
-RUNS, RESULTS, LOGS = "runs", "results", "logs"
-OURS = (SWEEP, TABLE, TIMES, RUNS, RESULTS, LOGS)
+PARQUET = "sweep.parquet"
+RUNS, RESULTS, LOGS, SHARES = "runs", "results", "logs", "parts"
+OURS = (SWEEP, TABLE, TIMES, PARQUET, RUNS, RESULTS, LOGS)
 
 FIGURES = (
     "frames",
@@ -46,13 +48,18 @@ SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 """Columns of the table after the axes."""
 
 
-def open_folder(folder: Path, plan: Plan, resume: bool) -> FolderLock:
+def open_folder(
+    folder: Path, plan: Plan, resume: bool, together: int = 1, part: tuple[int, int] | None = None
+) -> FolderLock:
     """Make and lock the folder of a sweep, or lock the one that is continued.
 
     Args:
         folder: The folder.
         plan: The sweep.
         resume: Whether to continue the sweep in it.
+        together: Largest number of runs that are simulated together, on which the results depend.
+        part: Number of a part and how many there are. Other processes do the others in the same folder: only the part
+            is locked then, and it does not matter whether the sweep has begun.
 
     Returns:
         The lock, to be released at the end.
@@ -61,38 +68,51 @@ def open_folder(folder: Path, plan: Plan, resume: bool) -> FolderLock:
         FolderLocked: If another sweep writes there.
         ValueError: If the folder cannot be written, holds something else, or a sweep with other settings.
     """
+    foreign = [name for name in OURS if os.path.lexists(folder / name)]  # before `held`, as another part may begin
     held = (folder / SWEEP).exists()
-    if resume and not held:
+    if resume and not held and part is None:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
-    if held and not resume:
+    if held and not resume and part is None:
         raise ValueError(
             f"{folder} holds a sweep already: add --resume to do what is missing in it, or choose another --output."
         )
-    foreign = [name for name in OURS if os.path.lexists(folder / name)]
     if foreign and not held:
         raise ValueError(
             f"The output folder {folder} contains {', '.join(foreign)} of something else: choose another --output."
         )
-    new = _described(plan)
+    new = _described(plan) | ({"together": together} if together > 1 else {})
     if held:
         _check_same(folder, new)
+    own = folder if part is None else folder / SHARES / f"{part[0]}of{part[1]}"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        own.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(
             f"The output folder {folder} cannot be written ({error.strerror or error}): choose another with --output."
         ) from error
-    lock = hold_folder(folder, "choose another with --output")
+    lock = hold_folder(own, "choose another with --output" if part is None else "wait for that part")
     try:
+        remove_temporaries(own)  # of a sweep that was killed while writing
         if not held:
-            write_json(folder / SWEEP, new)
-        remove_temporaries(folder)  # of a sweep that was killed while writing
+            _begin(folder, own, new)
         for name in (RUNS, RESULTS, LOGS):
             (folder / name).mkdir(exist_ok=True)
     except BaseException:
         lock.release()
         raise
     return lock
+
+
+def _begin(folder: Path, own: Path, new: dict[str, Any]) -> None:
+    """Write ``sweep.json``; of several parts that begin at the same moment, the first one does."""
+    write_json(own / SWEEP, new)
+    if own != folder:
+        try:
+            os.link(own / SWEEP, folder / SWEEP)
+        except FileExistsError:
+            _check_same(folder, new)
+        except OSError:  # a file system without links
+            os.replace(own / SWEEP, folder / SWEEP)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -161,12 +181,13 @@ def read_result(folder: Path, name: str) -> dict[str, Any] | None:
     raise ValueError(f"{path} is damaged ({why}): remove it, and --resume does its run again.")
 
 
-def result_of(summary: Mapping[str, Any], attempt: int) -> dict[str, Any]:
+def result_of(summary: Mapping[str, Any], attempt: int, where: str = "") -> dict[str, Any]:
     """The result of a complete run.
 
     Args:
         summary: Its summary, as in ``summary.json``.
         attempt: How often it was begun in this sweep.
+        where: The machine that did it.
     """
     figures = {name: summary.get(name) for name in FIGURES}
     end = summary.get("energy_end_J") or {}
@@ -177,6 +198,7 @@ def result_of(summary: Mapping[str, Any], attempt: int) -> dict[str, Any]:
         "reason": None,
         "figures": figures,
         "attempts": attempt,
+        "where": where,
         "wall_s": summary.get("wall_s"),
         "peak_memory_bytes": summary.get("peak_memory_bytes"),
     }
@@ -215,15 +237,68 @@ def write_tables(
         row |= {axis: _cell(value) for axis, value in run.items()}
         table.append(row | {column: _cell(figures.get(column)) for column in SUMMARY})
         walls, peak = result.get("wall_s") or {}, result.get("peak_memory_bytes") or {}
-        clock = {"run": name, "attempts": result.get("attempts")}
+        clock = {"run": name, "attempts": result.get("attempts"), "where": result.get("where")}
         clock |= {f"{part}_s": walls.get(part) for part in PARTS}
         times.append(clock | {f"{where}_bytes": peak.get(where) for where in ("host", "device")})
     write_table(folder / TABLE, table)
     write_table(folder / TIMES, times)
 
 
+def check_parquet() -> None:
+    """Raise ValueError if pyarrow is missing."""
+    if find_spec("pyarrow") is None:
+        raise ValueError("`--parquet` needs pyarrow: install gaussian-swaying[parquet], or use sweep.csv.")
+
+
+def write_parquet(
+    folder: Path, names: Sequence[str], runs: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
+) -> None:
+    """Write ``sweep.parquet``: the rows and columns of ``sweep.csv``, with numbers and lists of numbers as such.
+
+    Args:
+        folder: Folder of the sweep.
+        names: Names of the runs.
+        runs: The value of every axis in each run.
+        results: Result of each run that has one, by name.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    found = [results.get(name) or {"status": "missing"} for name in names]
+    columns: dict[str, list[Any]] = {"run": list(names)}
+    columns |= {name: [result.get(name) for result in found] for name in ("status", "reason")}
+    columns |= {axis: _typed([run[axis] for run in runs]) for axis in runs[0]}
+    columns |= {name: _typed([(result.get("figures") or {}).get(name) for result in found]) for name in SUMMARY}
+    text = pyarrow.schema([(name, pyarrow.string()) for name in ("status", "reason")])
+    kinds = {name: text.field(name).type for name in text.names}
+    arrays = {name: pyarrow.array(values, kinds.get(name)) for name, values in columns.items()}
+    with atomic(folder / PARQUET) as temporary:
+        pyarrow.parquet.write_table(pyarrow.table(arrays), temporary)
+
+
+def _typed(values: list[Any]) -> list[Any]:
+    """Values of one type: whole numbers, numbers, lists of numbers, or else text."""
+    given = [value for value in values if value is not None]
+    if all(type(value) is int for value in given):
+        return values
+    if all(type(value) in (int, float) for value in given):
+        return [None if value is None else float(value) for value in values]
+    if all(isinstance(v, list) and all(type(x) in (int, float) for x in v) for v in given):
+        return [None if value is None else [float(x) for x in value] for value in values]
+    return [_cell(value) for value in values]
+
+
 def _cell(value: Any) -> Any:
     return value if value is None or isinstance(value, str) else json.dumps(value)
 
 
-__all__ = ["failure", "open_folder", "read_record", "read_result", "result_of", "write_tables"]
+__all__ = [
+    "check_parquet",
+    "failure",
+    "open_folder",
+    "read_record",
+    "read_result",
+    "result_of",
+    "write_parquet",
+    "write_tables",
+]

@@ -1,21 +1,20 @@
-"""A worker: a process that does one run after the other, and ends with the process that started it."""
+"""A worker: a process that does one job after the other, and ends with the process that started it."""
 
 from __future__ import annotations
 
 import gc
 import io
 import os
+import platform
 import signal
 import threading
-import time
 import traceback
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import connection as connections
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -25,44 +24,34 @@ from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.sweeps.job import Job, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import LOGS, RUNS, failure, result_file, result_of
+from gaussian_swaying.sweeps.together import run_together
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
 
-LOCKED_S = 60.0  # how long to wait for a folder: the worker of a driver that was killed ends at its frame
+CONTEXT_BYTES = 700 << 20  # what CUDA, its libraries and the compiled kernels take besides torch's allocator
+WHERE = "GAUSSIAN_SWAYING_WHERE"
+"""Variable of the environment with a name for the place of a worker; the host if it is not set."""
 
 Explain = Callable[[BaseException], str]
 
 
 @dataclass(frozen=True)
-class Job:
-    """A run to do.
+class Done:
+    """What a worker has done.
 
-    Args:
-        folder: Folder of the sweep.
-        name: Name of the run.
-        config: What all runs share, as YAML.
-        frames: Frames.
-        run: The value of every axis.
-        device: Where to simulate.
-        attempt: 1 for the first time.
-        resume: Continue from the checkpoint of an earlier attempt, if there is one.
+    Attributes:
+        results: The result of each run, by name.
+        ready: Whether the process can do another job. It should not after lack of memory, a bug or a signal.
+        share: Share of the memory of the GPU that the process took; None on a CPU.
     """
 
-    folder: Path
-    name: str
-    config: str
-    frames: int
-    run: dict[str, Any]
-    device: str = "auto"
-    attempt: int = 1
-    resume: bool = True
-
-    def again(self, resume: bool) -> Job:
-        """The next attempt."""
-        return replace(self, attempt=self.attempt + 1, resume=resume)
+    results: dict[str, dict[str, Any]]
+    ready: bool
+    share: float | None = None
 
 
 def first_line(error: BaseException) -> str:
@@ -85,9 +74,9 @@ def work(connection: Connection, threads: int, explain: Explain = first_line) ->
     with suppress(KeyboardInterrupt, EOFError, OSError), stop_signals():
         parser = Simulation.parser()
         while True:
-            result, ready = do(connection.recv(), parser, explain)
-            connection.send((result, ready))
-            if not ready:
+            done = do(connection.recv(), parser, explain)
+            connection.send(done)
+            if not done.ready:
                 return
             gc.collect()
 
@@ -99,59 +88,75 @@ def _end_with_parent() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def do(job: Job, parser: ArgumentParser, explain: Explain) -> tuple[dict[str, Any], bool]:
-    """Do a run and write its result, if it is complete.
+def do(job: Job, parser: ArgumentParser, explain: Explain) -> Done:
+    """Do a job and write the results of its complete runs.
 
     Args:
-        job: The run.
+        job: The job.
         parser: From :meth:`Simulation.parser`.
         explain: Makes a sentence of an error.
 
     Returns:
-        Its result, which is not written yet if it is a failure; and whether this process can do another run. It should
-        not after lack of memory, a bug or a signal.
+        The results; those of failures are not written yet.
     """
     told = io.StringIO()
     try:
         with redirect_stdout(told), redirect_stderr(told):
-            result = result_of(_run(job, parser), job.attempt)
-            write_json(result_file(job.folder, job.name), result)
-        return result, True
+            summaries = _run(job, parser) if len(job.names) == 1 else run_together(job, parser)
+            results = {name: result_of(summary, job.attempt, _where()) for name, summary in summaries.items()}
+            for name, result in results.items():
+                write_json(result_file(job.folder, name), result)
+        return Done(results, True, _share())
     except KeyboardInterrupt as stop:
-        return failure("failed", f"It was stopped ({stop or 'Ctrl-C'}).", job.attempt), False
+        return _failed(job, "failed", f"It was stopped ({stop or 'Ctrl-C'}).", False)
     except SimulationDiverged as error:
-        return failure("diverged", first_line(error), job.attempt), True
+        return _failed(job, "diverged", first_line(error), True)
     except Exception as error:
         told.write(traceback.format_exc())
-        return failure("failed", explain(error), job.attempt), isinstance(error, ValueError)
+        return _failed(job, "failed", explain(error), isinstance(error, ValueError))
     finally:
         with suppress(OSError):
             if told.getvalue():
-                with (job.folder / LOGS / f"{job.name}.txt").open("a", encoding="utf-8") as file:
+                with (job.folder / LOGS / f"{job.names[0]}.txt").open("a", encoding="utf-8") as file:
                     file.write(told.getvalue())
 
 
-def _run(job: Job, parser: ArgumentParser) -> dict[str, Any]:
-    settings = parse_run(parser, job.config, job.frames, job.run)
+def _failed(job: Job, status: str, reason: str, ready: bool) -> Done:
+    return Done({name: failure(status, reason, job.attempt) for name in job.wanted}, ready)
+
+
+def _where() -> str:
+    """This machine, as the table of times names it."""
+    return os.environ.get(WHERE) or platform.node()
+
+
+def _share() -> float | None:
+    """Share of the GPU's memory that this process has taken, with what CUDA itself needs."""
+    if not torch.cuda.is_initialized():
+        return None
+    return (torch.cuda.max_memory_reserved() + CONTEXT_BYTES) / torch.cuda.get_device_properties(0).total_memory
+
+
+def _run(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
+    """Do the only run of a job; its summary by its name."""
+    (name,), (run,) = job.names, job.runs
+    settings = parse_run(parser, job.config, job.frames, run)
     settings.device = job.device
-    folder = job.folder / RUNS / job.name
-    extra = {"sweep": {"run": job.name, "settings": job.run}}
+    folder = job.folder / RUNS / name
+    extra = {"sweep": {"run": name, "settings": run}}
     simulation = Simulation.from_settings(parser, settings)
-    begin = time.monotonic()
-    while True:
-        try:
-            if job.resume and (folder / "checkpoint.pt").exists():
-                try:
-                    return simulation.run(folder, settings.frames, True, extra, progress=False)
-                except FolderLocked:
-                    raise
-                except ValueError as error:  # it was killed after the last frame, or a file is damaged
-                    print(f"{error} The run starts again.")
-            return simulation.run(folder, settings.frames, False, extra, progress=False)
-        except FolderLocked:
-            if time.monotonic() - begin > LOCKED_S:
+
+    def once() -> dict[str, Any]:
+        if job.resume and (folder / "checkpoint.pt").exists():
+            try:
+                return simulation.run(folder, settings.frames, True, extra, progress=False)
+            except FolderLocked:
                 raise
-            time.sleep(0.5)
+            except ValueError as error:  # it was killed after the last frame, or a file is damaged
+                print(f"{error} The run starts again.")
+        return simulation.run(folder, settings.frames, False, extra, progress=False)
+
+    return {name: unlocked(once)}
 
 
-__all__ = ["Explain", "Job", "do", "first_line", "work"]
+__all__ = ["Done", "Explain", "do", "first_line", "work"]

@@ -11,10 +11,13 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from gaussian_swaying._files import kind_of
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.runs.seal import check_seal, save_sealed
 from gaussian_swaying.training.densification import PARAMETERS
 
 _FIELDS = {"densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen"}
+
+_CLOCK_STEP = 20_000_000  # [ns] by which file times may lag behind the clock
 
 
 def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str, Any]:
@@ -51,6 +54,47 @@ def _check_parameters(state: dict[str, Any]) -> None:
             raise ValueError(f"its `{name}` are not those of {len(found[0])} Gaussians")
         if not bool(torch.isfinite(value).all()):
             raise ValueError(f"its `{name}` are NaN or infinite")
+
+
+def check_settings(stored: dict[str, Any], sh_degree: int, devices: int | None) -> None:
+    """Raise ValueError if a checkpoint belongs to other settings.
+
+    Args:
+        stored: Its entry ``splat_training``.
+        sh_degree: Degree of the spherical harmonics.
+        devices: Number of devices that train on; None if nothing is trained.
+    """
+    if stored["sh_degree"] != sh_degree:
+        raise ValueError(
+            f"The checkpoint was trained with `sh_degree` {stored['sh_degree']}, but the configuration says "
+            f"{sh_degree}: use the same."
+        )
+    known = stored.get("devices", 1)
+    if devices not in (None, known):
+        raise ValueError(
+            f"The checkpoint was trained on {known} devices, but there are {devices}: use `trainer.devices: {known}`."
+        )
+
+
+def stored_gaussians(state: dict[str, Tensor]) -> GaussianCloud:
+    """The Gaussians in the entry ``state_dict`` of a checkpoint."""
+    means, scales, quats, opacities, sh0, rest = (state[f"model.{name}"] for name in PARAMETERS)
+    return GaussianCloud(means, quats, scales, opacities, torch.cat([sh0, rest], 1))
+
+
+def newest_checkpoint(trainer: Any, begun: int) -> str | None:
+    """The newest checkpoint of a run, or the one that it resumes; None if there is none.
+
+    Args:
+        trainer: The trainer of the run.
+        begun: Time at which the run began [ns].
+    """
+    folders = [getattr(callback, "dirpath", None) for callback in trainer.checkpoint_callbacks]
+    files = [file for folder in folders if folder for file in Path(folder).glob("*.ckpt")]
+    files = [file for file in files if file.stat().st_mtime_ns >= begun - _CLOCK_STEP]
+    if files:
+        return str(max(files, key=lambda file: file.stat().st_mtime_ns))
+    return None if trainer.ckpt_path is None else str(trainer.ckpt_path)
 
 
 class SealedCheckpoints(TorchCheckpointIO):

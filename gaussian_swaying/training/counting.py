@@ -13,6 +13,8 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+from gaussian_swaying.training.parallel import steps_of
+
 _INNER_HOOKS = ("on_before_backward", "on_after_backward", "on_before_optimizer_step", "on_before_zero_grad")
 
 
@@ -20,12 +22,13 @@ def images_until_hooks(trainer: Trainer, every: int) -> int:
     """How many images to train on before Lightning's hooks are called.
 
     Hooks come at multiples of ``every``, and wherever Lightning has something to do: the last image, a checkpoint, a
-    validation, the end of an epoch.
+    validation, the end of an epoch. On several devices each trains on so many images, and all call the hooks together.
 
     Args:
         trainer: The trainer, at the start of a step.
-        every: Most images between two calls.
+        every: Most images between two calls, of all devices together (rounded up).
     """
+    every = steps_of(every, trainer.world_size)
     seen = trainer.global_step
     ends = [every - seen % every]
     if trainer.max_steps > 0:

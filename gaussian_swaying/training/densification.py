@@ -15,9 +15,14 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.subdivision import split_large
 from gaussian_swaying.rendering.protocol import ScreenGaussians
+from gaussian_swaying.training.parallel import steps_of, sum_over_devices, this_device
 
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN")
 """Parameters of a :class:`GaussianSurfaceModel`; training uses one optimiser for each."""
+
+_SUMS = ("grad2d", "count")  # of gsplat's state, over the images since the last change
+
+_IN_IMAGES = ("refine_start_iter", "refine_stop_iter", "refine_every", "reset_every", "pause_refine_after_reset")
 
 
 def _check_steps(**values: int) -> None:
@@ -42,13 +47,18 @@ class Densification(ABC):
         self._strategy: Any = None
         self._state: dict[str, Any] = {}
         self._restored: dict[str, Any] | None = None
+        self.devices = 1
 
     @abstractmethod
     def make_strategy(self, device: torch.device) -> Any:
         """The strategy of gsplat for parameters on a device; ValueError if it does not run there."""
 
     def attach(
-        self, model: GaussianSurfaceModel, optimizers: Mapping[str, torch.optim.Optimizer], scene_scale: float
+        self,
+        model: GaussianSurfaceModel,
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        scene_scale: float,
+        devices: int = 1,
     ) -> None:
         """Use a model and its optimisers from now on.
 
@@ -56,6 +66,8 @@ class Densification(ABC):
             model: The model; its parameters are replaced when the number of Gaussians changes.
             optimizers: One for each of :data:`PARAMETERS`, with only that parameter.
             scene_scale: Extent of the scene [scene units]; size thresholds are shares of it.
+            devices: Number of devices that train together. A step takes so many images; the numbers of steps that the
+                densification was given count images.
 
         Raises:
             ValueError: If an optimiser is missing or has another parameter, ``scene_scale`` is not positive, or the
@@ -67,13 +79,15 @@ class Densification(ABC):
             held = [id(item) for group in groups for item in group["params"]]
             if held != [id(getattr(model, name))]:
                 raise ValueError(f"Expected an optimiser with only `{name}` for the densification.")
-        device = model.means.device
+        device, self.devices = model.means.device, devices
         self._strategy = self.make_strategy(device)
         self._model, self._optimizers = model, {name: optimizers[name] for name in PARAMETERS}
         self._state = self._initial_state(scene_scale)
         if self._restored is not None:
             moved = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in self._restored.items()}
             self._state |= moved
+            if this_device()[0] > 0:  # the first device goes on with the sums of all
+                self._state |= {name: torch.zeros_like(moved[name]) for name in _SUMS if moved.get(name) is not None}
             self._restored = None
 
     def _initial_state(self, scene_scale: float) -> dict[str, Any]:
@@ -98,8 +112,14 @@ class Densification(ABC):
         """Run the strategy; it puts new parameters into the dictionary."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything accumulated by the strategy since it last changed the Gaussians."""
-        return dict(self._state)
+        """Everything accumulated by the strategy since it last changed the Gaussians, on all devices."""
+        sums = {name: self._state[name].clone() for name in _SUMS if self._state.get(name) is not None}
+        sum_over_devices(list(sums.values()))
+        return self._state | sums
+
+    def _in_steps(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Options whose numbers of images became numbers of steps."""
+        return {k: steps_of(v, self.devices) if k in _IN_IMAGES else v for k, v in options.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Use a state when a model is attached next."""
@@ -209,28 +229,29 @@ class DefaultDensification(Densification):
         }
 
     def make_strategy(self, device: torch.device) -> Any:
-        """``gsplat.DefaultStrategy`` with these options."""
+        """``gsplat.DefaultStrategy`` with these options; on several devices with the gradients of all."""
         if self.absgrad and device.type != "cuda":
             raise ValueError("`densification.absgrad` needs CUDA: leave it off on a CPU.")
-        return _default_strategy()(**self._options)
+        return _default_strategy()(**self._in_steps(self._options))
 
     def _initial_state(self, scene_scale: float) -> dict[str, Any]:
         return dict(self._strategy.initialize_state(scene_scale=scene_scale))
 
     def before_backward(self, step: int, screen: ScreenGaussians) -> None:
         """Keep the gradient of the centres on the screen."""
-        if step < self.stop:
+        if step < steps_of(self.stop, self.devices):
             super().before_backward(step, screen)
 
     def after_step(self, step: int, screen: ScreenGaussians) -> None:
         """See :meth:`Densification.after_step`."""
-        if step == self.split_at:
+        split_at = None if self.split_at is None else steps_of(self.split_at, self.devices)
+        if step == split_at:
             self._split_large()
-        if self.split_at is not None and step >= self.split_at:  # or they would grow again
+        if split_at is not None and step >= split_at:  # or they would grow again
             assert self._model is not None, "attach comes first"
             with torch.no_grad():
                 self._model.scales.clamp_(max=math.log(self.split_size))
-        if step >= self.stop:
+        if step >= steps_of(self.stop, self.devices):
             return
         if screen.means2d.grad is None:  # nothing was drawn
             screen.means2d.grad = torch.zeros_like(screen.means2d)
@@ -261,7 +282,7 @@ class DefaultDensification(Densification):
         self._strategy.step_post_backward(
             parameters, self._optimizers, self._state, step, screen.info(), packed=screen.index is not None
         )
-        if self.reset_opacity and step > 0 and step % self.reset_every == 0:
+        if self.reset_opacity and step > 0 and step % steps_of(self.reset_every, self.devices) == 0:
             from gsplat.strategy.ops import reset_opa
 
             reset_opa(parameters, self._optimizers, self._state, value=2.0 * self.prune_opacity)
@@ -269,10 +290,18 @@ class DefaultDensification(Densification):
 
 @cache
 def _default_strategy() -> type:
-    """The ``DefaultStrategy`` of gsplat, without the waits for the GPU in its sums of gradients."""
+    """The ``DefaultStrategy`` of gsplat, without the waits for the GPU in its sums of gradients.
+
+    On several devices each sums over its own images; they decide by the sums over all, which are the same on all.
+    """
     from gsplat import DefaultStrategy
 
     class Strategy(DefaultStrategy):
+        def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
+            sum_over_devices([state[name] for name in _SUMS])
+            grown: tuple[int, int] = super()._grow_gs(params, optimizers, state, step)
+            return grown
+
         def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
             if packed or state["grad2d"] is None or self.refine_scale2d_stop_iter > 0:
                 super()._update_state(params, state, info, packed)
@@ -344,7 +373,7 @@ class MCMCDensification(Densification):
             )
         from gsplat import MCMCStrategy
 
-        return MCMCStrategy(**self._options)
+        return MCMCStrategy(**self._in_steps(self._options))
 
     def before_backward(self, step: int, screen: ScreenGaussians) -> None:
         """Nothing to prepare: gradients on the screen are not used."""

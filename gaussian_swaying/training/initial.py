@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -66,10 +67,14 @@ def gaussians_from_points(
 
 
 def gaussians_from_file(path: str | os.PathLike[str], sh_degree: int) -> GaussianCloud:
-    """The Gaussians of a splat, with harmonics of this degree: higher ones are left out, missing ones are zero."""
+    """The Gaussians of a splat, with harmonics of this degree: higher ones are left out, missing ones are zero.
+
+    Args:
+        path: A file that :func:`~gaussian_swaying.gaussians.compact.read_gaussians` reads.
+        sh_degree: The degree, 0 to 3.
+    """
     cloud = read_gaussians(path)
     wanted = (sh_degree + 1) ** 2
     sh = cloud.sh[:, :wanted]
     missing = sh.new_zeros(len(cloud), wanted - sh.shape[1], 3)
-    sh = torch.cat([sh, missing], dim=1)
-    return GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh, cloud.normals)
+    return replace(cloud, sh=torch.cat([sh, missing], 1))

@@ -17,12 +17,12 @@ from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
-from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
+from gaussian_swaying.training.checkpoints import check_settings, newest_checkpoint, stored_gaussians
 from gaussian_swaying.training.counting import count_further_image, images_until_hooks, inner_hooks_used, number_batch
 from gaussian_swaying.training.data.datamodule import TrainingImage
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
@@ -31,20 +31,21 @@ from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
 from gaussian_swaying.training.optimizers import OPTIMIZERS, make_optimizer, step_all
 from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
-from gaussian_swaying.training.random_stream import random_stream
+from gaussian_swaying.training.parallel import check_alike, seen_by_any, share_gradients, steps_of
+from gaussian_swaying.training.random_stream import mixed_seed, random_stream
 from gaussian_swaying.training.rates import LearningRates, means_rate
+from gaussian_swaying.training.strategy import count_steps
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
-
-_CLOCK_STEP = 20_000_000  # [ns] by which file times may lag behind the clock
 
 
 class SplatTrainer(lightning.LightningModule):
     """Trains a :class:`~gaussian_swaying.gaussians.model.GaussianSurfaceModel` on photos with known cameras.
 
-    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one.
-    Lightning's callbacks are called after several images, see ``hooks_every``. Random numbers come from a separate
-    stream, which starts from the seed and is stored in checkpoints. So nothing else changes them, and a resumed run
-    continues exactly.
+    A step is one image, also for ``trainer.max_steps``: six optimisers step for it, of which Lightning counts one. On
+    several devices (``trainer.devices``) a step takes one image on each, and everything that is given in steps still
+    counts images, see :mod:`~gaussian_swaying.training.parallel`. Lightning's callbacks are called after several
+    images, see ``hooks_every``. Random numbers come from a separate stream, which starts from the seed and is stored in
+    checkpoints. So nothing else changes them, and a resumed run continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
     the colours of the image are not premultiplied. Losses that compare two views also need the item ``index``, and
@@ -172,18 +173,15 @@ class SplatTrainer(lightning.LightningModule):
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
         """One optimiser for each parameter, in the order of :data:`PARAMETERS`."""
         assert self.scene_scale is not None
-        rates = {name: getattr(self.rates, name) for name in PARAMETERS} | {
-            "means": self.rates.means * self.scene_scale
-        }
-        return [make_optimizer(getattr(self.splat, name), rates[name], self.optimizer) for name in PARAMETERS]
+        rates = vars(self.rates) | {"means": self.rates.means * self.scene_scale}
+        return [
+            make_optimizer(getattr(self.splat, name), rates[name], self.optimizer, self.devices) for name in PARAMETERS
+        ]
 
     def on_fit_start(self) -> None:
         """Refuse settings that would silently train wrongly."""
         self._begun = time.time_ns()
-        if self.trainer.world_size > 1:
-            raise ValueError(
-                f"Expected one device for training, but got {self.trainer.world_size}: use trainer.devices 1."
-            )
+        count_steps(self.trainer)
         if self.trainer.precision not in ("32-true", "32"):
             raise ValueError(
                 f"Expected `trainer.precision` to be 32-true, but got {self.trainer.precision}: splats need float32."
@@ -193,8 +191,14 @@ class SplatTrainer(lightning.LightningModule):
         """Attach the Gaussians and their optimisers to the densification, after a checkpoint has been read."""
         assert self.scene_scale is not None
         optimizers = dict(zip(PARAMETERS, self._raw_optimizers(), strict=True))
-        self.densification.attach(self.splat, optimizers, self.scene_scale)
+        self.densification.attach(self.splat, optimizers, self.scene_scale, self.devices)
+        check_alike([getattr(self.splat, name) for name in PARAMETERS])
         self._inner_hooks = inner_hooks_used(self.trainer, self)
+
+    @property
+    def devices(self) -> int:
+        """Number of devices that train together; a step takes so many images."""
+        return self.trainer.world_size
 
     def _raw_optimizers(self) -> list[torch.optim.Optimizer]:
         found = self.optimizers(use_pl_optimizer=False)
@@ -270,12 +274,14 @@ class SplatTrainer(lightning.LightningModule):
     def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
         optimizers = self._raw_optimizers()
         assert self.scene_scale is not None
-        steps = int(self.trainer.max_steps)
-        optimizers[0].param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps)
+        steps, images = int(self.trainer.max_steps), step * self.devices  # images before this step
+        if self.devices > 1:  # other backgrounds on each device
+            torch.manual_seed(mixed_seed(self.seed, step, 1 + self.global_rank))
+        optimizers[0].param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps, self.devices)
         target, alpha, background = self._target(batch, train=True)
-        needs = self.loss.needs(step)
+        needs = self.loss.needs(images)
         output = self.render(
-            batch["camera"], background, self.active_degree(step), self.densification.absgrad, bool(needs)
+            batch["camera"], background, self.active_degree(images), self.densification.absgrad, bool(needs)
         )
         self._check_pending()  # of the previous step: gsplat has already waited for the GPU
         splat = self.splat
@@ -289,7 +295,7 @@ class SplatTrainer(lightning.LightningModule):
             splat.quats,
             splat.scales,
             splat.opacity(),
-            step,
+            images,
             camera,
             surface,
             self._other_view(batch, background) if "other_view" in needs else None,
@@ -302,9 +308,13 @@ class SplatTrainer(lightning.LightningModule):
             self.manual_backward(loss)
         else:
             loss.backward()
+        mean = loss.detach()
+        if self.devices > 1:
+            mean = share_gradients([getattr(splat, name) for name in PARAMETERS], loss)
+            torch.manual_seed(mixed_seed(self.seed, step))  # the same changes on all devices
         if self._pending is None:
             self._pending = PendingLoss(self.device)
-        self._pending.send(step, loss.detach())
+        self._pending.send(images, mean)
         if self.device.type != "cuda":
             self._check_pending()
         self._step(optimizers, output)
@@ -313,10 +323,10 @@ class SplatTrainer(lightning.LightningModule):
         self.densification.after_step(step, output.screen)
         if len(splat) == 0:
             raise ValueError(
-                f"No Gaussian is left at step {step}: lower `densification.prune_opacity`, or the weights of the "
+                f"No Gaussian is left at step {images}: lower `densification.prune_opacity`, or the weights of the "
                 "losses that lower opacities."
             )
-        if step % self.log_every == 0 or step + 1 == steps:
+        if step % steps_of(self.log_every, self.devices) == 0 or step + 1 == steps:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
 
@@ -328,7 +338,7 @@ class SplatTrainer(lightning.LightningModule):
             return
         counted = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
         counted.increment_ready()
-        step_all(optimizers, output.screen.seen(len(self.splat)) if self.optimizer != "adam" else None)
+        step_all(optimizers, seen_by_any(output.screen.seen(len(self.splat))) if self.optimizer != "adam" else None)
         counted.increment_completed()
 
     def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
@@ -386,12 +396,7 @@ class SplatTrainer(lightning.LightningModule):
 
     def last_checkpoint(self) -> str | None:
         """The newest checkpoint of this run, or the one that it resumes; None if there is none."""
-        folders = [getattr(callback, "dirpath", None) for callback in self.trainer.checkpoint_callbacks]
-        files = [file for folder in folders if folder for file in Path(folder).glob("*.ckpt")]
-        files = [file for file in files if file.stat().st_mtime_ns >= self._begun - _CLOCK_STEP]  # of this run
-        if files:
-            return str(max(files, key=lambda file: file.stat().st_mtime_ns))
-        return None if self.trainer.ckpt_path is None else str(self.trainer.ckpt_path)
+        return newest_checkpoint(self.trainer, self._begun)
 
     # ---- checkpoints
 
@@ -400,15 +405,17 @@ class SplatTrainer(lightning.LightningModule):
         self._check_pending()
         for name in PARAMETERS:
             if not bool(torch.isfinite(getattr(self.splat, name)).all()):
-                raise TrainingDiverged(self.global_step, f"a value of `{name}`", self.last_checkpoint())
+                raise TrainingDiverged(self.global_step * self.devices, f"a value of `{name}`", self.last_checkpoint())
+        check_alike([getattr(self.splat, name) for name in PARAMETERS])
         checkpoint["splat_training"] = {
+            "devices": self.devices,
             "densification": self.densification.state_dict(),
             "kind": type(self.densification).__name__,
             "scene_scale": self.scene_scale,
             "sh_degree": self.sh_degree,
             "seed": self.seed,
             "random": dict(self._random),
-            "seen": self.global_step,
+            "seen": self.global_step * self.devices,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -416,20 +423,10 @@ class SplatTrainer(lightning.LightningModule):
         stored = checkpoint.get("splat_training")
         if stored is None:
             raise ValueError("The checkpoint has no Gaussians: it was not written by this package.")
-        if stored["sh_degree"] != self.sh_degree:
-            raise ValueError(
-                f"The checkpoint was trained with `sh_degree` {stored['sh_degree']}, but the configuration says "
-                f"{self.sh_degree}: use the same."
-            )
-        state = {name: checkpoint["state_dict"][f"model.{name}"] for name in PARAMETERS}
+        fitting = self._trainer is not None and self.trainer.state.fn == "fit"
+        check_settings(stored, self.sh_degree, self.devices if fitting else None)
         device = self.device if self.model is None else self.model.means.device
-        cloud = GaussianCloud(
-            state["means"],
-            state["quats"],
-            state["scales"],
-            state["opacities"],
-            torch.cat([state["sh0"], state["shN"]], 1),
-        )
+        cloud = stored_gaussians(checkpoint["state_dict"])
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
         self._random.update({name: state.cpu() for name, state in stored["random"].items()})
@@ -472,14 +469,14 @@ class SplatTrainer(lightning.LightningModule):
     def _evaluate(self, batch: Mapping[str, Any], batch_idx: int, stage: str) -> None:
         target, _, background = self._target(batch, train=False)
         fitting = self.trainer.state.fn == "fit"
-        degree = self.active_degree(max(self.global_step - 1, 0)) if fitting else self._degree_reached()
+        images = self.global_step * self.devices if fitting else self._seen
+        degree = self.active_degree(max(images - 1, 0)) if fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
         lpips = self._lpips[0].to(self.device) if self._lpips else None
         for name, value in picture_metrics(image, target, lpips).items():
             self._metrics.setdefault(name, []).append(value)
-        if batch_idx < self.panels and not self.trainer.sanity_checking:
-            step = self.global_step if fitting else self._seen
-            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}", step)
+        if batch_idx < self.panels and not self.trainer.sanity_checking and self.trainer.is_global_zero:
+            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}", images)
 
     def _log_metrics(self, stage: str) -> None:
         for name, values in self._metrics.items():
@@ -504,7 +501,9 @@ class SplatTrainer(lightning.LightningModule):
     def on_train_end(self) -> None:
         """Check the last loss and write ``point_cloud.ply``."""
         self._check_pending()
-        self.export(self.folder / "point_cloud.ply")
+        check_alike([getattr(self.splat, name) for name in PARAMETERS])
+        if self.trainer.is_global_zero:
+            self.export(self.folder / "point_cloud.ply")
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Write the Gaussians as a 3DGS file, without those that are not finite.

@@ -8,11 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.training.parallel import scaled_adam
+
 OPTIMIZERS = ("adam", "selective_adam")
 """Kinds of :func:`make_optimizer`."""
 
 
-def make_optimizer(parameter: Tensor, rate: float, kind: str = "adam") -> torch.optim.Optimizer:
+def make_optimizer(parameter: Tensor, rate: float, kind: str = "adam", devices: int = 1) -> torch.optim.Optimizer:
     """An optimiser of one parameter of the Gaussians.
 
     Args:
@@ -20,19 +22,22 @@ def make_optimizer(parameter: Tensor, rate: float, kind: str = "adam") -> torch.
         rate: Its learning rate.
         kind: ``adam``, or ``selective_adam``: gsplat's Adam of the Gaussians in the picture alone (Mallick et al. 2024,
             "Taming 3DGS"); CUDA only. It does not correct the bias of the first steps.
+        devices: Number of devices that train together, see
+            :func:`~gaussian_swaying.training.parallel.scaled_adam`.
 
     Raises:
         ValueError: If ``kind`` does not run on the parameter's device.
     """
     on_gpu = parameter.device.type == "cuda"
+    options = scaled_adam(rate, devices)
     if kind == "adam":
-        return torch.optim.Adam([parameter], lr=rate, eps=1e-15, fused=on_gpu)
+        return torch.optim.Adam([parameter], fused=on_gpu, **options)
     if not on_gpu:
         raise ValueError(f"`optimizer` {kind} needs CUDA, but the Gaussians are on {parameter.device}: use adam there.")
     from gsplat import SelectiveAdam
 
-    made: torch.optim.Optimizer = SelectiveAdam([parameter], eps=1e-15, betas=(0.9, 0.999))
-    made.param_groups[0]["lr"] = rate
+    made: torch.optim.Optimizer = SelectiveAdam([parameter], eps=options["eps"], betas=options["betas"])
+    made.param_groups[0]["lr"] = options["lr"]
     return made
 
 

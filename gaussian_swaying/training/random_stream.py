@@ -9,6 +9,14 @@ import torch
 from torch import Tensor
 
 
+def mixed_seed(*numbers: int) -> int:
+    """A seed made from several numbers."""
+    found = 0
+    for number in numbers:
+        found = (found * 1_000_003 + number + 1) % 2**63
+    return found
+
+
 def random_state(device: torch.device) -> dict[str, Tensor]:
     """The states of the generators of the CPU and, if the device is a GPU, of the device."""
     state = {"cpu": torch.get_rng_state()}

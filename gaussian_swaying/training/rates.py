@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_positive
@@ -35,17 +36,19 @@ class LearningRates:
             check_positive(f"rates.{name}", getattr(self, name), allow_zero=name != "means_final")
 
 
-def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: int) -> float:
+def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: int, devices: int = 1) -> float:
     """Learning rate of the centres at a step: decays exponentially from ``rates.means`` times the scene's extent.
 
     Args:
         rates: The rates.
         scene_scale: Extent of the scene [scene units].
-        step: Number of images trained on before.
-        max_steps: Number of images in all.
+        step: Number of steps before.
+        max_steps: Number of steps in all.
+        devices: Number of devices that train together, see
+            :func:`~gaussian_swaying.training.parallel.scaled_adam`.
 
     Returns:
         The rate [scene units].
     """
     share = min(step / max_steps, 1.0) if max_steps > 0 else 0.0
-    return rates.means * scene_scale * rates.means_final**share
+    return math.sqrt(devices) * rates.means * scene_scale * rates.means_final**share

@@ -78,23 +78,35 @@ class RunFolder(Callback):
 
     def _mark(self, pl_module: Any) -> None:
         for folder in {self.root, pl_module.folder}:
-            if not any(os.path.lexists(folder / name) for name in (MARKER, *_OURS)):
+            taken = any(os.path.lexists(folder / name) for name in (MARKER, *_OURS))
+            if not taken and pl_module.trainer.is_global_zero:
                 folder.mkdir(parents=True, exist_ok=True)
                 mark(folder)
 
     def _begin(self, trainer: Any, pl_module: Any) -> None:
         if self.begun:
             return
+        if trainer.world_size > 1:
+            try:  # the first of several processes takes the folder
+                if trainer.is_global_zero:
+                    self._take_all(trainer, pl_module)
+            finally:
+                trainer.strategy.barrier()
+        else:
+            self._take_all(trainer, pl_module)
+        if self.loggers is not None:
+            trainer.loggers = self.loggers()
+        place = Path(trainer.log_dir or self.root)  # the processes agree on it
+        if self.save_config is not None and trainer.is_global_zero:
+            self.save_config(place)
+        self.begun = True
+        self._newest = pl_module.last_checkpoint
+
+    def _take_all(self, trainer: Any, pl_module: Any) -> None:
         continued = None if trainer.ckpt_path is None else Path(str(trainer.ckpt_path))
         in_use = [getattr(trainer.datamodule, "path", None), pl_module.init_ply, continued]
         for folder, option in _apart({pl_module.folder: "--model.output", self.root: "--trainer.default_root_dir"}):
             self._locks.append(_take(folder, option, continued, [Path(str(path)) for path in in_use if path]))
-        if self.loggers is not None:
-            trainer.loggers = self.loggers()
-        if self.save_config is not None:
-            self.save_config(Path(trainer.log_dir or self.root))
-        self.begun = True
-        self._newest = pl_module.last_checkpoint
 
 
 def _apart(options: dict[Path, str]) -> list[tuple[Path, str]]:

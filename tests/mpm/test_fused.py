@@ -17,6 +17,7 @@ from gaussian_swaying import _graphs
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, SpatialWind, WindField
+from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.geometry.regions import Box, Everything
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -1156,6 +1157,19 @@ def test_boundaries_of_a_batch(kernel_device, formulation):
     points = _points(kernel_device, count=40, batch=(2,))
     boundaries = [SequentialRelease(LEFT, [0.0, 1.0, 0.0], end=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
     _agree(_wind_case(points, formulation, steps=2, boundaries=boundaries))
+
+
+def test_nodes_held_in_a_batch_of_winds(kernel_device):
+    """The momentum that pins take is summed for each scene, and all scenes share their patches."""
+    points = _points(kernel_device, count=40, batch=(2,))
+    winds = WindBatch([WindField([0.0, -8.0, 0.0]), WindField([3.0, 9.0, 0.0])]).to(kernel_device)
+    listed = _load(points, [WindField([0.0, -8.0, 0.0]), WindField([3.0, 9.0, 0.0])])
+    load = WindForce(listed.aero, winds, listed.normal[0], listed.area[0])
+    boundaries = [PinnedRegion(LEFT, kind="nodes")]
+    ends = _both(points, lambda solver, state: solver.rollout(state, DT, 2, load), "total", boundaries=boundaries)
+    _agree(ends)
+    assert float(ends[0].impulse.abs().amax()) > 0
+    torch.testing.assert_close(ends[1].impulse, ends[0].impulse, rtol=1e-3, atol=1e-12)
 
 
 # ---- what is conserved

@@ -20,7 +20,8 @@ from gaussian_swaying.cli.sweep import explain, main
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import worker
-from gaussian_swaying.sweeps.worker import Job, do
+from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.worker import do
 
 PROGRAM = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main())"
 LOCK = ".gaussian_swaying.lock"
@@ -250,8 +251,9 @@ def test_what_failed_is_told_in_one_sentence(tmp_path, monkeypatch, error, words
 
     monkeypatch.setattr(worker, "_run", fail)
     (tmp_path / "logs").mkdir()
-    result, ready = do(Job(tmp_path, "00000", "", 2, {}, attempt=2), None, explain)
-    assert (result["status"], result["attempts"], ready) == ("failed", 2, False)
+    done = do(Job(tmp_path, ("00000",), "", 2, ({},), attempt=2), None, explain)
+    result = done.results["00000"]
+    assert (result["status"], result["attempts"], done.ready) == ("failed", 2, False)
     for word in words:
         assert word in result["reason"]
     assert "\n" not in result["reason"]

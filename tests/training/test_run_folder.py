@@ -14,8 +14,10 @@ def _begin(root, output=None, ckpt=None, data=None):
     taken = RunFolder()
     taken.root = root
     trainer = SimpleNamespace(ckpt_path=ckpt, datamodule=SimpleNamespace(path=data), log_dir=str(root / "csv"))
+    trainer.world_size, trainer.is_global_zero = 1, True
     trainer.state, trainer.sanity_checking = SimpleNamespace(fn="fit"), False
     module = SimpleNamespace(folder=root if output is None else output, init_ply=None, last_checkpoint=lambda: None)
+    module.trainer = trainer
     taken.on_validation_start(trainer, module)
     taken.on_train_batch_start(trainer, module, None, 0)
     assert taken.begun

@@ -31,6 +31,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     speed,
     speed_plot,
     surfaces,
+    sweeps,
     training,
     web,
     winds,

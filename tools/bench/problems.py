@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import UniformGust, WindField
+from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
@@ -60,7 +61,7 @@ def waves(position: Tensor) -> Tensor:
     return torch.stack([zero, zero, torch.sin(2 * math.pi * x) * torch.cos(2 * math.pi * y)], dim=-1)
 
 
-def wind_load(points: MaterialPoints, winds: WindField | list[WindField]) -> WindForce:
+def wind_load(points: MaterialPoints, winds: WindField | WindBatch | list[WindField]) -> WindForce:
     """Wind on every particle of one or several sheets."""
     slope = 0.027 * torch.cos(9 * points.position[..., 0])
     normal = torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], dim=-1)

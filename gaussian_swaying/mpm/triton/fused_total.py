@@ -125,12 +125,10 @@ class FusedTotal(Fused):
                 owner = torch.where((pin.share > pin.threshold).reshape(-1), k, owner)
         owner = owner[active]
         self.held = (owner >= 0).to(torch.int8)
-        self.taken = torch.zeros(len(active), 4, device=self.device)  # momentum taken from each held node
+        # momentum taken from each held node, and a row of zeros
+        self.taken = torch.zeros(len(active) + 1, 4, device=self.device)
         scene = active // self.grid.node_count
-        # the held nodes of each boundary in each scene, for sums in a fixed order
-        self.own_nodes = [
-            [((owner == k) & (scene == s)).nonzero()[:, 0] for k in range(len(bound.held))] for s in range(self.scenes)
-        ]
+        self.own_nodes = [_by_scene((owner == k).nonzero()[:, 0], scene, self.scenes) for k in range(len(bound.held))]
         self.points: DenseHolds | None = None
         if self.plain and bound.point_holds is not None:
             self.points = bound.point_holds.dense()
@@ -275,9 +273,8 @@ class FusedTotal(Fused):
         """Momentum that each boundary took in this part of the rollout, shape of ``impulse``; in a fixed order."""
         total = self.impulse.reshape(self.scenes, -1, 3).clone()
         if "nodes" in self.bound.kinds and self.plain:
-            for s, own in enumerate(self.own_nodes):
-                for k, nodes in enumerate(own):
-                    total[s, k] += self.taken[nodes, :3].sum(0, dtype=torch.float64)
+            for k, nodes in enumerate(self.own_nodes):
+                total[:, k] += self.taken[nodes, :3].sum(1, dtype=torch.float64)
         if self.touching is not None:
             self.touching.add_taken(total)
         if self.points is not None:
@@ -390,3 +387,18 @@ def _lanes(sizes: Tensor) -> int:
         if largest <= n and len(sizes) <= _PROGRAMS * max(1, 32 // n):
             return n
     return min(zip(lanes, work, strict=True), key=lambda pair: pair[1] * _LANE_COST[pair[0]])[0]
+
+
+def _by_scene(nodes: Tensor, scene: Tensor, scenes: int) -> Tensor:
+    """The nodes of each scene as rows, for sums in a fixed order, filled up with the place after the last node.
+
+    Args:
+        nodes: Places among the active nodes, which are sorted by scene, shape (n,).
+        scene: Scene of each active node.
+        scenes: Number of scenes.
+    """
+    counts = scene[nodes].bincount(minlength=scenes)
+    rows = torch.full((scenes, int(counts.amax()) if len(nodes) else 0), len(scene), device=nodes.device)
+    rank = torch.arange(len(nodes), device=nodes.device) - (counts.cumsum(0) - counts)[scene[nodes]]
+    rows[scene[nodes], rank] = nodes
+    return rows

@@ -170,6 +170,7 @@ class Recorder:
         real_time_fps: float = 25.0,
         cameras: Sequence[str] = (),
         check: Callable[[dict[str, Any]], None] | None = None,
+        alone: bool = True,
     ) -> dict[str, Any] | None:
         """Prepare the output folder.
 
@@ -183,6 +184,8 @@ class Recorder:
             real_time_fps: Frames per second at which the video shows the simulated time.
             cameras: Names of the further cameras.
             check: Called with the checkpoint before anything in the folder is changed; raises an error if it is bad.
+            alone: Whether no other recorder is at work in this process. One of many uses a single thread, and encodes
+                its video at the end.
 
         Returns:
             The checkpoint to continue from, or None. The folder is locked until :meth:`close` or :meth:`release`.
@@ -196,7 +199,7 @@ class Recorder:
         self.wait()
         self._give_up_video()
         self.release()
-        self._writer, self._real_time_fps = FrameWriter(), real_time_fps
+        self._writer, self._real_time_fps = FrameWriter() if alone else FrameWriter(workers=1), real_time_fps
         path = Path(folder)
         places = [frame_folder(render, camera) for camera in ("", *cameras) for render in self.renders]
         self._films = {place: _Film() for place in places} if self.images else {}
@@ -219,7 +222,7 @@ class Recorder:
         except BaseException:
             self.release()
             raise
-        if self.video and not resume:  # a resumed run makes its video from the PNGs
+        if self.video and alone and not resume:  # a resumed run makes its video from the PNGs
             for place, film in self._films.items():
                 film.encoder = VideoEncoder(path / video_file(place), self.fps or real_time_fps)
         return checkpoint

@@ -21,6 +21,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.training.data.order import EndlessShuffle
 from gaussian_swaying.training.initial import gaussians_from_points
+from gaussian_swaying.training.parallel import this_device
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,11 +253,13 @@ class CaptureDataModule(LightningDataModule):
     def train_dataloader(self) -> DataLoader[TrainingImage]:
         """Training images, shuffled and endless."""
         dataset = self._dataset("train")
-        return DataLoader(dataset, sampler=EndlessShuffle(len(dataset), self.seed, self._seen), **self._options())
+        rank, devices = this_device()
+        order = EndlessShuffle(len(dataset), self.seed, self._seen + rank, devices)
+        return DataLoader(dataset, sampler=order, **self._options())
 
     def state_dict(self) -> dict[str, int]:
         """Number of training images seen, and what defines their order; Lightning stores it in checkpoints."""
-        seen = self._seen if self.trainer is None else self.trainer.global_step
+        seen = self._seen if self.trainer is None else self.trainer.global_step * this_device()[1]
         return {"seed": self.seed, "count": len(self.capture.split("train")), "seen": seen}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:

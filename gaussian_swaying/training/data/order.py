@@ -1,6 +1,7 @@
 """The order of training images."""
 
 from collections.abc import Iterator
+from itertools import islice
 
 import torch
 from torch.utils.data import Sampler
@@ -15,6 +16,7 @@ class EndlessShuffle(Sampler[int]):
         count: Number of images.
         seed: Seed of the permutations.
         start: Number of images already seen.
+        every: Take only every so many of them, from ``start`` on: the share of one of several devices.
 
     Raises:
         ValueError: If there is no image, or ``start`` is negative.
@@ -25,15 +27,18 @@ class EndlessShuffle(Sampler[int]):
         True
     """
 
-    def __init__(self, count: int, seed: int = 0, start: int = 0) -> None:
+    def __init__(self, count: int, seed: int = 0, start: int = 0, every: int = 1) -> None:
         if count < 1:
             raise ValueError("Expected at least one image to train on, but got none.")
         if start < 0:
             raise ValueError(f"Expected `start` not to be negative, but got {start}.")
-        self.count, self.seed, self.start = count, seed, start
+        self.count, self.seed, self.start, self.every = count, seed, start, every
 
     def __iter__(self) -> Iterator[int]:
         """Indices from ``start`` on."""
+        return islice(self._all(), 0, None, self.every)
+
+    def _all(self) -> Iterator[int]:
         number, skip = divmod(self.start, self.count)
         while True:
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + number)

@@ -18,6 +18,7 @@ from torch import Tensor
 from bench import record
 from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
 from bench.problems import CUBE, block, cube, fewest_bytes, nodes_in_reach, sheet, spin, waves, wind, wind_load
+from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -199,7 +200,7 @@ def bench_batch(plan: Plan, formulation: str, gusts: bool, device: torch.device)
         return solver, solver.init_state(points, waves(points.position))
 
     together, all_at_rest = start(many)
-    load = wind_load(many, winds)
+    load = wind_load(many, WindBatch(winds))
 
     def batched() -> None:
         results["together"] = together.rollout(all_at_rest, DT, steps, load).position

@@ -1,0 +1,92 @@
+"""Runs of equal shape that are simulated together: which they are, and how a worker does them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from gaussian_swaying.simulation.config import config_text
+from gaussian_swaying.simulation.defaults import as_wind
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.together import Together, variant
+from gaussian_swaying.sweeps.job import Job, unlocked
+from gaussian_swaying.sweeps.plan import parse_run
+from gaussian_swaying.sweeps.record import RUNS
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser
+
+ALIKE = ("wind.flow", "wind.seed", "material.E", "material.nu", "material.density")
+"""Axes along which runs keep their shape."""
+
+
+def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
+    """Numbers of the runs that are simulated together, at most ``size`` of them.
+
+    It depends on nothing but the runs and the size, so that a sweep that is resumed has the same groups.
+
+    Args:
+        runs: The value of every axis in each run.
+        size: Largest number of runs in a group.
+
+    Example:
+        >>> grouped([{"wind.seed": 1, "solver.dx": x} for x in (1, 2, 1, 1)], 2)
+        [[0, 2], [3], [1]]
+    """
+    alike: dict[str, list[int]] = {}
+    for number, run in enumerate(runs):
+        key = json.dumps({name: value for name, value in run.items() if name not in ALIKE})
+        alike.setdefault(key, []).append(number)
+    return [numbers[k : k + size] for numbers in alike.values() for k in range(0, len(numbers), size)]
+
+
+def run_together(job: Job, parser: ArgumentParser) -> dict[str, dict[str, Any]]:
+    """Do the runs of a job in one rollout.
+
+    Args:
+        job: The job.
+        parser: From :meth:`Simulation.parser`.
+
+    Returns:
+        The summaries of its runs by name, without those that are complete.
+
+    Raises:
+        ValueError: If they cannot be done together.
+    """
+    together, frames = make_together(job, parser)
+    folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]
+    extras = [{"sweep": {"run": n, "settings": r}} for n, r in zip(job.names, job.runs, strict=True)]
+    summaries = unlocked(lambda: together.record(folders, frames, extras))
+    return {name: found for name, found in zip(job.names, summaries, strict=True) if found is not None}
+
+
+def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
+    """The simulation of all runs of a job, and how many frames they have."""
+    settings = [parse_run(parser, job.config, job.frames, job.runs[0])]
+    settings[0].device = job.device
+    for run in job.runs[1:]:  # parsing takes longer than a frame of all
+        settings.append(settings[0].clone())
+        for name in ALIKE:
+            if name in run:
+                settings[-1][name] = _as_parsed(name, run[name])
+    first = Simulation.from_settings(parser, settings[0])
+    first.start()  # with all checks of a run
+    given = parser.instantiate(settings[0]).material
+    members = [first]
+    for one in settings[1:]:
+        parts = parser.instantiate(one)
+        wind = as_wind(parts.wind, first.scene.frame)
+        text = config_text(parser, one)
+        members.append(variant(first, wind, parts.material, given, parts.recorder, text))
+    return Together(members), settings[0].frames
+
+
+def _as_parsed(name: str, value: Any) -> Any:
+    """The value of an axis as the parser would make it; its numbers were checked with the plan."""
+    if name == "wind.seed":
+        return int(value)
+    return [float(part) for part in value] if isinstance(value, list) else float(value)
+
+
+__all__ = ["grouped", "make_together", "run_together"]

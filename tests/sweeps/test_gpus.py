@@ -1,0 +1,86 @@
+"""Runs that are simulated together on a GPU, and sweeps on one and several GPUs."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.sweeps.job import Job
+from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+from gaussian_swaying.sweeps.together import make_together
+
+pytestmark = pytest.mark.gpu
+
+
+def _rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_together_is_as_alone(tmp_path, sweep_file):
+    """The kernels with a batch of scenes against one scene after the other, with the same substeps."""
+    settings = {"solver.substep": 2e-3, "frames": 5}
+    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=settings)))
+    job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
+    together, _ = make_together(job, Simulation.parser())
+    state = together.start()
+    assert together.solver.fused() is not None
+    for _ in range(4):
+        state, health = together.advance(state)
+    for number, member in enumerate(together.members):
+        alone = member.start() if number == 0 else member.solver.init_state(
+            member.solver.points, frame=member.scene.frame
+        )  # fmt: skip
+        for _ in range(4):
+            alone, own = member.advance(alone)
+        moved = float((alone.position - member.solver.points.position).abs().amax())
+        assert float((state.scene(number).position - alone.position).abs().amax()) < 1e-4 * moved
+        shared = health.each[number]
+        assert shared.substeps == own.substeps
+        assert shared.wind_work == pytest.approx(own.wind_work, rel=1e-3, abs=1e-6)
+        assert np.allclose(shared.support, own.support, rtol=1e-3, atol=1e-5)
+
+
+def test_together_foresees(tmp_path, sweep_file):
+    """Without a fixed substep the host waits once in a frame."""
+    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml")))
+    job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
+    together, _ = make_together(job, Simulation.parser())
+    state, _ = together.advance(together.start())
+    assert together.foresees
+    assert together.outlook is not None
+    expected = together.substeps(state)
+    assert together.advance(state)[1].substeps == expected
+
+
+@pytest.mark.timeout(600)
+def test_a_sweep_on_all_gpus(tmp_path, sweep_file):
+    file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
+    assert main([str(file), "--output", str(folder), "--together", "4", "--device", "cuda"]) == 0
+    assert {row["status"] for row in _rows(folder / "sweep.csv")} == {"complete"}
+    assert all(int(row["device_bytes"]) > 0 for row in _rows(folder / "times.csv"))
+    again = tmp_path / "again"
+    assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--per-gpu", "auto"]) == 0
+    assert (again / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_training_on_two_gpus(tmp_path):
+    import subprocess
+    import sys
+    from pathlib import Path
+
+    tool = Path(__file__).parents[2] / "tools/train.py"
+    command = [sys.executable, str(tool), "fit", "--config", "quick_cpu", "--trainer.accelerator", "gpu"]
+    command += ["--trainer.devices", "2", "--trainer.default_root_dir", str(tmp_path / "two")]
+    command += ["--data.init_args.path", str(tmp_path / "capture")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert len(list((tmp_path / "two").rglob("*.ply"))) == 1
+    with (tmp_path / "two/csv/metrics.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("val/psnr")]
+    assert float(rows[-1]["val/psnr"]) > 18

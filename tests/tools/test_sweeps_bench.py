@@ -1,0 +1,79 @@
+"""``bench.py sweeps``: its sweep files, its enlarged photos and its tables."""
+
+import argparse
+import json
+
+import pytest
+from bench.cases import sweeps
+from bench.tables import sweeps as tables
+from PIL import Image
+
+from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+
+
+def test_the_small_flags_have_4096_points_each(tmp_path):
+    axes = {"wind.seed": {"draw": "integer", "low": 0, "high": 9}}
+    file = sweeps._sweep_file(tmp_path / "flags.yaml", sweeps._flag(0.8, 0.0125, 3), axes, 2)
+    plan = make_plan(read_sweep(file))
+    assert len(plan.runs) == 2
+    assert "images: false" in plan.config
+    row = sweeps.one_sheet(argparse.Namespace(flags=1, device="cpu"), frames=6)
+    assert row["particles"] == 4096
+    assert row["per_s"] > 0
+
+
+def test_photos_are_enlarged(tmp_path):
+    (tmp_path / "small/images").mkdir(parents=True)
+    Image.new("RGB", (6, 4), (200, 10, 10)).save(tmp_path / "small/images/a.png")
+    known = {"fl_x": 5.0, "fl_y": 5.0, "cx": 3.0, "cy": 2.0, "w": 6, "h": 4, "k1": 0.1}
+    known["frames"] = [{"file_path": "images/a.png"}]
+    (tmp_path / "small/transforms.json").write_text(json.dumps(known))
+    made = sweeps.enlarged(tmp_path / "small", tmp_path / "large", 2)
+    found = json.loads((made / "transforms.json").read_text())
+    assert (found["fl_x"], found["cx"], found["w"], found["h"], found["k1"]) == (10.0, 6.0, 12, 8, 0.1)
+    with Image.open(made / "images/a.png") as image:
+        assert image.size == (12, 8)
+
+
+def _flags(wall, rate):
+    return {"particles": 4096, "wall_s": wall, "frames_s": 30.0, "per_s": rate, "memory_bytes": 2**30}
+
+
+RECORD = {
+    "device": "a GPU", "versions": {"torch": "2"}, "seed": 0,
+    "gpus": {
+        "flags": 256, "frames": 1000, "rows": {"1": _flags(100.0, 2.8e9), "2": _flags(52.0, 5.5e9)},
+        "sheet": {"particles": 1048576, "frames": 55, "frames_s": 2.0, "per_s": 3.0e9, "build_s": 9.0},
+    },
+    "training": {
+        "images": 7000,
+        "rows": {
+            "1": {"steps": 7000, "seconds": 80.0, "psnr_db": 29.0, "gaussians": 100},
+            "2": {"steps": 3500, "seconds": 50.0, "psnr_db": 28.95, "gaussians": 90},
+        },
+    },
+}  # fmt: skip
+
+
+def test_tables():
+    ended = {"seconds": 9.5, "killed": 5, "complete": 40, "attempts": 45}
+    workers = {"runs": 40, "workers": 2, "equal": True, "undisturbed": ended | {"killed": 0}, "disturbed": ended}
+    cpu = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0, "workers": workers}
+    reached = [reached for _, _, reached in tables.goals([cpu, RECORD])]
+    assert reached == [True, True, True, False, True]
+    assert [value for _, value, _ in tables.goals([cpu])] == ["40 complete, 5 killed, tables equal", *["-"] * 4]
+    assert "| 256 flags, 1000 frames, 2 GPUs | 4,096 | 52.0 | 30.0 | 5,500 | 1.00 |" in tables.gpus_table([RECORD])
+    assert tables.workers_table([cpu])[-1] == "| disturbed | 5 | 40 | 45 | 10 |"
+    assert tables.training_table([RECORD])[-1] == "| 7,000 images, 2 GPUs | 3500 | 50.0 | 28.95 | 90 |"
+    assert tables.gpus_table([cpu]) == tables.training_table([cpu]) == ["Not recorded yet."]
+    failed = {"gpus": RECORD["gpus"] | {"rows": {"1": {"failed": "no memory"}}}}
+    assert "failed" in tables.gpus_table([failed])[2]
+    assert "1.60 times" in tables.goal_table([RECORD])[-2]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_disturbed_sweep(tmp_path):
+    row = sweeps.disturbed_sweep(tmp_path, runs=8, kills=2)
+    assert row["equal"]
+    assert row["disturbed"]["killed"] == 2
