@@ -116,8 +116,10 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
         v0 * rest[0], v0 * rest[1], v0 * rest[2], v1 * rest[0], v1 * rest[1], v1 * rest[2],
         v2 * rest[0], v2 * rest[1], v2 * rest[2],
     )  # fmt: skip
-    by_velocity = (-area * by_r[0], -area * by_r[1], -area * by_r[2])
-    by_wind = _sum3(area, by_r, area, by_air)
+    by_wind = (area * by_r[0], area * by_r[1], area * by_r[2])
+    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    if OPTIONS[0] == 2:
+        by_wind = _sum3(1.0, by_wind, area, by_air)
     return cofactor_change(F, outer), by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
 
 
@@ -244,6 +246,8 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
     by_c = axpy9(1.0, by_c, by_grown, turned)
     scale = tl.where(real, half * cap, 0.0)
     by_c = axpy9(scale, by_c, 0.0, c)
-    by_velocity = (-scale * by_r[0], -scale * by_r[1], -scale * by_r[2])
-    by_wind = _sum3(scale, by_r, scale, by_air)
+    by_wind = (scale * by_r[0], scale * by_r[1], scale * by_r[2])
+    by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    if OPTIONS[0] == 2:
+        by_wind = _sum3(1.0, by_wind, scale, by_air)
     return cofactor_change(F, by_c), by_velocity, by_wind, (scale * pressure, scale * shear, scale * side)
