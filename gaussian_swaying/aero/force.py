@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_positive, check_shape
 from gaussian_swaying.aero.patches import PatchSums, grouped_force
 
-LAWS = ("paper", "projected")
+LAWS = ("paper", "projected", "linear")
 
 
 def aero_force(
@@ -49,7 +49,10 @@ def aero_force(
         lift: C_L.
         air_density: Density of the air [kg/m³].
         law: ``paper`` follows the paper literally: the full drag acts along n at every angle of incidence.
-            ``projected`` multiplies the drag by n·d, as for a plate, so that it vanishes edge-on.
+            ``projected`` multiplies the drag by n·d, as for a plate, so that it vanishes edge-on. ``linear`` is the
+            drag of Blender's cloth, :math:`\tfrac12 \rho A C_D |\mathbf{u}| (\mathbf{v}_r \cdot \mathbf{n})\,
+            \mathbf{n}`: that of ``projected`` on a patch at rest, but linear in the velocity of the patch. In still
+            air this drag is zero, however the patch moves. Friction and lift are those of the other laws.
         lift_direction: ``side`` is the paper's d x n, a force perpendicular to flow and normal; ``lift`` is (d x n) x
             d, in the plane of flow and normal.
         unit_tangent: Normalise d^t (a possible reading of the paper's hat) instead of using the projection itself.
@@ -67,7 +70,8 @@ def aero_force(
     check_shape("normal", normal, patches, 3)
     check_shape("area", area, patches)
     check_shape("wind", wind, 3)
-    relative = wind.to(velocity.dtype) - velocity
+    wind = wind.to(velocity.dtype)
+    relative = wind - velocity
     speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     along = (relative * normal).sum(-1, keepdim=True)
     sign = torch.where(along < 0, -1.0, 1.0)
@@ -75,7 +79,11 @@ def aero_force(
     incidence = sign * along
     tangent = relative - along * normal
     # each term below is v_r² times the bracket of the equation, without ever dividing by v_r
-    pressure = drag * (speed * speed if law == "paper" else speed * incidence) * oriented
+    if law == "paper":
+        pressure = drag * (speed * speed) * oriented
+    else:
+        blow = torch.linalg.vector_norm(wind, dim=-1, keepdim=True) if law == "linear" else speed
+        pressure = drag * (blow * incidence) * oriented
     if unit_tangent:
         size = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
         shear = friction * speed.square() * tangent / size.clamp(min=torch.finfo(size.dtype).tiny)
@@ -132,7 +140,7 @@ class AeroForce(nn.Module):
         C_F: Friction coefficient.
         C_L: Lift coefficient.
         air_density: Density of the air [kg/m³].
-        law: ``paper`` or ``projected``.
+        law: ``paper``, ``projected`` or ``linear``.
         lift_direction: ``side`` or ``lift``.
         unit_tangent: Normalise the tangential flow direction.
         drag_step: ``explicit``, or ``semi_implicit``: the solver evaluates the drag at the velocity at the end of the
@@ -190,18 +198,24 @@ class AeroForce(nn.Module):
     def mostly_linear(self) -> bool:
         """Whether less than 5 % of the force depends on the side of the patch that the flow meets."""
         sided = float(self.C_L.abs()) / max(float(self.C_D + self.C_F + self.C_L.abs()), 1e-30)
-        return self.law == "projected" and not self.unit_tangent and sided < 0.05
+        return self.law != "paper" and not self.unit_tangent and sided < 0.05
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:
-        """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component."""
-        coefficient = (self.C_D + self.C_F + self.C_L.abs()).to(speed.dtype)
+        """:func:`drag_rate` [1/s], shape (..., P), with the coefficients of this component.
+
+        The drag of the ``linear`` law changes half as fast as a quadratic one: its slope is rho A C_D U / 2. For a
+        bound, ``speed`` must then be no less than the speed U of the wind.
+        """
+        drag = 0.5 * self.C_D if self.law == "linear" else self.C_D
+        coefficient = (drag + self.C_F + self.C_L.abs()).to(speed.dtype)
         return drag_rate(speed, area, mass, coefficient, self.air_density)
 
     def resistance(self, wind: Tensor, velocity: Tensor, area: Tensor) -> Tensor | None:
         r"""Decrease of the force per velocity that the patch gains [kg/s], for ``MPMSolver.step(drag=...)``.
 
         :math:`D = \tfrac12 \rho A C v_r`, so that the force at the end of the step is about :math:`f - D (v^+ - v)`. If
-        the velocity does not change, this is the explicit force. A free patch never overtakes the wind.
+        the velocity does not change, this is the explicit force. A free patch never overtakes the wind. With the
+        ``linear`` law, the speed of the wind stands for v_r in the part of C_D.
 
         Args:
             wind: Air velocity [m/s], broadcastable to (..., P, 3).
@@ -213,8 +227,11 @@ class AeroForce(nn.Module):
         """
         if self.drag_step == "explicit":
             return None
-        speed = torch.linalg.vector_norm(wind.to(velocity.dtype) - velocity, dim=-1)
-        return 0.5 * self.rate(speed, area, torch.ones_like(area))
+        wind = wind.to(velocity.dtype)
+        speed = torch.linalg.vector_norm(wind - velocity, dim=-1)
+        blow = torch.linalg.vector_norm(wind, dim=-1) if self.law == "linear" else speed
+        drag, rest = (c.to(speed.dtype) for c in (self.C_D, self.C_F + self.C_L.abs()))
+        return 0.5 * self.air_density * area * (drag * blow + rest * speed)
 
     def forward(self, wind: Tensor, velocity: Tensor, normal: Tensor, area: Tensor) -> Tensor:
         """Force on each patch [N].

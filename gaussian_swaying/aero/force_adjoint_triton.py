@@ -16,9 +16,12 @@ def _sum3(s, a, t, b):
 
 @triton.jit
 def force_adjoint(
-    r, n, a, drag, friction, lift, PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr
+    r, air, n, a, drag, friction, lift, LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr
 ):  # fmt: skip
-    """Gradients of a . f by relative wind, normal and coefficients, and a . f; f is per half density and area."""
+    """Gradients of a . f by relative wind, by wind alone, normal and coefficients, and a . f.
+
+    f is per half density and area.
+    """
     speed = tl.sqrt(dot3(r, r))
     inverse = 1.0 / tl.maximum(speed, 1e-30)
     square = speed * speed
@@ -26,7 +29,15 @@ def force_adjoint(
     sign = tl.where(along < 0, -1.0, 1.0)
     g = dot3(a, n)
     # drag
-    if PROJECTED:
+    by_air = (square * 0, square * 0, square * 0)
+    if LAW == 2:
+        blow = tl.sqrt(dot3(air, air))
+        pressure = blow * along * g
+        by_r = (drag * g * blow * n[0], drag * g * blow * n[1], drag * g * blow * n[2])
+        by_n = _sum3(drag * g * blow, r, drag * blow * along, a)
+        push = drag * g * along / tl.maximum(blow, 1e-30)
+        by_air = (push * air[0], push * air[1], push * air[2])
+    elif LAW == 1:
         pressure = speed * along * g
         by_r = _sum3(drag * g * along * inverse, r, drag * g * speed, n)
         by_n = _sum3(drag * g * speed, r, drag * speed * along, a)
@@ -67,7 +78,7 @@ def force_adjoint(
         turn = (speed * turn[0], speed * turn[1], speed * turn[2])
     by_r = _sum3(1.0, by_r, sign * lift, more)
     by_n = _sum3(1.0, by_n, sign * lift, turn)
-    return by_r, by_n, (pressure, shear, side), drag * pressure + friction * shear + lift * side
+    return by_r, by_air, by_n, (pressure, shear, side), drag * pressure + friction * shear + lift * side
 
 
 @triton.jit
@@ -84,15 +95,14 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
         tl.where(flat, rest[2], vector[2] * scale),
     )
     widest = tl.load(numbers + 4)
-    relative = (
-        tl.load(wind) - velocity[0],
-        tl.load(wind + 1) - velocity[1],
-        tl.load(wind + 2) - velocity[2],
-    )
+    air = (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2))
+    relative = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     drag = tl.load(numbers)
     friction = tl.load(numbers + 1)
     lift = tl.load(numbers + 2)
-    by_r, by_n, parts, whole = force_adjoint(relative, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2])
+    by_r, by_air, by_n, parts, whole = force_adjoint(
+        relative, air, n, a, drag, friction, lift, OPTIONS[0], OPTIONS[1], OPTIONS[2]
+    )
     half = tl.load(numbers + 3) * patch[3]
     area = half * tl.minimum(size, widest)
     # the unit normal and the area both come from the area vector
@@ -108,6 +118,8 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
     )  # fmt: skip
     by_wind = (area * by_r[0], area * by_r[1], area * by_r[2])
     by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    if OPTIONS[0] == 2:
+        by_wind = _sum3(1.0, by_wind, area, by_air)
     return cofactor_change(F, outer), by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
 
 
@@ -139,7 +151,8 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
     first = 8 + 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
-    r = (tl.load(wind) - velocity[0], tl.load(wind + 1) - velocity[1], tl.load(wind + 2) - velocity[2])
+    air = (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2))
+    r = (air[0] - velocity[0], air[1] - velocity[1], air[2] - velocity[2])
     drag = tl.load(numbers)
     friction = tl.load(numbers + 1)
     lift = tl.load(numbers + 2)
@@ -191,7 +204,15 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
     by_r = _sum3(friction * rub * inverse, r, friction * speed * area, a)
     by_area = friction * speed * ar
     to_across = -friction * speed
-    if OPTIONS[0]:
+    by_air = (zero, zero, zero)
+    if OPTIONS[0] == 2:
+        blow = tl.sqrt(dot3(air, air))
+        pressure = blow * ac
+        push = drag * ac / tl.maximum(blow, 1e-30)
+        by_air = (push * air[0], push * air[1], push * air[2])
+        to_across += drag * blow
+        by_facing = (zero, zero, zero)
+    elif OPTIONS[0] == 1:
         pressure = speed * ac
         by_r = _sum3(1.0, by_r, drag * ac * inverse, r)
         to_across += drag * speed
@@ -227,4 +248,6 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
     by_c = axpy9(scale, by_c, 0.0, c)
     by_wind = (scale * by_r[0], scale * by_r[1], scale * by_r[2])
     by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
+    if OPTIONS[0] == 2:
+        by_wind = _sum3(1.0, by_wind, scale, by_air)
     return cofactor_change(F, by_c), by_velocity, by_wind, (scale * pressure, scale * shear, scale * side)

@@ -9,20 +9,21 @@ from gaussian_swaying.geometry.patches_triton import deform_patch
 
 @triton.jit
 def aero_force(
-    relative, n, area, drag, friction, lift, half_density,
-    PROJECTED: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
+    relative, air, n, area, drag, friction, lift, half_density,
+    LAW: tl.constexpr, LIFT: tl.constexpr, UNIT: tl.constexpr,
 ):  # fmt: skip
-    """Force on a patch in a relative wind, and the relative speed."""
+    """Force on a patch in a relative wind, the relative speed, and the speed that the drag is proportional to."""
     speed = tl.sqrt(dot3(relative, relative))
+    blow = tl.sqrt(dot3(air, air)) if LAW == 2 else speed
     along = dot3(relative, n)
     sign = tl.where(along < 0, -1.0, 1.0)
     tx = relative[0] - along * n[0]
     ty = relative[1] - along * n[1]
     tz = relative[2] - along * n[2]
-    if PROJECTED:
-        pressure = drag * speed * along  # sign times sign is one
-    else:
+    if LAW == 0:
         pressure = drag * speed * speed * sign
+    else:
+        pressure = drag * blow * along  # sign times sign is one
     shear = friction * speed
     if UNIT:
         # normalise first: in a wind along the normal the tangent is zero, and the other order would overflow
@@ -44,15 +45,15 @@ def aero_force(
         scale * (pressure * n[1] + shear * ty + lifting * side[1]),
         scale * (pressure * n[2] + shear * tz + lifting * side[2]),
     )
-    return force, speed
+    return force, speed, blow
 
 
 @triton.jit
 def wind_force(F, velocity, patch, wind, numbers, OPTIONS: tl.constexpr):
     """Triton twin of ``WindForce``: force on patches (normal and area at rest) and their resistance [kg/s].
 
-    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: projected law, lift in
-    the plane of flow and normal, unit tangent, semi-implicit drag.
+    ``numbers``: C_D, C_F, C_L, half the density of the air, largest ratio of areas. ``OPTIONS``: place of the law in
+    ``force.LAWS``, lift in the plane of flow and normal, unit tangent, semi-implicit drag.
     """
     return force_on_patch(F, velocity, patch, (tl.load(wind), tl.load(wind + 1), tl.load(wind + 2)), numbers, OPTIONS)
 
@@ -66,11 +67,11 @@ def force_on_patch(F, velocity, patch, air, numbers, OPTIONS: tl.constexpr):
     friction = tl.load(numbers + 1)
     lift = tl.load(numbers + 2)
     half_density = tl.load(numbers + 3)
-    force, speed = aero_force(
-        relative, normal, area, drag, friction, lift, half_density, OPTIONS[0], OPTIONS[1], OPTIONS[2]
+    force, speed, blow = aero_force(
+        relative, air, normal, area, drag, friction, lift, half_density, OPTIONS[0], OPTIONS[1], OPTIONS[2]
     )
     if OPTIONS[3]:
-        resistance = half_density * area * (drag + friction + tl.abs(lift)) * speed
+        resistance = half_density * area * (drag * blow + (friction + tl.abs(lift)) * speed)
     else:
         resistance = area * 0
     return force, resistance
@@ -127,6 +128,7 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
     half_density = tl.load(numbers + 3)
     widest = tl.load(numbers + 4)
     speed = tl.sqrt(dot3(relative, relative))
+    blow = tl.sqrt(dot3(air, air)) if OPTIONS[0] == 2 else speed
     c = cofactor(F)
     w = (
         c[0] * relative[0] + c[3] * relative[1] + c[6] * relative[2],
@@ -165,11 +167,11 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
         s, u = add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
     facing = times(c, s)
     area = growth * rest
-    if OPTIONS[0]:
-        pressure = (drag * speed * across[0], drag * speed * across[1], drag * speed * across[2])
-    else:
+    if OPTIONS[0] == 0:
         square = drag * speed * speed
         pressure = (square * facing[0], square * facing[1], square * facing[2])
+    else:
+        pressure = (drag * blow * across[0], drag * blow * across[1], drag * blow * across[2])
     if OPTIONS[2]:
         tangent = times(c, u)
         square = friction * speed * speed
@@ -195,7 +197,7 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
         scale * (pressure[2] + shear[2] + lifting * side[2]),
     )
     if OPTIONS[3]:
-        resistance = scale * area * (drag + friction + tl.abs(lift)) * speed
+        resistance = scale * area * (drag * blow + (friction + tl.abs(lift)) * speed)
     else:
         resistance = zero
     return force, resistance

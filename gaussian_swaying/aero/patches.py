@@ -9,7 +9,8 @@ vector of a patch, :math:`\mathbf{b} = A \mathbf{N}` at rest, becomes :math:`\op
     T = \frac1\kappa \operatorname{cof} F\, \Bigl(\sum_i A_i \mathbf{N}_i \mathbf{N}_i^T\Bigr) \operatorname{cof} F^T,
     \qquad A = \operatorname{tr} T, \qquad \mathbf{w} = \operatorname{cof} F^T \mathbf{v}_r
 
-The paper's drag is :math:`C_D v_r^2 \mathbf{s}`, the projected one :math:`C_D v_r T \mathbf{v}_r`, friction
+The paper's drag is :math:`C_D v_r^2 \mathbf{s}`, the projected one :math:`C_D v_r T \mathbf{v}_r`, the linear one
+:math:`C_D |\mathbf{u}| T \mathbf{v}_r` with the wind u, friction
 :math:`C_F v_r (A - T) \mathbf{v}_r`, and lift follows from s. The sum of signs is over all directions, the others are
 constant tensors of six numbers. All are exact for F that turns, or stretches patches of one direction; the mean growth
 of the area :math:`\kappa` stands for that of each patch.
@@ -68,7 +69,7 @@ class PatchSums(nn.Module):
 
     Args:
         patches: The patches.
-        coarse: Whether directions up to 0.25 rad from their mean may be joined: for the projected law, where only the
+        coarse: Whether directions up to 0.25 rad from their mean may be joined: for laws in which only the
             lift depends on the sum of signs.
 
     Attributes:
@@ -203,7 +204,8 @@ def grouped_force(
     Returns:
         Force [N], shape (P, 3), and area [m²], shape (P,).
     """
-    relative = wind.to(velocity.dtype) - velocity
+    wind = wind.to(velocity.dtype)
+    relative = wind - velocity
     speed = torch.linalg.vector_norm(relative, dim=-1, keepdim=True)
     cof = cofactor(deformation_gradient)
     pulled = (cof * relative[..., None]).sum(-2)  # w
@@ -217,7 +219,11 @@ def grouped_force(
     signed = sums(sign * patches.vector, patches.point, len(relative))
     facing = (cof * signed[..., None, :]).sum(-1)  # s
     area = growth * rest
-    pressure = drag * (speed * speed * facing if law == "paper" else speed * across)
+    if law == "paper":
+        pressure = drag * (speed * speed * facing)
+    else:
+        blow = torch.linalg.vector_norm(wind, dim=-1, keepdim=True) if law == "linear" else speed
+        pressure = drag * (blow * across)
     if unit_tangent:
         size = torch.linalg.vector_norm(patches.vector, dim=-1, keepdim=True)
         unit = patches.vector / size

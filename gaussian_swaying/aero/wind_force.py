@@ -13,7 +13,7 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying._graphs import fingerprint, record, tensors_in
 from gaussian_swaying.aero.effects import Moment
 from gaussian_swaying.aero.effects_twin import Packed, has_twin, packed, vectors
-from gaussian_swaying.aero.force import AeroForce, capped_area
+from gaussian_swaying.aero.force import LAWS, AeroForce, capped_area
 from gaussian_swaying.aero.patches import Patches, PatchSums
 from gaussian_swaying.aero.shelter import Shelter, wind_axes
 from gaussian_swaying.aero.wind import SpatialWind, WindField
@@ -300,7 +300,8 @@ class WindForce(Force):
         aero = self.aero
         implicit = aero.drag_step == "semi_implicit"
         smooth = self.uniform and not implicit
-        options: tuple[Any, ...] = (aero.law == "projected", aero.lift_direction == "lift", aero.unit_tangent, implicit)
+        law, lift = LAWS.index(aero.law), aero.lift_direction == "lift"
+        options: tuple[Any, ...] = (law, lift, aero.unit_tangent, implicit)
         functions, space = (wind_force, wind_on_groups), None
         if not self.uniform:
             kinds, space, _ = self._packed()

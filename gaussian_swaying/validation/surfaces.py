@@ -59,7 +59,7 @@ def surface_drag(shape: str, count: int, overlap: float, area: str, law: str) ->
         count: Approximate number of Gaussians.
         overlap: Standard deviation of a Gaussian over the spacing.
         area: ``coverage`` or ``paper``.
-        law: ``paper`` or ``projected``.
+        law: As in :func:`~gaussian_swaying.aero.force.aero_force`.
 
     Returns:
         ``error`` (relative), ``share`` of the exact force and ``gaussians``.

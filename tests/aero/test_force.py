@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.aero.force import AeroForce, aero_force, capped_area, drag_rate
+from gaussian_swaying.aero.force import LAWS, AeroForce, aero_force, capped_area, drag_rate
 
 RHO = 1.225
 
@@ -68,7 +68,7 @@ def test_each_term_against_the_equation():
     )
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", LAWS)
 def test_sign_of_the_normal_does_not_matter(law):
     """A splat's normal has no outside: drag must never push upwind."""
     wind, velocity, normal, area = _random()
@@ -92,7 +92,35 @@ def test_quadratic_linear_and_relative(law, device, dtype):
     assert base.dtype == dtype
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+def test_linear_law():
+    """1/2 rho A C_D |u| (u - v).n n: as `projected` at rest, linear in v on either side, and none in still air."""
+    wind, velocity, normal, area = _random()
+    options = {"drag": 0.7, "friction": 0.0, "lift": 0.0}
+    force = aero_force(wind, velocity, normal, area, law="linear", **options)
+    pressure = 0.5 * RHO * 0.7 * wind.norm() * ((wind - velocity) * normal).sum(-1)
+    torch.testing.assert_close(force, (pressure * area)[:, None] * normal)
+    rest = torch.zeros_like(velocity)
+    at_rest = aero_force(wind, rest, normal, area, law="linear", **options)
+    torch.testing.assert_close(at_rest, aero_force(wind, rest, normal, area, law="projected", **options))
+    twice = aero_force(wind, 2 * velocity, normal, area, law="linear", **options)
+    torch.testing.assert_close(twice - at_rest, 2 * (force - at_rest))
+    assert not bool(aero_force(torch.zeros(3).double(), velocity, normal, area, law="linear", **options).any())
+
+
+def test_linear_drag_rate_and_resistance():
+    """A patch faster than the wind is slowed; the rate bounds the slope, and the resistance is all of it."""
+    aero = AeroForce(0.7, 0.0, 0.0, air_density=RHO, law="linear", drag_step="semi_implicit")
+    wind, area = _vector(3, 0, 0), torch.tensor([0.2]).double()
+    velocity = torch.tensor([[5.0, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    force = aero(wind, velocity, _vector(1, 0, 0)[None], area)
+    (slope,) = torch.autograd.grad(force[0, 0], velocity)
+    assert float(force.detach()[0, 0]) < 0
+    rate = aero.rate(wind.norm()[None], area, torch.tensor([0.5]).double())
+    assert float(rate) == pytest.approx(-float(slope[0, 0]) / 0.5)
+    assert float(aero.resistance(wind, velocity.detach(), area)) == pytest.approx(-float(slope[0, 0]))
+
+
+@pytest.mark.parametrize("law", LAWS)
 def test_still_air_exerts_nothing_and_has_a_gradient(law):
     """The gradient of |v| at zero must not be NaN."""
     velocity = torch.zeros(4, 3, dtype=torch.float64, requires_grad=True)
@@ -117,7 +145,7 @@ def test_only_patches_with_an_area_feel_the_wind():
     assert bool((force[1::2].norm(dim=-1) > 0).all())
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", LAWS)
 def test_rotation_turns_the_force(law):
     wind, velocity, normal, area = _random()
     Q = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
@@ -128,7 +156,7 @@ def test_rotation_turns_the_force(law):
     )
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("lift_direction", ["side", "lift"])
 @pytest.mark.parametrize("unit_tangent", [False, True])
 def test_gradcheck(law, lift_direction, unit_tangent):
@@ -179,7 +207,7 @@ def test_drag_rate_is_the_slope_of_the_force():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"law": "plate"}, "`law` to be one of paper, projected"),
+        ({"law": "plate"}, "`law` to be one of paper, projected, linear"),
         ({"lift_direction": "up"}, "`lift_direction` to be one of side, lift"),
         ({"C_D": -0.1}, "`C_D` to not be negative"),
         ({"air_density": -1.0}, "`air_density` to not be negative"),

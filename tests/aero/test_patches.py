@@ -17,6 +17,7 @@ LAWS = {
     "paper": {"drag": 0.5, "friction": 0.4, "lift": 0.01, "law": "paper"},
     "projected": {"drag": 1.28, "friction": 0.0, "lift": 0.0, "law": "projected"},
     "projected with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "projected"},
+    "linear with all terms": {"drag": 0.5, "friction": 0.4, "lift": 0.3, "law": "linear"},
     "paper with lift": {"drag": 0.5, "friction": 0.1, "lift": 0.5, "law": "paper", "lift_direction": "lift"},
     "unit tangent": {"drag": 0.5, "friction": 0.4, "lift": 0.1, "law": "paper", "unit_tangent": True},
 }
@@ -71,7 +72,7 @@ def test_force_is_the_sum_over_the_patches(law, spread):
         torch.testing.assert_close(now.sum(), area.sum())
 
 
-@pytest.mark.parametrize("law", ["projected", "projected with all terms", "paper"])
+@pytest.mark.parametrize("law", ["projected", "projected with all terms", "linear with all terms", "paper"])
 def test_strain_costs_less_than_itself(law):
     """The mean growth of area stands for that of each patch: exact for one direction, else no worse than the strain."""
     velocity = torch.zeros(POINTS, 3, dtype=torch.float64)
@@ -146,17 +147,18 @@ def make_points():
     return MaterialPoints.create(position, volume=1e-5, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
 
 
-def test_gradients():
+@pytest.mark.parametrize("law", ["projected with all terms", "linear with all terms"])
+def test_gradients(law):
     normal, area, point = random_patches(0.3, each=3)
     sums = PatchSums(Patches(normal, area, point, POINTS))
-    wind = torch.tensor([3.0, -1.0, 0.4], dtype=torch.float64)
+    wind = torch.tensor([3.0, -1.0, 0.4], dtype=torch.float64, requires_grad=True)
     velocity = torch.zeros(POINTS, 3, dtype=torch.float64, requires_grad=True)
     F = turned(0.05).requires_grad_()
 
-    def function(velocity, F):
-        return grouped_force(wind, velocity, F, sums, **LAWS["projected with all terms"])[0]
+    def function(wind, velocity, F):
+        return grouped_force(wind, velocity, F, sums, **LAWS[law])[0]
 
-    assert torch.autograd.gradcheck(function, (velocity, F), fast_mode=True)
+    assert torch.autograd.gradcheck(function, (wind, velocity, F), fast_mode=True)
 
 
 def test_directions_are_joined_up_to_a_number():

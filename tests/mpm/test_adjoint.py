@@ -10,6 +10,7 @@ pytest.importorskip("triton", reason="needs triton, which is available on Linux 
 import triton
 import triton.language as tl
 
+from gaussian_swaying.aero.force import LAWS as WIND_LAWS
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.force_adjoint_triton import wind_force_adjoint, wind_on_groups_adjoint
 from gaussian_swaying.aero.patches import Patches, PatchSums
@@ -165,7 +166,7 @@ def test_derivative_of_the_viscous_stress(kernel_device):
 
 @pytest.mark.parametrize("unit", [False, True])
 @pytest.mark.parametrize("side", ["side", "lift"])
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", WIND_LAWS)
 def test_derivative_of_the_wind(law, side, unit, kernel_device):
     """By F, velocity, wind and coefficients, with a cap on the area, in all variants of the law."""
     dtype, tolerance = _tolerance(kernel_device, 1e-11, 1e-4)
@@ -186,7 +187,7 @@ def test_derivative_of_the_wind(law, side, unit, kernel_device):
     numbers = torch.tensor([0.6, 0.4, 0.2, 0.5 * 1.225, 1.5], dtype=WIDE)
     patch = torch.cat([normal, area[:, None]], 1)
     given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, patch, wind, numbers, a)]
-    options = (law == "projected", side == "lift", unit, False)
+    options = (WIND_LAWS.index(law), side == "lift", unit, False)
     _check_wind(given, options, wind_force_adjoint, expected, tolerance)
 
 
@@ -203,7 +204,7 @@ def _check_wind(given, options, function, expected, tolerance):
 
 
 @pytest.mark.parametrize("side", ["side", "lift"])
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", WIND_LAWS)
 def test_derivative_of_the_wind_on_groups(law, side, kernel_device):
     """Points with no, one and several patches."""
     dtype, tolerance = _tolerance(kernel_device, 1e-11, 1e-4)
@@ -221,7 +222,9 @@ def test_derivative_of_the_wind_on_groups(law, side, kernel_device):
     numbers = torch.cat([numbers, sums.table()])
     place = torch.nn.functional.pad(sums.lists(), (0, 2))
     given = [t.detach().to(kernel_device, dtype).contiguous() for t in (F, v, place, wind, numbers, a)]
-    _check_wind(given, (law == "projected", side == "lift", False, False), wind_on_groups_adjoint, expected, tolerance)
+    _check_wind(
+        given, (WIND_LAWS.index(law), side == "lift", False, False), wind_on_groups_adjoint, expected, tolerance
+    )
 
 
 def _patches(count, dtype):

@@ -426,7 +426,8 @@ def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
         {"drag_step": "semi_implicit"},
         {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
         {"max_area_ratio": 0.9},
-        interpreted=[{"law": "projected"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
+        {"law": "linear", "drag_step": "semi_implicit"},
+        interpreted=[{"law": "projected"}, {"law": "linear"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
     ),
     indirect=["kernel_device"],
     ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
@@ -441,6 +442,7 @@ def test_every_kind_of_wind(kernel_device, formulation, settings):
     _on(
         {"drag_step": "semi_implicit", "max_area_ratio": 0.9},
         {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        {"law": "linear", "drag_step": "semi_implicit"},
         interpreted=[{"law": "projected"}],
     ),
     indirect=["kernel_device"],

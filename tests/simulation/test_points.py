@@ -309,7 +309,7 @@ def test_the_kernel_of_followers_is_their_definition(up, device, make_scene):
             assert torch.equal(still.means, scene.rest().means)
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", ["paper", "projected", "linear"])
 def test_points_of_a_group_share_its_wind(law, make_scene):
     """On an oblique sheet, wind and mass of the points have one ratio, and the whole wind is that on the Gaussians."""
     cloud = FlagScene(spacing=0.01, yaw=-35.0, ripple=0.0).generate()

@@ -18,6 +18,7 @@ def test_rows_match_the_references(name, tmp_path):
         settings = parser.parse_args(arguments)
         made, sheet = settings.scene.generator.init_args, settings.material
         assert settings.solver.dx == pins.grid_spacing(pins.ROWS[name], pattern)
+        assert (settings.aero.law == "linear") == pins.ROWS[name].linear
         assert settings.scene.particle_spacing == pytest.approx(0.45 * settings.solver.dx)
         assert (made.width, made.height, made.yaw, made.ripple) == (flag.width, flag.height, flag.yaw, flag.ripple)
         assert sheet.E * sheet.thickness == pytest.approx(flag.material().membrane)

@@ -61,6 +61,19 @@ def test_a_free_plate_approaches_the_speed_of_the_wind(formulation, law):
         assert _fly(formulation, law, 5.0, (0, 0, 0), seconds) == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.parametrize("formulation", ["total", "updated"])
+def test_a_free_plate_in_linear_drag(formulation):
+    """v = U (1 - exp(-U t / L)) with L = 2 m / (rho A C): within 1 %."""
+    length = 2 * DENSITY * THICKNESS / (AIR * C)
+    for seconds in (0.08, 0.4):
+        expected = 5.0 - 5.0 * math.exp(-5.0 * seconds / length)
+        assert _fly(formulation, "linear", 5.0, (0, 0, 0), seconds) == pytest.approx(expected, rel=0.01)
+
+
+def test_linear_drag_does_nothing_in_still_air():
+    assert _fly("total", "linear", 0.0, (0, -9.8, 0), 0.12) == pytest.approx(-9.8 * 0.12, rel=0.01)
+
+
 @pytest.mark.parametrize("law", ["paper", "projected"])
 def test_a_falling_plate_reaches_its_terminal_velocity(law):
     """v = v_t tanh(g t / v_t) with v_t² = 2 m g / (rho A C), in still air, broadside: within 1 %."""
@@ -70,7 +83,7 @@ def test_a_falling_plate_reaches_its_terminal_velocity(law):
         assert _fly("total", law, 0.0, (0, -9.8, 0), seconds) == pytest.approx(-expected, rel=0.01)
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", ["paper", "projected", "linear"])
 def test_force_on_a_plate_does_not_depend_on_the_gaussians_that_carry_it(law):
     """Number and overlap of the Gaussians vary: the force stays within 3 % with `coverage`, not with `paper`."""
     kinds = [(256, 0.5), (1600, 0.3), (1600, 1.0), (4096, 0.6)]
@@ -232,7 +245,7 @@ def test_the_mirror_image_feels_the_mirrored_force(options, parity, axis):
     assert float((image - force * mirror).abs().max() > 0.1) == (parity < 0)
 
 
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", ["paper", "projected", "linear"])
 def test_force_grows_with_the_square_of_the_wind(law):
     wind, _, F, normal, area = _patches()
     aero, still = AeroForce(law=law), torch.zeros(len(area), 3, dtype=torch.float64)
@@ -279,7 +292,7 @@ def _blow(solver, state, normal, aero, wind, steps, dt=2e-4):
 
 
 @pytest.mark.parametrize("formulation", ["total", "updated"])
-@pytest.mark.parametrize("law", ["paper", "projected"])
+@pytest.mark.parametrize("law", ["paper", "projected", "linear"])
 def test_nothing_moves_in_still_air(formulation, law):
     solver, state, normal = _sheet(formulation, pinned=True, bump=0.01)
     rest = state.position

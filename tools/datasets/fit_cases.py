@@ -152,7 +152,7 @@ def scene_settings(
     Args:
         pattern: The case.
         video: Its video.
-        law: ``projected``, the closest law that is always there, or ``linear``, that of the data.
+        law: ``projected``, that of a plate, or ``linear``, that of the data.
         folder: Where the case is.
         spacing: Distance between Gaussians [m].
     """

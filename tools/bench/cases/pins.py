@@ -28,22 +28,25 @@ class Pin:
     Attributes:
         kind: What is held: the ``nodes`` of the grid, or places on the cloth (``hinge``).
         dx: Grid spacing [m]; None for that of the configuration.
+        linear: Whether the drag is linear in the velocity of the cloth, as in the reference.
     """
 
     kind: str
     dx: float | None
+    linear: bool = False
 
     def title(self) -> str:
         """The name in the tables."""
         what = {"nodes": "nodes held", "hinge": "hinges"}[self.kind]
-        return f"{what}, dx = {f'{self.dx:g} m' if self.dx else '0.015 to 0.025 m'}"
+        law = ", linear law" if self.linear else ""
+        return f"{what}, dx = {f'{self.dx:g} m' if self.dx else '0.015 to 0.025 m'}{law}"
 
 
 ROWS = {
     f"{kind}{name}": Pin(kind, dx)
     for kind in ("nodes", "hinge")
     for name, dx in (("", None), ("_025", 0.025), ("_04", 0.04), ("_08", 0.08))
-}
+} | {f"{kind}_04_linear": Pin(kind, 0.04, linear=True) for kind in ("nodes", "hinge")}
 """All rows, by name."""
 
 _EDGES = {1: "max=[0.00625,9,9]", 3: "min=[-9,-9,1.19]", 5: "min=[-9,-9,0.794]"}  # of the held box [m]: one row of
@@ -61,6 +64,7 @@ def variant(pin: Pin, pattern: int) -> Variant:
     options = flags.grid_options(pin.dx) if pin.dx else ()
     held = "--solver.boundaries.init_args"  # of the last boundary: each flag has one
     options += (f"{held}.kind={pin.kind}",)
+    options += ("--aero.law=linear",) if pin.linear else ()
     if pin.kind == "hinge" and pattern in _EDGES:
         options += (f"{held}.region.init_args.{_EDGES[pattern]}",)
     return Variant(pin.title(), options=options, patterns=(pattern,))
