@@ -53,7 +53,7 @@ def plane_wake(behind, aside, width, drag):
     """As ``obstacle_flow.plane_wake``."""
     thickness = 0.5 * drag * width
     least = 2 * thickness / 1.7724538509055159  # the square root of pi
-    sigma = tl.maximum(PLANE_GROWTH * tl.sqrt(thickness * tl.maximum(behind, 0.0)), least)
+    sigma = tl.maximum(tl.sqrt(thickness * tl.maximum(behind, 0.0)) * PLANE_GROWTH, least)
     depth = (1 - tl.sqrt(tl.maximum(1 - least / sigma, 0.0))) * 0.7071067811865476
     far = aside / sigma
     return tl.where(behind > 0, depth * tl.exp(-0.5 * far * far), 0.0)

@@ -86,8 +86,10 @@ class WindForce(Force):
             winds, scenes = len(wind), tuple(normal.shape[:-2])  # type: ignore[arg-type]
             if scenes != (winds,) and not (isinstance(wind, WindBatch) and scenes == ()):  # () for all scenes alike
                 raise ValueError(f"Expected one `wind` for each of the {scenes} scenes, but got {winds}.")
-            if self.sums is not None:
-                raise ValueError("Patches of several directions on a point need one wind: simulate one by one.")
+            if self.sums is not None and isinstance(wind, WindBatch):
+                raise ValueError(
+                    "Patches of several directions on a point need a list of winds: pass it, not a WindBatch."
+                )
         self._key: tuple[tuple[object, ...], ...] = ()
         self._graph: torch.cuda.CUDAGraph | None = None
         self._space: Packed | None = None

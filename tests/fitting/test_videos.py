@@ -6,6 +6,7 @@ import shutil
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 
 from gaussian_swaying.fitting.videos import frame_times, read_videos
 
@@ -20,8 +21,8 @@ def test_two_cameras(own):
     assert left.size == (200, 120)
     assert frame_times([left, right]) == pytest.approx([k / 24 for k in range(FRAMES)], abs=1e-6)
     wanted = cameras()["left"]
-    assert left.cameras[0].world_to_camera.tolist() == pytest.approx(wanted.world_to_camera.tolist(), abs=1e-5)
-    assert left.cameras[0].intrinsics.tolist() == pytest.approx(wanted.intrinsics.tolist(), abs=1e-4)
+    assert torch.allclose(left.cameras[0].world_to_camera, wanted.world_to_camera, atol=1e-5)
+    assert torch.allclose(left.cameras[0].intrinsics, wanted.intrinsics, atol=1e-4)
 
 
 def test_a_video_file(own, tmp_path):
@@ -48,7 +49,6 @@ def test_bad_videos(own, tmp_path):
     for change, words in (
         (lambda frame: frame.pop("time"), r"frames\[0\].time"),
         (lambda frame: frame.pop("camera"), "two frames"),
-        (lambda frame: frame.update(mask_path="left_0000.png", file_path="right_0000.png"), "two frames"),
     ):
         other = json.loads(json.dumps(given))
         for frame in other["frames"]:

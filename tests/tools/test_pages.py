@@ -17,6 +17,7 @@ NAMES = (
     "flag_benchmark.md",
     "gallery.md",
     "live.md",
+    "many.md",
     "training.md",
     "validation.md",
     "web.md",
