@@ -24,7 +24,7 @@ LEAST_MARGIN = 0.5
 ARM = 1.2
 """How much farther a place may move than any material point."""
 
-TOLERANCE = 1e-4
+TOLERANCE = 5e-5
 """Violation of a constraint within a substep at which the impulses are good enough [cells]."""
 
 AHEAD = 3.0
