@@ -6,6 +6,7 @@ parser are counted first, which takes little memory.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -126,11 +127,44 @@ def check_config_files(arguments: Sequence[str]) -> None:
                 continue  # YAML on the command line, or an error that the parser reports
         except (OSError, ValueError):
             continue
-        path = check_regular(argument, "the configuration", LARGEST)
-        try:
-            path.read_text(encoding="utf-8")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{path} is not UTF-8 text ({error.reason}): save it as UTF-8.") from error
+        _text(check_regular(argument, "the configuration", LARGEST))
 
 
-__all__ = ["check_config_files", "check_yaml", "limit_yaml"]
+def read_fields(path: str | os.PathLike[str], what: str, fields: Sequence[str]) -> dict[str, Any]:
+    """Read a YAML file with known fields at the top; any of them may be missing.
+
+    Args:
+        path: The file.
+        what: What the file should be, for the message, for example "the sweep file".
+        fields: Names that it may have.
+
+    Returns:
+        What is given, by name.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not a regular file, too large, not YAML, or has another field.
+    """
+    import yaml
+
+    file = check_regular(path, what, LARGEST)
+    try:
+        given = yaml.safe_load(check_yaml(_text(file)))
+    except yaml.YAMLError as error:
+        raise ValueError(f"{file} is not valid YAML ({' '.join(str(error).split())}): correct it.") from error
+    if not isinstance(given, dict):
+        raise ValueError(f"Expected {file} to have the fields {', '.join(fields)}, but got {given!r:.60}.")
+    for name in given:
+        if name not in fields:
+            raise ValueError(f"{file} has an unknown field `{name}`: use {', '.join(fields)}.")
+    return given
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 text ({error.reason}): save it as UTF-8.") from error
+
+
+__all__ = ["check_config_files", "check_yaml", "limit_yaml", "read_fields"]

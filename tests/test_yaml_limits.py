@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gaussian_swaying._yaml_limits import check_config_files, check_yaml
+from gaussian_swaying._yaml_limits import check_config_files, check_yaml, read_fields
 from gaussian_swaying.cli.simulate import main
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").rglob("*.yaml"))
@@ -78,3 +78,24 @@ def test_files_that_are_no_configurations(tmp_path):
 def test_a_group_without_fields(capsys):
     assert main(["--config", "wind: [1, 2]", "--frames", "2"]) == 2
     assert "Expected `wind` to contain fields" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"frames: [1", "fields.yaml is not valid YAML"),
+        (b"[frames]", "to have the fields frames, output, but got"),
+        (b"", "to have the fields frames, output, but got None"),
+        (b"frame: 3", "unknown field `frame`: use frames, output"),
+        ("output: Blüte".encode("latin-1"), "fields.yaml is not UTF-8 text"),
+    ],
+)
+def test_a_file_of_known_fields(text, words, tmp_path):
+    path = tmp_path / "fields.yaml"
+    path.write_bytes(text)
+    with pytest.raises(ValueError, match=words):
+        read_fields(path, "the plan", ("frames", "output"))
+    path.write_text("frames: 3")
+    assert read_fields(path, "the plan", ("frames", "output")) == {"frames": 3}
+    with pytest.raises(FileNotFoundError, match="the path of the plan"):
+        read_fields(tmp_path / "none.yaml", "the plan", ("frames",))

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gaussian_swaying._inputs import check_regular
-from gaussian_swaying._yaml_limits import LARGEST, check_config_files, check_yaml
+from gaussian_swaying._yaml_limits import check_config_files, read_fields
 from gaussian_swaying.fitting.unknowns import Unknown, default_scale
 from gaussian_swaying.simulation.config import check_settings, option
 from gaussian_swaying.simulation.simulation import Simulation
@@ -100,18 +99,8 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
         FileNotFoundError: If there is no such file.
         ValueError: If the file is invalid; the message names the entry and the remedy.
     """
-    import yaml
-
-    file = check_regular(path, "the fit file", LARGEST)
-    try:
-        given = yaml.safe_load(check_yaml(file.read_text(encoding="utf-8")))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{file} is not valid YAML ({' '.join(str(error).split())}): correct it.") from error
-    if not isinstance(given, dict):
-        raise ValueError(f"Expected {file} to have the fields {', '.join(_FIELDS)}, but got {given!r:.60}.")
-    for name in given:
-        if name not in _FIELDS:
-            raise ValueError(f"{file} has an unknown field `{name}`: use {', '.join(_FIELDS)}.")
+    file = Path(path)
+    given = read_fields(file, "the fit file", _FIELDS)
     sought = given.get("unknowns")
     if not isinstance(sought, dict) or not sought:
         raise ValueError(

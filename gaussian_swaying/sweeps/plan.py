@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying._yaml_limits import LARGEST, check_config_files, check_yaml
+from gaussian_swaying._yaml_limits import check_config_files, read_fields
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.config import check_settings, config_text, option, parse_text
 from gaussian_swaying.simulation.simulation import Simulation
@@ -78,18 +78,8 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
         ValueError: If the file is invalid; the message names the entry and the remedy.
         FileNotFoundError: If there is no such file.
     """
-    import yaml
-
-    file = check_regular(path, "the sweep file", LARGEST)
-    try:
-        given = yaml.safe_load(check_yaml(file.read_text(encoding="utf-8")))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{file} is not valid YAML ({' '.join(str(error).split())}): correct it.") from error
-    if not isinstance(given, dict):
-        raise ValueError(f"Expected {file} to have the fields {', '.join(FIELDS)}, but got {given!r:.60}.")
-    for name in given:
-        if name not in FIELDS:
-            raise ValueError(f"{file} has an unknown field `{name}`: use {', '.join(FIELDS)}.")
+    file = Path(path)
+    given = read_fields(file, "the sweep file", FIELDS)
     base = given.get("base")
     base = [base] if isinstance(base, str) else base
     if not isinstance(base, list) or not base or not all(isinstance(name, str) for name in base):
