@@ -3,15 +3,21 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.aero.force_triton import add_direction, times
-from gaussian_swaying.geometry.linalg_triton import axpy9, cofactor, cofactor_change, cross3, dot3, load3, matmul
+from gaussian_swaying.aero.force_triton import add_direction
+from gaussian_swaying.geometry.linalg_triton import (
+    axpy3,
+    axpy9,
+    cofactor,
+    cofactor_change,
+    cross3,
+    dot3,
+    load3,
+    matmul,
+    matvec,
+    outer3,
+    transpose,
+)
 from gaussian_swaying.geometry.patches_triton import area_vector
-
-
-@triton.jit
-def _sum3(s, a, t, b):
-    """S a + t b for vectors."""
-    return (s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2])
 
 
 @triton.jit
@@ -34,50 +40,50 @@ def force_adjoint(
         blow = tl.sqrt(dot3(air, air))
         pressure = blow * along * g
         by_r = (drag * g * blow * n[0], drag * g * blow * n[1], drag * g * blow * n[2])
-        by_n = _sum3(drag * g * blow, r, drag * blow * along, a)
+        by_n = axpy3(drag * g * blow, r, drag * blow * along, a)
         push = drag * g * along / tl.maximum(blow, 1e-30)
         by_air = (push * air[0], push * air[1], push * air[2])
     elif LAW == 1:
         pressure = speed * along * g
-        by_r = _sum3(drag * g * along * inverse, r, drag * g * speed, n)
-        by_n = _sum3(drag * g * speed, r, drag * speed * along, a)
+        by_r = axpy3(drag * g * along * inverse, r, drag * g * speed, n)
+        by_n = axpy3(drag * g * speed, r, drag * speed * along, a)
     else:
         pressure = square * sign * g
         by_r = (2 * drag * sign * g * r[0], 2 * drag * sign * g * r[1], 2 * drag * sign * g * r[2])
         by_n = (drag * square * sign * a[0], drag * square * sign * a[1], drag * square * sign * a[2])
     # friction
-    t = _sum3(1.0, r, -along, n)
+    t = axpy3(1.0, r, -along, n)
     if UNIT:
         size = tl.maximum(tl.sqrt(dot3(t, t)), 1e-18)  # finite where there is no tangent
         b = (t[0] / size, t[1] / size, t[2] / size)
         shear = dot3(a, b)
         w = ((a[0] - shear * b[0]) / size, (a[1] - shear * b[1]) / size, (a[2] - shear * b[2]) / size)
         wn = dot3(w, n)
-        more = _sum3(2 * shear, r, square, _sum3(1.0, w, -wn, n))
-        turn = _sum3(-square * wn, r, -square * along, w)
+        more = axpy3(2 * shear, r, square, axpy3(1.0, w, -wn, n))
+        turn = axpy3(-square * wn, r, -square * along, w)
         shear = square * shear
     else:
         shear = dot3(a, t)
-        more = _sum3(shear * inverse, r, speed, _sum3(1.0, a, -g, n))
-        turn = _sum3(-speed * g, r, -speed * along, a)
+        more = axpy3(shear * inverse, r, speed, axpy3(1.0, a, -g, n))
+        turn = axpy3(-speed * g, r, -speed * along, a)
         shear = speed * shear
-    by_r = _sum3(1.0, by_r, friction, more)
-    by_n = _sum3(1.0, by_n, friction, turn)
+    by_r = axpy3(1.0, by_r, friction, more)
+    by_n = axpy3(1.0, by_n, friction, turn)
     # lift
     if LIFT:
         ar = dot3(a, r)
         side = sign * (square * g - along * ar)
-        more = _sum3(1.0, _sum3(2 * g, r, -along, a), -ar, n)
-        turn = _sum3(square, a, -ar, r)
+        more = axpy3(1.0, axpy3(2 * g, r, -along, a), -ar, n)
+        turn = axpy3(square, a, -ar, r)
     else:
         across = cross3(n, a)
         product = dot3(r, across)
         side = sign * speed * product
-        more = _sum3(product * inverse, r, speed, across)
+        more = axpy3(product * inverse, r, speed, across)
         turn = cross3(a, r)
         turn = (speed * turn[0], speed * turn[1], speed * turn[2])
-    by_r = _sum3(1.0, by_r, sign * lift, more)
-    by_n = _sum3(1.0, by_n, sign * lift, turn)
+    by_r = axpy3(1.0, by_r, sign * lift, more)
+    by_n = axpy3(1.0, by_n, sign * lift, turn)
     return by_r, by_air, by_n, (pressure, shear, side), drag * pressure + friction * shear + lift * side
 
 
@@ -109,37 +115,17 @@ def wind_force_adjoint(F, velocity, patch, wind, numbers, a, OPTIONS: tl.constex
     growth = tl.where(size < widest, half * whole, 0.0) * tl.where(det < 0, -1.0, 1.0)
     turn = area * scale
     normal_part = dot3(by_n, n)
-    v0 = turn * (by_n[0] - normal_part * n[0]) + growth * n[0]
-    v1 = turn * (by_n[1] - normal_part * n[1]) + growth * n[1]
-    v2 = turn * (by_n[2] - normal_part * n[2]) + growth * n[2]
-    outer = (
-        v0 * rest[0], v0 * rest[1], v0 * rest[2], v1 * rest[0], v1 * rest[1], v1 * rest[2],
-        v2 * rest[0], v2 * rest[1], v2 * rest[2],
-    )  # fmt: skip
+    v = (
+        turn * (by_n[0] - normal_part * n[0]) + growth * n[0],
+        turn * (by_n[1] - normal_part * n[1]) + growth * n[1],
+        turn * (by_n[2] - normal_part * n[2]) + growth * n[2],
+    )
     by_wind = (area * by_r[0], area * by_r[1], area * by_r[2])
     by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
     if OPTIONS[0] == 2:
-        by_wind = _sum3(1.0, by_wind, area, by_air)
-    return cofactor_change(F, outer), by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
-
-
-@triton.jit
-def _outer(a, b):
-    """A b^T in nine parts."""
-    return (
-        a[0] * b[0], a[0] * b[1], a[0] * b[2], a[1] * b[0], a[1] * b[1], a[1] * b[2],
-        a[2] * b[0], a[2] * b[1], a[2] * b[2],
-    )  # fmt: skip
-
-
-@triton.jit
-def _transposed(m, x):
-    """M^T x."""
-    return (
-        m[0] * x[0] + m[3] * x[1] + m[6] * x[2],
-        m[1] * x[0] + m[4] * x[1] + m[7] * x[2],
-        m[2] * x[0] + m[5] * x[1] + m[8] * x[2],
-    )
+        by_wind = axpy3(1.0, by_wind, area, by_air)
+    by_F = cofactor_change(F, outer3(v, rest))
+    return by_F, by_velocity, by_wind, (area * parts[0], area * parts[1], area * parts[2])
 
 
 @triton.jit
@@ -162,7 +148,7 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
     inverse = 1.0 / tl.maximum(speed, 1e-30)
     square = speed * speed
     c = cofactor(F)
-    w = _transposed(c, r)
+    w = matvec(transpose(c), r)
     t0 = tl.load(numbers + first, real, 0.0)
     t1 = tl.load(numbers + first + 1, real, 0.0)
     t2 = tl.load(numbers + first + 2, real, 0.0)
@@ -192,16 +178,16 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
         + turned[5] * c[5] + turned[6] * c[6] + turned[7] * c[7] + turned[8] * c[8]
     )  # fmt: skip
     growth = tl.where(real, tl.sqrt(tl.maximum(grown / whole, 1.2e-38)), 1.0)
-    across = times(turned, w)
+    across = matvec(turned, w)
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
-    facing = times(c, s)
+    facing = matvec(c, s)
     area = growth * rest
     ar = dot3(a, r)
     ac = dot3(a, across)
     af = dot3(a, facing)
     rub = area * ar - ac
     shear = speed * rub
-    by_r = _sum3(friction * rub * inverse, r, friction * speed * area, a)
+    by_r = axpy3(friction * rub * inverse, r, friction * speed * area, a)
     by_area = friction * speed * ar
     to_across = -friction * speed
     by_air = (zero, zero, zero)
@@ -214,40 +200,40 @@ def wind_on_groups_adjoint(F, velocity, place, wind, numbers, a, OPTIONS: tl.con
         by_facing = (zero, zero, zero)
     elif OPTIONS[0] == 1:
         pressure = speed * ac
-        by_r = _sum3(1.0, by_r, drag * ac * inverse, r)
+        by_r = axpy3(1.0, by_r, drag * ac * inverse, r)
         to_across += drag * speed
         by_facing = (zero, zero, zero)
     else:
         pressure = square * af
-        by_r = _sum3(1.0, by_r, 2 * drag * af, r)
+        by_r = axpy3(1.0, by_r, 2 * drag * af, r)
         by_facing = (drag * square * a[0], drag * square * a[1], drag * square * a[2])
     if OPTIONS[1]:
         rf = dot3(r, facing)
         side = square * af - ar * rf
-        by_r = _sum3(1.0, by_r, lift, _sum3(1.0, _sum3(2 * af, r, -rf, a), -ar, facing))
-        by_facing = _sum3(1.0, by_facing, lift, _sum3(square, a, -ar, r))
+        by_r = axpy3(1.0, by_r, lift, axpy3(1.0, axpy3(2 * af, r, -rf, a), -ar, facing))
+        by_facing = axpy3(1.0, by_facing, lift, axpy3(square, a, -ar, r))
     else:
         turn = cross3(facing, a)
         product = dot3(r, turn)
         side = speed * product
-        by_r = _sum3(1.0, by_r, lift, _sum3(product * inverse, r, speed, turn))
-        by_facing = _sum3(1.0, by_facing, lift * speed, cross3(a, r))
+        by_r = axpy3(1.0, by_r, lift, axpy3(product * inverse, r, speed, turn))
+        by_facing = axpy3(1.0, by_facing, lift * speed, cross3(a, r))
     by_across = (to_across * a[0], to_across * a[1], to_across * a[2])
     total = drag * pressure + friction * shear + lift * side
     cap = tl.minimum(widest / growth, 1.0)
     by_growth = by_area * rest - dot3(by_across, across) / growth - tl.where(growth > widest, total / growth, 0.0)
     scaled = (by_across[0] / growth, by_across[1] / growth, by_across[2] / growth)
-    by_w = _transposed(turned, scaled)
-    by_r = _sum3(1.0, by_r, 1.0, times(c, by_w))
+    by_w = matvec(transpose(turned), scaled)
+    by_r = axpy3(1.0, by_r, 1.0, matvec(c, by_w))
     by_grown = by_growth / (2 * growth * whole)
-    by_turned = axpy9(1.0, _outer(scaled, w), by_grown, c)
-    by_c = axpy9(1.0, _outer(by_facing, s), 1.0, matmul(by_turned, tensor))
-    by_c = axpy9(1.0, by_c, 1.0, _outer(r, by_w))
+    by_turned = axpy9(1.0, outer3(scaled, w), by_grown, c)
+    by_c = axpy9(1.0, outer3(by_facing, s), 1.0, matmul(by_turned, tensor))
+    by_c = axpy9(1.0, by_c, 1.0, outer3(r, by_w))
     by_c = axpy9(1.0, by_c, by_grown, turned)
     scale = tl.where(real, half * cap, 0.0)
     by_c = axpy9(scale, by_c, 0.0, c)
     by_wind = (scale * by_r[0], scale * by_r[1], scale * by_r[2])
     by_velocity = (-by_wind[0], -by_wind[1], -by_wind[2])
     if OPTIONS[0] == 2:
-        by_wind = _sum3(1.0, by_wind, scale, by_air)
+        by_wind = axpy3(1.0, by_wind, scale, by_air)
     return cofactor_change(F, by_c), by_velocity, by_wind, (scale * pressure, scale * shear, scale * side)

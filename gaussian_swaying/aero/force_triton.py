@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from gaussian_swaying.geometry.linalg_triton import cofactor, cross3, dot3, load3
+from gaussian_swaying.geometry.linalg_triton import cofactor, cross3, dot3, load3, matvec, transpose
 from gaussian_swaying.geometry.patches_triton import deform_patch
 
 
@@ -78,16 +78,6 @@ def force_on_patch(F, velocity, patch, air, numbers, OPTIONS: tl.constexpr):
 
 
 @triton.jit
-def times(a, x):
-    """A matrix in nine parts times a vector."""
-    return (
-        a[0] * x[0] + a[1] * x[1] + a[2] * x[2],
-        a[3] * x[0] + a[4] * x[1] + a[5] * x[2],
-        a[6] * x[0] + a[7] * x[1] + a[8] * x[2],
-    )
-
-
-@triton.jit
 def add_direction(s, u, b, w, known, UNIT: tl.constexpr):
     """Add the area vector b to the sums of signed vectors and (UNIT) of tangents of length |b|."""
     along = dot3(b, w)
@@ -130,11 +120,7 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
     speed = tl.sqrt(dot3(relative, relative))
     blow = tl.sqrt(dot3(air, air)) if OPTIONS[0] == 2 else speed
     c = cofactor(F)
-    w = (
-        c[0] * relative[0] + c[3] * relative[1] + c[6] * relative[2],
-        c[1] * relative[0] + c[4] * relative[1] + c[7] * relative[2],
-        c[2] * relative[0] + c[5] * relative[1] + c[8] * relative[2],
-    )
+    w = matvec(transpose(c), relative)
     t0 = tl.load(numbers + first, real, 0.0)
     t1 = tl.load(numbers + first + 1, real, 0.0)
     t2 = tl.load(numbers + first + 2, real, 0.0)
@@ -143,14 +129,14 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
     t5 = tl.load(numbers + first + 5, real, 0.0)
     tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
     rest = t0 + t3 + t5
-    r0 = times(tensor, (c[0], c[1], c[2]))
-    r1 = times(tensor, (c[3], c[4], c[5]))
-    r2 = times(tensor, (c[6], c[7], c[8]))
+    r0 = matvec(tensor, (c[0], c[1], c[2]))
+    r1 = matvec(tensor, (c[3], c[4], c[5]))
+    r2 = matvec(tensor, (c[6], c[7], c[8]))
     grown = c[0] * r0[0] + c[1] * r0[1] + c[2] * r0[2]
     grown += c[3] * r1[0] + c[4] * r1[1] + c[5] * r1[2]
     grown += c[6] * r2[0] + c[7] * r2[1] + c[8] * r2[2]
     growth = tl.sqrt(tl.maximum(grown / tl.maximum(rest, 1.2e-38), 1.2e-38))
-    across = times(c, times(tensor, w))
+    across = matvec(c, matvec(tensor, w))
     across = (across[0] / growth, across[1] / growth, across[2] / growth)
     zero = rest * 0
     s = (zero, zero, zero)
@@ -165,7 +151,7 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
         s, u = add_direction(s, u, b1, w, k + 1 < count, OPTIONS[2])
         s, u = add_direction(s, u, b2, w, k + 2 < count, OPTIONS[2])
         s, u = add_direction(s, u, b3, w, k + 3 < count, OPTIONS[2])
-    facing = times(c, s)
+    facing = matvec(c, s)
     area = growth * rest
     if OPTIONS[0] == 0:
         square = drag * speed * speed
@@ -173,7 +159,7 @@ def force_on_group(F, velocity, place, air, numbers, OPTIONS: tl.constexpr):
     else:
         pressure = (drag * blow * across[0], drag * blow * across[1], drag * blow * across[2])
     if OPTIONS[2]:
-        tangent = times(c, u)
+        tangent = matvec(c, u)
         square = friction * speed * speed
         shear = (square * tangent[0], square * tangent[1], square * tangent[2])
     else:

@@ -100,6 +100,15 @@ def matvec(m, x):
 
 
 @triton.jit
+def outer3(a, b):
+    """A b^T of two vectors."""
+    return (
+        a[0] * b[0], a[0] * b[1], a[0] * b[2], a[1] * b[0], a[1] * b[1], a[1] * b[2],
+        a[2] * b[0], a[2] * b[1], a[2] * b[2],
+    )  # fmt: skip
+
+
+@triton.jit
 def cofactor(a):
     """The cofactor matrix."""
     return (
@@ -175,6 +184,12 @@ def axpy9(s, a, t, b):
         s * a[3] + t * b[3], s * a[4] + t * b[4], s * a[5] + t * b[5],
         s * a[6] + t * b[6], s * a[7] + t * b[7], s * a[8] + t * b[8],
     )  # fmt: skip
+
+
+@triton.jit
+def axpy3(s, a, t, b):
+    """S a + t b for vectors."""
+    return (s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2])
 
 
 @triton.jit

@@ -13,10 +13,10 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import axpy9, load3, scale9
-from gaussian_swaying.mpm.laws.triton.body import ROW, pk1_adjoint
+from gaussian_swaying.mpm.laws.triton.body import pk1_adjoint
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
 from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, vector_of
-from gaussian_swaying.mpm.triton.total_kernels import gather
+from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -64,40 +64,17 @@ def particles_adjoint(
     the vector and the numbers of the force are written to a row of eight for each substep and cell.
     """
     step = tl.load(last) - tl.load(first_step) - step_offset
-    cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
-    real = cell < cells
-    start = tl.load(cell_start + cell, real, 0)
-    end = tl.load(cell_start + cell + 1, real, 0)
-    node = tl.load(cell_node + cell, real, 0)[:, None]
-    scene = tl.load(cell_scene + cell, real, 0)[:, None]
-    longest = tl.max(end - start)
+    cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
     lane = tl.arange(0, LANES)[None, :]
     known = real[:, None]
     for chunk in range(0, longest, LANES):
         index = start[:, None] + chunk + lane
         mask = index < end[:, None]
-        f = (
-            tl.load(fraction + index, mask, 1.0),
-            tl.load(fraction + count + index, mask, 1.0),
-            tl.load(fraction + 2 * count + index, mask, 1.0),
-        )
-        volume = tl.load(material + index, mask, 0.0)
-        mu = tl.load(material + count + index, mask, 0.0)
-        lam = tl.load(material + 2 * count + index, mask, 0.0)
+        f, volume, mu, lam = load_particles(fraction, material, count, index, mask)
         wz, gz = axis_weights(f[2], inverse_dx)
-        if VISCOUS:
-            _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-            v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-        elif ADJOINT is not None:
-            _u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
-        else:
-            _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-        F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+        _u, F, v, rate = motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, ADJOINT is not None)
         a, Q, _v = gather(force_bar, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-        if MULTI:
-            row = law_table + ROW * tl.load(law + index, mask, 0)
-        else:
-            row = law_table
+        row = law_row(law, law_table, index, mask, MULTI)
         by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
         if VISCOUS:
             more, by_rate, one, two = kelvin_voigt_adjoint(F, rate, Q, mu, lam, viscous_time)

@@ -75,6 +75,58 @@ def gather(field, node, sx, sy, f, wz, gz, inverse_dx, mask, BOTH: tl.constexpr)
     return (u0, u1, u2), (g00, g01, g02, g10, g11, g12, g20, g21, g22), (v0, v1, v2)
 
 
+@triton.jit
+def cells_of(cell_start, cell_node, cell_scene, cells, CELLS: tl.constexpr):
+    """The cells of a program: numbers, which are real, their particles from start to end, node, scene, most particles.
+
+    Node and scene have a second axis for the lanes.
+    """
+    cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
+    real = cell < cells
+    start = tl.load(cell_start + cell, real, 0)
+    end = tl.load(cell_start + cell + 1, real, 0)
+    node = tl.load(cell_node + cell, real, 0)[:, None]
+    scene = tl.load(cell_scene + cell, real, 0)[:, None]
+    return cell, real, start, end, node, scene, tl.max(end - start)
+
+
+@triton.jit
+def load_particles(fraction, material, count, index, mask):
+    """Place in the cell, volume, mu and lambda of some particles.
+
+    A lane without a particle is put in the middle of the cell: outside it F might be inverted, which is slow.
+    """
+    f = (
+        tl.load(fraction + index, mask, 1.0),
+        tl.load(fraction + count + index, mask, 1.0),
+        tl.load(fraction + 2 * count + index, mask, 1.0),
+    )
+    volume = tl.load(material + index, mask, 0.0)
+    mu = tl.load(material + count + index, mask, 0.0)
+    lam = tl.load(material + 2 * count + index, mask, 0.0)
+    return f, volume, mu, lam
+
+
+@triton.jit
+def motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS: tl.constexpr, MOVING: tl.constexpr):
+    """Displacement, F, velocity (with VISCOUS or MOVING) and the velocity's gradient (with VISCOUS) of particles."""
+    u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, MOVING and not VISCOUS)
+    rate = F
+    if VISCOUS:
+        v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
+    return u, (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1), v, rate
+
+
+@triton.jit
+def law_row(law, law_table, index, mask, MULTI: tl.constexpr):
+    """Where the numbers of the law of some particles are."""
+    if MULTI:
+        row = law_table + ROW * tl.load(law + index, mask, 0)
+    else:
+        row = law_table
+    return row
+
+
 @triton.jit(do_not_specialize=VARIES)
 def total_particles(
     fraction, material, law, law_table, values, force_in, load, order, count,
@@ -95,40 +147,16 @@ def total_particles(
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)
     before = tl.load(schedule + step * 4)
-    cell = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
-    real = cell < cells
-    start = tl.load(cell_start + cell, real, 0)
-    end = tl.load(cell_start + cell + 1, real, 0)
-    node = tl.load(cell_node + cell, real, 0)[:, None]
-    scene = tl.load(cell_scene + cell, real, 0)[:, None]
-    longest = tl.max(end - start)
+    cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
     lane = tl.arange(0, LANES)[None, :]
     known = real[:, None]
     for chunk in range(0, longest, LANES):
         index = start[:, None] + chunk + lane
         mask = index < end[:, None]
-        # a lane without a particle is put in the middle of the cell: outside it F might be inverted, which is slow
-        f = (
-            tl.load(fraction + index, mask, 1.0),
-            tl.load(fraction + count + index, mask, 1.0),
-            tl.load(fraction + 2 * count + index, mask, 1.0),
-        )
-        volume = tl.load(material + index, mask, 0.0)
-        mu = tl.load(material + count + index, mask, 0.0)
-        lam = tl.load(material + 2 * count + index, mask, 0.0)
+        f, volume, mu, lam = load_particles(fraction, material, count, index, mask)
         wz, gz = axis_weights(f[2], inverse_dx)
-        if VISCOUS:
-            u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-            v, rate, _v = gather(fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-        elif LOADED:
-            u, F, v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, True)
-        else:
-            u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, known, False)
-        F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
-        if MULTI:
-            row = law_table + ROW * tl.load(law + index, mask, 0)
-        else:
-            row = law_table
+        u, F, v, rate = motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS, LOADED)
+        row = law_row(law, law_table, index, mask, MULTI)
         stress = pk1(F, mu, lam, row, LAWS)
         if VISCOUS:
             stress = axpy9(1.0, stress, 1.0, kelvin_voigt_pk1(F, rate, mu, lam, viscous_time))
