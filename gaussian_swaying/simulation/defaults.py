@@ -15,6 +15,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
 
+HoldLike = Region | PinnedRegion | PinnedPoints
 CELLS = 32
 """Largest number of grid cells along the longest side if no solver is given."""
 
@@ -78,7 +80,7 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     return Scene(ply=source, up=direction)
 
 
-def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud: GaussianCloud) -> MPMSolver:
+def as_solver(solver: MPMSolver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud) -> MPMSolver:
     """Return the given solver, or make one whose grid suits the size of the scene.
 
     What is held has no gravity then, as in the starters of the preview: its shape at rest is one in balance with its
@@ -88,7 +90,7 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud
         ValueError: If ``hold`` is given together with a solver.
     """
     if solver is None:
-        pins = [] if hold is None else [PinnedRegion(hold)]
+        pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []
         chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
         means = cloud.means[chosen]
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
@@ -98,8 +100,7 @@ def as_solver(solver: MPMSolver | None, hold: Region | None, scene: Scene, cloud
         return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins)
     if hold is not None:
         raise ValueError(
-            "`hold` only works without a solver: add PinnedRegion(...) to the `boundaries` of the solver, and leave "
-            "out `hold`."
+            "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
         )
     return solver
 
@@ -151,6 +152,6 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "edits": (list, tuple),
     "recorder": (Recorder,),
     "normalisation": (Normalisation,),
-    "hold": (Region,),
+    "hold": (Region, PinnedRegion, PinnedPoints),
 }
 _LISTS: dict[str, type] = {"forces": Force, "edits": Edit}

@@ -16,7 +16,7 @@ from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, Measurement
 
 if TYPE_CHECKING:
-    from gaussian_swaying.simulation.simulation import Simulation
+    from gaussian_swaying.simulation.stepping import Stepping
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
@@ -31,7 +31,7 @@ class Launched:
         before: The state at the start of the frame.
     """
 
-    def __init__(self, simulation: Simulation, before: MPMState) -> None:
+    def __init__(self, simulation: Stepping, before: MPMState) -> None:
         self._simulation, self._before = simulation, before
         self._error: Exception | None = None
         try:
@@ -122,7 +122,7 @@ def _read(state: MPMState) -> list[Tensor]:
     return [tensor for tensor in found if tensor is not None]
 
 
-def parts_of(simulation: Simulation) -> tuple[object, ...] | None:
+def parts_of(simulation: Stepping) -> tuple[object, ...] | None:
     """What the needs depend on besides the state; None if that cannot be told, or if it is on another device."""
     wind = simulation.wind_force
     tensors = tensors_in([wind])
@@ -133,7 +133,7 @@ def parts_of(simulation: Simulation) -> tuple[object, ...] | None:
     return (simulation.solver.bound, fingerprint([wind]), versions)
 
 
-def needs_of(simulation: Simulation, state: MPMState, winds: Tensor | None) -> Tensor:
+def needs_of(simulation: Stepping, state: MPMState, winds: Tensor | None) -> Tensor:
     """Cells that the fastest wave crosses per second; rate of the drag [1/s] and speed of the wind [m/s]; float64.
 
     Args:

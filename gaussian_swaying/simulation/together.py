@@ -29,7 +29,8 @@ from gaussian_swaying.simulation.launch import needs_of
 from gaussian_swaying.simulation.material import Material
 from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.run import Run, splat_checksum
-from gaussian_swaying.simulation.simulation import MAX_GROWTH, MAX_SUBSTEPS, Simulation
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.stepping import MAX_GROWTH, MAX_SUBSTEPS
 
 M = TypeVar("M", bound=nn.Module)
 

@@ -1,5 +1,6 @@
 """Simulation as users meet it in Python and in a YAML: short forms, frames, what is given twice, custom forces."""
 
+import copy
 import dataclasses
 import inspect
 import re
@@ -20,6 +21,7 @@ from gaussian_swaying import (
     Material,
     MPMSolver,
     Normalisation,
+    PinnedPoints,
     PinnedRegion,
     Recorder,
     Sand,
@@ -387,6 +389,40 @@ def test_a_coefficient_changed_in_place_is_felt():
     simulation.aero.C_D.fill_(1.2)
     state, _ = simulation.advance(state)
     assert float((state.position - simulation.scene.points.position).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("hold", "kind"),
+    [
+        (POLE, "hinge"),
+        (PinnedRegion(POLE, kind="clamp"), "clamp"),
+        (PinnedRegion(POLE, kind="nodes"), "nodes"),
+        (PinnedPoints([[0.05, 0.0, 0.75], [0.05, 0.0, 0.05]]), "hinge"),
+    ],
+)
+def test_what_is_held_has_a_kind(hold, kind):
+    simulation = _flag(hold=hold)
+    simulation.start()
+    assert list(simulation.solver.bound.kinds) == [kind]
+    assert tuple(simulation.solver.gravity) == (0.0, 0.0, 0.0)
+    assert ("clamp" in simulation.config) == (kind == "clamp")  # a run is resumed with the same pins
+
+
+def test_a_copy_goes_its_own_way(tmp_path):
+    simulation = _flag(recorder=Recorder(images=False, video=False))
+    simulation.run(tmp_path / "run", 2, progress=False)
+    other = copy.deepcopy(simulation)
+    other.wind = [0.0, 9.0, 0.0]
+    other.aero.C_D.mul_(2.0)
+    *_, blown = other.frames(3)
+    *_, last = simulation.frames(3)
+    *_, expected = _flag().frames(3)
+    assert torch.equal(last.state.position, expected.state.position)
+    assert float((blown.state.position - expected.state.position).abs().max()) > 1e-3
+    other.run(tmp_path / "other", 2, progress=False)
+    assert other.recorder.folder == tmp_path / "other"
+    assert simulation.recorder.folder == tmp_path / "run"
+    assert (tmp_path / "other/trajectory.npz").exists()
 
 
 @pytest.mark.parametrize("name", ["camera", "material", "solver", "scene", "forces", "hold", "device"])
