@@ -155,6 +155,15 @@ class Recorder:
         self.checkpoint_frame: int | None = None
         self._real_time_fps = 25.0
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The settings: a copy has no folder, no open files and nothing that waits to be written."""
+        closed: dict[str, Any] = {"_folder": None, "_writer": None, "_films": {}, "_lock": None}
+        return vars(self) | closed | {"checkpoint_frame": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the settings."""
+        vars(self).update(state, _writer=FrameWriter())
+
     @property
     def folder(self) -> Path:
         """The output folder, once :meth:`open` was called."""
