@@ -6,27 +6,14 @@ import pytest
 import yaml
 
 from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.validation.small_sweep import AXES, SETTINGS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
-POLE = {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}
-TINY = {
-    "frames": 12,
-    "scene.generator.init_args.spacing": 0.1,
-    "solver.dx": 0.2,
-    "solver.boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": POLE}}],
-    "camera.init_args.width": 32,
-    "camera.init_args.height": 18,
-}
-AXES = {
-    "wind.flow": [[4.0, 1.0, 0.0], [8.0, 2.0, 0.0]],
-    "material.E": {"from": 3e3, "to": 3e4, "count": 2, "scale": "log"},
-    "wind.seed": {"draw": "integer", "low": 0, "high": 10**6},
-}
 
 
 def write_sweep(path, axes=AXES, draws=2, settings=None, **more):
     """A sweep file of tiny flags; ``settings`` are added to those that make them tiny."""
-    fields = {"base": str(FLAG), "settings": TINY | (settings or {}), "axes": axes, "draws": draws}
+    fields = {"base": str(FLAG), "settings": SETTINGS | (settings or {}), "axes": axes, "draws": draws}
     path.write_text(yaml.safe_dump(fields | more, sort_keys=False))
     return path
 

@@ -5,7 +5,6 @@ import json
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,23 +16,14 @@ from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.scenes.procedural import FlagScene
 
-TOOLS = Path(__file__).parents[2] / "tools" / "datasets"
-NAMES = ("blender_cloth", "blender_checks", "blender_images", "make_flag_dataset", "make_fit_data")
-NAMES += ("flag_reference", "flag_pictures", "flag_motion", "flag_difference", "fit_cases", "fit_video")
+from .conftest import dataset_tool
 
 
 @pytest.fixture(scope="module")
 def tool():
     """tools/datasets/make_fit_data.py with the modules beside it."""
-    sys.path.insert(0, str(TOOLS))
-    try:
-        import make_fit_data
-
-        yield make_fit_data
-    finally:
-        sys.path.remove(str(TOOLS))
-        for name in NAMES:
-            sys.modules.pop(name, None)
+    with dataset_tool("make_fit_data") as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ import json
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,23 +15,14 @@ import torch
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
 
-TOOLS = Path(__file__).parents[2] / "tools" / "datasets"
-NAMES = ("blender_cloth", "blender_checks", "blender_images", "make_flag_dataset")
-NAMES += ("flag_reference", "flag_pictures", "flag_motion", "flag_difference", "newton_cloth")
+from .conftest import dataset_tool
 
 
 @pytest.fixture(scope="module")
 def tool():
     """tools/datasets/make_flag_dataset.py with the modules beside it."""
-    sys.path.insert(0, str(TOOLS))
-    try:
-        import make_flag_dataset
-
-        yield make_flag_dataset
-    finally:
-        sys.path.remove(str(TOOLS))
-        for name in NAMES:
-            sys.modules.pop(name, None)
+    with dataset_tool("make_flag_dataset") as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

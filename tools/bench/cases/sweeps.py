@@ -27,6 +27,7 @@ from bench.clock import guarded
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.training.data.datamodule import CaptureDataModule
+from gaussian_swaying.validation.small_sweep import AXES, SETTINGS
 
 ROOT = Path(__file__).resolve().parents[3]
 Row = dict[str, Any]
@@ -107,21 +108,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 def disturbed_sweep(place: Path, runs: int = 40, kills: int = 5, seed: int = 2) -> Row:
     """A sweep of small flags undisturbed, and with a worker killed at random some times: are their tables equal?"""
-    pole = {"class_path": "Box", "init_args": {"min": [None, None, None], "max": [0.11, None, None]}}
-    settings = {
-        "frames": 12,
-        "scene.generator.init_args.spacing": 0.1,
-        "solver.dx": 0.2,
-        "solver.boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": pole}}],
-        "camera.init_args.width": 32,
-        "camera.init_args.height": 18,
-    }
-    axes = {
-        "wind.flow": [[4.0, 1.0, 0.0], [8.0, 2.0, 0.0]],
-        "material.E": {"from": 3e3, "to": 3e4, "count": 2, "scale": "log"},
-        "wind.seed": {"draw": "integer", "low": 0, "high": 10**6},
-    }
-    file = _sweep_file(place / "small.yaml", settings, axes, runs // 4)
+    file = _sweep_file(place / "small.yaml", SETTINGS, AXES, runs // 4)
     common = ("--workers", "2", "--device", "cpu")
     found: Row = {"runs": runs, "workers": 2}
     for name, times in (("undisturbed", 0), ("disturbed", kills)):
