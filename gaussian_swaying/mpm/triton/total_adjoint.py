@@ -53,6 +53,30 @@ class _Run:
     end: MPMState | None = None
 
 
+@dataclass(frozen=True)
+class _Pass:
+    """What the kernels of one backward pass compute, and where they sum.
+
+    Attributes:
+        twin: The force, if any.
+        options: Of the kernels of the forward pass.
+        flags: Which gradients are wanted: MATERIAL, SHARES, MASS and WEIGHTS.
+        partial: Sums of the cells, with 27 rows per cell.
+        width: Columns of ``partial``; eight if there are gradients by nodal velocities.
+    """
+
+    twin: ForceTwin | None
+    options: dict[str, Any]
+    flags: dict[str, bool]
+    partial: Tensor
+    width: int
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What a recorded graph of it depends on."""
+        return (*self.options.values(), *self.flags.values())
+
+
 class TotalAdjoint:
     """The backward pass of the substeps of a :class:`FusedTotal`, whose buffers and graphs it shares.
 
@@ -162,18 +186,6 @@ class TotalAdjoint:
         needs: dict[str, bool],
     ) -> dict[str, Tensor]:
         """Gradients by the inputs of :class:`_Rollout`, by name, from those by the nodal fields at the end."""
-        with at_home(self.bars):
-            return self._backward(run, displacement, velocity, vectors, numbers, needs)
-
-    def _backward(
-        self,
-        run: _Run,
-        displacement: Tensor,
-        velocity: Tensor,
-        vectors: Tensor | None,
-        numbers: Tensor | None,
-        needs: dict[str, bool],
-    ) -> dict[str, Tensor]:
         fused, nodes = self.fused, self.nodes
         twin = run.forces[0].twin() if run.forces else None
         fused.asked = ()
@@ -191,6 +203,7 @@ class TotalAdjoint:
         material = any(needs[name] for name in ("mu", "lam", "volume"))
         shares = twin is not None and (needs["vectors"] or needs["numbers"])
         flags = {"MATERIAL": material, "SHARES": shares, "MASS": needs["inverse_mass"], "WEIGHTS": needs["weight"]}
+        asked = _Pass(twin, options, flags, partial, width)
         if fused.points is not None:
             self.weight_bar.zero_()
         vector_bars: list[Tensor] = []
@@ -203,41 +216,32 @@ class TotalAdjoint:
                 own = own.reshape(count, -1, own.shape[-1]).expand(-1, fused.scenes, -1)
                 fused.vectors[:count, :, : own.shape[-1]].copy_(own)
             fused.schedule[: count + 2].copy_(fused.table(run.kicks[n], run.dt, count), non_blocking=True)
-            self._segment(run.starts[n], count, twin, options, flags, partial, width)
+            self._segment(run.starts[n], count, asked)
             if shares:
                 by_vector, by_numbers = self._shared(count)
                 vector_bars.append(by_vector)
                 number_bar += by_numbers
-        self._nodes(0, partial, width, options, flags, SUM=True, PUSH=False, FINISH=False)
+        self._nodes(0, asked, SUM=True, PUSH=False, FINISH=False)
         return self._found(run, displacement, vectors, numbers, vector_bars, number_bar)
 
-    def _segment(
-        self,
-        start: Tensor,
-        count: int,
-        twin: ForceTwin | None,
-        options: dict[str, Any],
-        flags: dict[str, bool],
-        partial: Tensor,
-        width: int,
-    ) -> None:
+    def _segment(self, start: Tensor, count: int, asked: _Pass) -> None:
         """Run the substeps of a segment again, keeping their states, and then backward."""
         fused = self.fused
         fused.fields.view(-1, 2, 4)[:, :, :3].index_copy_(0, self.active, start)
         fused.first_step.zero_()
 
         def again(offset: int) -> None:
-            self._keep(offset, flags)
-            fused.substep(offset, options)
+            self._keep(offset, asked)
+            fused.substep(offset, asked.options)
 
         def back(offset: int) -> None:
-            self._node_stages(offset, partial, width, options, flags)
-            self._particles(offset, twin, options, flags, partial, width)
+            self._node_stages(offset, asked)
+            self._particles(offset, asked)
 
-        key = (*options.values(), *flags.values(), self.rooms)
+        key = (*asked.key, self.rooms)
         fused.repeat(count, ("again", *key), again)
-        self._keep(0, flags)
-        if flags["WEIGHTS"]:
+        self._keep(0, asked)
+        if asked.flags["WEIGHTS"]:
             self._find_multipliers(count)
         self.last.fill_(count - 1)
         fused.first_step.zero_()
@@ -271,26 +275,24 @@ class TotalAdjoint:
         found = torch.einsum("sij,csjx->csix", W.mT @ W, rates)
         self.multipliers[:count].copy_(found.reshape(count, -1, 4))
 
-    def _keep(self, offset: int, flags: dict[str, bool]) -> None:
+    def _keep(self, offset: int, asked: _Pass) -> None:
         fused, block = self.fused, 512
         kernels.keep_nodes[(triton.cdiv(8 * self.nodes, block),)](
             fused.active, self.nodes, fused.fields, self.history, fused.first_step, offset, BLOCK=block, num_warps=4
         )
-        if flags["WEIGHTS"]:
+        if asked.flags["WEIGHTS"]:
             rows = len(self.residual)
             kernels.keep_rows[(triton.cdiv(4 * rows, block),)](
                 fused.residual, rows, self.row_history, fused.first_step, offset, BLOCK=block, num_warps=4
             )
 
-    def _node_stages(
-        self, offset: int, partial: Tensor, width: int, options: dict[str, Any], flags: dict[str, bool]
-    ) -> None:
+    def _node_stages(self, offset: int, asked: _Pass) -> None:
         """Back through displacement, held points, pins and the new velocity."""
         fused = self.fused
         if fused.points is None:
-            self._nodes(offset, partial, width, options, flags, SUM=True, PUSH=True, FINISH=True)
+            self._nodes(offset, asked, SUM=True, PUSH=True, FINISH=True)
             return
-        self._nodes(offset, partial, width, options, flags, SUM=True, PUSH=True, FINISH=False)
+        self._nodes(offset, asked, SUM=True, PUSH=True, FINISH=False)
         nodes, rows = len(self.affected), self.push.shape[0]
         kernels.rows_adjoint[(len(self.residual),)](
             self.affected, self.scene, self.push, self.bars, self.residual, nodes, rows,
@@ -300,42 +302,26 @@ class TotalAdjoint:
         kernels.hold_adjoint[(triton.cdiv(nodes, block),)](
             self.affected, self.scene, self.weight, self.residual, nodes, rows, self.bars,
             self.weight_bar, self.multipliers, len(self.residual), fused.inverse_mass, self.history, self.nodes,
-            fused.first_step, offset, self.last, WEIGHTS=flags["WEIGHTS"], BLOCK=block, ROWS=64, num_warps=2,
+            fused.first_step, offset, self.last, WEIGHTS=asked.flags["WEIGHTS"], BLOCK=block, ROWS=64, num_warps=2,
         )  # fmt: skip
-        self._nodes(offset, partial, width, options, flags, SUM=False, PUSH=False, FINISH=True)
+        self._nodes(offset, asked, SUM=False, PUSH=False, FINISH=True)
 
-    def _nodes(
-        self,
-        offset: int,
-        partial: Tensor,
-        width: int,
-        options: dict[str, Any],
-        flags: dict[str, bool],
-        **stages: bool,
-    ) -> None:
+    def _nodes(self, offset: int, asked: _Pass, **stages: bool) -> None:
         fused, block = self.fused, 64
         kernels.nodes_adjoint[(triton.cdiv(self.nodes, block),)](
-            fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.held, self.nodes, partial,
+            fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.held, self.nodes, asked.partial,
             fused.fields, self.force_bar, self.history, self.bars, self.mass_bar,
             fused.schedule, fused.first_step, offset, self.last, *fused.gravity,
-            **stages, VELOCITY=width == 8, HELD="nodes" in fused.bound.kinds, MASS=flags["MASS"], WIDTH=width,
-            BLOCK=block, SOURCES=triton.next_power_of_2(len(fused.source)), num_warps=4,
+            **stages, VELOCITY=asked.width == 8, HELD="nodes" in fused.bound.kinds, MASS=asked.flags["MASS"],
+            WIDTH=asked.width, BLOCK=block, SOURCES=triton.next_power_of_2(len(fused.source)), num_warps=4,
         )  # fmt: skip
 
-    def _particles(
-        self,
-        offset: int,
-        twin: ForceTwin | None,
-        options: dict[str, Any],
-        flags: dict[str, bool],
-        partial: Tensor,
-        width: int,
-    ) -> None:
-        fused = self.fused
+    def _particles(self, offset: int, asked: _Pass) -> None:
+        fused, twin, options, flags = self.fused, asked.twin, asked.options, asked.flags
         per_program = max(1, 32 // fused.lanes)
         _, ny, nz = fused.grid.resolution
         cut = fused.pieces > fused.cells
-        to = fused.sums(fused.pieces, width, "adjoint pieces") if cut else partial
+        to = fused.sums(fused.pieces, asked.width, "adjoint pieces") if cut else asked.partial
         kernels.particles_adjoint[(triton.cdiv(fused.pieces, per_program),)](
             fused.fraction, fused.material, fused.law, fused.law_table, fused.values, fused.count,
             fused.piece_start, fused.piece_node, fused.piece_scene, fused.pieces,
@@ -344,11 +330,11 @@ class TotalAdjoint:
             ny * nz, nz, 1 / fused.grid.dx, fused.settings.stiffness_damping,
             LAWS=fused.laws, MULTI=options["MULTI"], ADJOINT=None if twin is None else twin.adjoint,
             OPTIONS=options["OPTIONS"], VISCOUS=options["VISCOUS"], MATERIAL=flags["MATERIAL"],
-            SHARES=flags["SHARES"], WIDTH=width, CELLS=per_program, LANES=fused.lanes, num_warps=1,
+            SHARES=flags["SHARES"], WIDTH=asked.width, CELLS=per_program, LANES=fused.lanes, num_warps=1,
             **REGISTERS.get(fused.lanes, {}),
         )  # fmt: skip
         if cut:
-            fused.join_pieces(to, partial, width)
+            fused.join_pieces(to, asked.partial, asked.width)
 
     # ---- what it found
 
@@ -418,7 +404,8 @@ class _Rollout(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, displacement: Tensor, velocity: Tensor) -> tuple[Tensor | None, ...]:
         needs = dict(zip(_INPUTS, ctx.needs_input_grad[2:], strict=True))
-        found = ctx.adjoint.backward(ctx.run, displacement, velocity, ctx.vectors, ctx.numbers, needs)
+        with at_home(ctx.adjoint.bars):
+            found = ctx.adjoint.backward(ctx.run, displacement, velocity, ctx.vectors, ctx.numbers, needs)
         return None, None, *(found.get(name) if needs[name] else None for name in _INPUTS)
 
 
