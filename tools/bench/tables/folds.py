@@ -85,4 +85,4 @@ def goals(result: Row) -> list[str]:
             continue
         goal = f"{fold.title()}: within {100 * _ABOVE:g} % above the uncertainty of {REFERENCES[other]}"
         lines.append([goal, f"{_share(near)}, {_share(doubt)} + {100 * _ABOVE:g} %", yes_no(near <= doubt + _ABOVE)])
-    return grid(["goal", "measured", "reached"], lines)
+    return grid(["goal", "measured", "reached"], lines) if lines else ["This record has none of our flags."]
