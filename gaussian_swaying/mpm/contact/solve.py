@@ -5,7 +5,7 @@ and moves with :math:`\sum_i w_i v_i`. An impulse :math:`j` at it changes the no
 :math:`k` has a normal :math:`n`, a gap :math:`d` and two places, or one place and an obstacle. Its relative velocity
 along the normal after the substep must satisfy
 
-.. math:: v_n \ge -d / \Delta t \quad (d > 0), \qquad v_n \ge \min(0.2\,|d| / \Delta t,\; 0.004\,\Delta x / \Delta t)
+.. math:: v_n \ge -d / \Delta t \quad (d > 0), \qquad v_n \ge \min(0.02\,|d| / \Delta t,\; 0.004\,\Delta x / \Delta t)
           \quad (d \le 0),
 
 so that a gap closes at most to zero within a substep, and an overlap is removed in some substeps, at no more than one
@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-PUSH = 0.2
+PUSH = 0.02
 """Share of an overlap that a substep removes."""
 
 PUSH_CELLS = 0.004

@@ -363,7 +363,7 @@ def contact_solve(
     pressed_sum, row, moving, many, other, data, slots, impulse,
     touched, entry_start, entry_place, entry_weight, reached, marked, total, touched_nodes,
     peak, gate, status,
-    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, stretch, push, most, tolerance, friction,
+    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, slack, push, most, tolerance, friction,
     iterations,
     PAIRS: tl.constexpr, WALLS: tl.constexpr, ARMS: tl.constexpr, BLOCK: tl.constexpr,
     WIDE: tl.constexpr, TALL: tl.constexpr,
@@ -383,7 +383,7 @@ def contact_solve(
         listed = tl.load(status + WITHIN)
     if PAIRS:
         listed += tl.load(status + LISTED)
-        limit += slack + 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
+        limit += slack + 2 * largest_of(peak + MOST_PROGRAMS, programs)  # see `contact_lists`
     if listed > 0:
         if PAIRS:
             if pid == 0:

@@ -275,17 +275,17 @@ def _search(
 
 @triton.jit(do_not_specialize=CHANGES)
 def contact_lists(
-    active, before, nodes, fields, base, fraction, arm, rest, places,
+    active, carries, before, nodes, fields, base, fraction, arm, rest, places,
     position, counts, start, rank, item, ordered, sorted_, candidates, near, room, many, impulse,
     entry_start, entry_place, reached, touched_nodes, peak, sums, gate, status, margin,
-    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, stretch, ahead, last, chunk,
+    schedule, first_step, step_offset, sx, sy, inverse_dx, reach, apart, slack, least, ahead, last, chunk,
     ARMS: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr, TALL: tl.constexpr,
 ):  # fmt: skip
     """Make the lists again if a node may have moved too far since they were made.
 
-    Places that come close in this substep must be listed. No place moves farther than ``stretch`` times the node that
-    moves farthest, so lists of places closer than the reach of a contact and a margin are complete while twice that,
-    with the motion of this substep, is less than the margin.
+    Places that come close in this substep must be listed. No place moves farther than the largest motion of a node
+    times its entry of ``carries``, so lists of places closer than the reach of a contact and a margin are complete
+    while twice that, with the motion of this substep, is less than the margin.
     """
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)
     pid = tl.program_id(0)
@@ -304,16 +304,17 @@ def contact_lists(
             v = tl.load(at + 4 + c, mask, 0.0)
             far += u * u
             speed += v * v
-        speed = dt * tl.sqrt(speed)
-        moved = tl.maximum(moved, tl.sqrt(far) + speed)
+        share = tl.load(carries + k, mask, 0.0)
+        speed = share * dt * tl.sqrt(speed)
+        moved = tl.maximum(moved, share * tl.sqrt(far) + speed)
         fast = tl.maximum(fast, speed)
     tl.store(peak + pid, tl.max(moved))
     tl.store(peak + MOST_PROGRAMS + pid, tl.max(fast))
     known = tl.load(margin)
     meet(gate, programs)
     farthest = largest_of(peak, programs)
-    if (2 * stretch * farthest + slack > known) & (farthest < 1e9):  # a run that diverges keeps its lists
-        step = 2 * stretch * largest_of(peak + MOST_PROGRAMS, programs)
+    if (2 * farthest + slack > known) & (farthest < 1e9):  # a run that diverges keeps its lists
+        step = 2 * largest_of(peak + MOST_PROGRAMS, programs)
         wider = slack + tl.maximum(least, tl.minimum(ahead * step, tl.maximum(reach, 2 * step)))
         if pid == 0:
             tl.store(margin, wider)

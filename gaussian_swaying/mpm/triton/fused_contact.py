@@ -40,6 +40,9 @@ WIDE, WIDE_SEARCH = 8, 4
 PER_PROCESSOR = 4
 """Programs on each multiprocessor; all of them must run at once."""
 
+LIGHT = 0.01
+"""A node of a smaller weight hardly moves any place, however far it moves itself: see :func:`_carries`."""
+
 _LAUNCH: dict[str, Any] = {"num_warps": 4, "maxnreg": 128}
 
 
@@ -81,8 +84,7 @@ class FusedContact:
         self.entry_start = torch.cat([ends.new_zeros(1), ends]).int()
         self.entry_place = real.nonzero()[:, 0][order].int()
         self.entry_weight = (stage.weight * stage.inverse_mass[stage.node])[real][order].contiguous()
-        self.stretch = float(stage.weight.abs().sum(1).amax()) if self.places else 1.0
-        """No place moves farther than this times the node that moves farthest."""
+        self.carries = _carries(stage.node, stage.weight, len(fields))[active.long()]
         many, walls = self.places, len(stage.obstacles)
         self.walls = walls
         whole: dict[str, Any] = {"dtype": torch.int32}
@@ -208,11 +210,11 @@ class FusedContact:
         if pairs:
             chunk = -(-(self.last + 1) // self.programs)
             list_kernels.contact_lists[(self.programs,)](
-                self.active, self.before, len(self.active), *where, self.places,
+                self.active, self.carries, self.before, len(self.active), *where, self.places,
                 self.now, self.counts, self.start, self.rank, self.item, self.ordered, self.sorted, self.candidates,
                 self.near, self.room, self.many, self.impulse, self.entry_start, self.entry_place, self.reached,
                 len(self.touched), self.peak, self.sums, self.gate, self.status, self.margin, *now, stage.reach,
-                stage.apart, SLACK * dx, LEAST_MARGIN * dx, self.stretch, AHEAD, self.last, -(-chunk // BLOCK) * BLOCK,
+                stage.apart, SLACK * dx, LEAST_MARGIN * dx, AHEAD, self.last, -(-chunk // BLOCK) * BLOCK,
                 WIDE=WIDE_SEARCH, **launch,
             )  # fmt: skip
         if walls:
@@ -241,7 +243,29 @@ class FusedContact:
             self.wall_gap, self.wall_normal, self.wall_drive, self.wall_valid, self.friction, self.pressed,
             self.pressed_sum, self.row, self.moving, self.many, self.other, self.data, self.slots, self.impulse,
             self.touched, self.entry_start, self.entry_place, self.entry_weight, self.reached, self.marked, self.total,
-            len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, self.stretch, PUSH,
+            len(self.touched), self.peak, self.gate, self.status, *now, stage.reach, SLACK * dx, PUSH,
             PUSH_CELLS * dx, TOLERANCE * dx, 0.0 if stage.contact is None else stage.contact.friction,
             stage.iterations, PAIRS=pairs, WALLS=walls, WIDE=WIDE, **launch,
         )  # fmt: skip
+
+
+def _carries(node: Tensor, weight: Tensor, nodes: int) -> Tensor:
+    r"""How far places move with a node: no place moves farther than the largest of these numbers times the motion.
+
+    A node that reaches the material by a hair's breadth has next to no mass, and stress moves it by metres, which
+    moves no place. With :math:`s_i` the largest weight of a node at any place, and :math:`r_i = \min(1, s_i /` LIGHT
+    :math:`)`, a place moves by at most :math:`\sum_i |w_i| |u_i| \le \max_i (C r_i |u_i|)`, where C is the largest sum
+    of :math:`|w_i| / r_i` of a place: at most 1.27 if no weight is negative.
+
+    Args:
+        node: Nodes of each place, shape (C, 27).
+        weight: Their weights, shape (C, 27).
+        nodes: Number of all nodes.
+
+    Returns:
+        Shape (nodes,).
+    """
+    size = weight.abs()
+    largest = size.new_zeros(nodes).scatter_reduce_(0, node.reshape(-1), size.reshape(-1), "amax")
+    share = (largest / LIGHT).clamp(max=1.0)
+    return share * (size / share[node].clamp(min=1e-30)).sum(1).amax() if len(node) else share

@@ -106,36 +106,39 @@ def test_fifty_layers_pressed_together_stay_in_order(sheet, scene, march):
         assert float((gaps(solver.bound.contact, later) < 0.5).double().mean()) <= 1e-3
 
 
-def _rest(sheet, scene, march, seconds):
-    """How the energy of a pile of eight layers changes after it has settled for half a second."""
-    solver, state = _pile(sheet, scene, 8, THICKNESS, 9.8, per_side=5, stiffness_damping=1e-3)
+def _rest(sheet, scene, march, layers, seconds):
+    """How the energy of a pile changes after it has settled for half a second, and how far a layer rises or sinks."""
+    solver, state = _pile(sheet, scene, layers, THICKNESS, 9.8, per_side=5, stiffness_damping=1e-3)
     settled = march(solver, state, 0.5, frame=0.1)[-1]
     later = march(solver, settled, seconds, frame=0.1)
     first = solver.energies(settled)
     weight = float(solver.points.mass.sum() * 9.8)
     for end in later:
         energy = solver.energies(end)
-        assert float(energy["kinetic"]) < 0.02 * weight * THICKNESS  # a few times g dt
+        assert float(energy["kinetic"]) < 1e-4 * weight * THICKNESS  # thirty times that if overlaps leave fast
     change = float(energy["potential"] + energy["elastic"] - first["potential"] - first["elastic"])
-    height = settled.position[:, 2].reshape(8, -1).mean(1), end.position[:, 2].reshape(8, -1).mean(1)
+    height = settled.position[:, 2].reshape(layers, -1).mean(1), end.position[:, 2].reshape(layers, -1).mean(1)
     return change / (weight * THICKNESS), float((height[1] - height[0]).abs().max())
 
 
 def test_a_pile_at_rest_stays_at_rest(sheet, scene, march):
-    """No layer moves by more than 2 % of the thickness; energy grows by no more than 2 % of weight times thickness."""
-    change, moved = _rest(sheet, scene, march, 0.5)
-    assert change < 0.02
-    assert moved < 0.02 * THICKNESS
+    """No layer moves by more than 1 % of the thickness; energy grows by no more than 1 % of weight times thickness."""
+    change, moved = _rest(sheet, scene, march, 5, 0.5)
+    assert change < 0.01
+    assert moved < 0.01 * THICKNESS
 
 
-@pytest.mark.xfail(strict=True, reason="a pile gains energy slowly, see docs/contact.md")
+_A_MINUTE = pytest.mark.xfail(strict=False, reason="measured for 12 s only, see docs/contact.md")
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_pile_rests_for_a_minute(sheet, scene, march):
-    """It stays together: measured for 12 s only, in which it rose by 3 % of a thickness."""
-    change, moved = _rest(sheet, scene, march, 60.0)
-    assert change < 0.33
-    assert moved < 0.33 * THICKNESS
+@pytest.mark.parametrize("seconds", [11.5, pytest.param(60.0, marks=_A_MINUTE)])
+def test_a_pile_rests_for_long(sheet, scene, march, seconds):
+    """As above, with twice the bounds: bending builds up against friction for five seconds, and stays."""
+    change, moved = _rest(sheet, scene, march, 8, seconds)
+    assert change < 0.02
+    assert moved < 0.02 * THICKNESS
 
 
 def test_the_lists_do_not_change_the_result(sheet, scene, march):

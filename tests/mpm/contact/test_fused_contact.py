@@ -114,6 +114,27 @@ def test_the_lists_are_those_of_close_pairs(sheet, scene, device):
     assert torch.equal((found[0] * width + found[1]).sort()[0], (expected[0] * width + expected[1]).sort()[0])
 
 
+def test_nodes_without_weight_do_not_widen_the_lists(sheet, scene, device):
+    """A node that reaches a sheet by a thousandth of a cell may fly at 1000 m/s, as stress makes it: no place moves."""
+    low = sheet(5, 5, dtype=torch.float32)
+    dx = 0.044
+    points = MaterialPoints.join([low, sheet(3, 3, (0.023, 0.017, 2.501 * dx), dtype=torch.float32)])
+    points = points.map(lambda t: t.to(device))
+    ends = []
+    for transfer in ("torch", "triton"):
+        solver, state = scene(points, Contact(iterations=4), transfer=transfer, gravity=(0.0, 0.0, 0.0))
+        mass = solver.bound.node_mass
+        light = (mass > 0) & (mass < 1e-5 * mass.amax())
+        assert int(light.sum()) > 4
+        velocity = torch.where(light[:, None], 1000.0, 0.0).expand(-1, 3)
+        state = solver.bound.read_particles(state, torch.zeros_like(velocity), velocity)
+        ends.append(solver.rollout(state, 1e-5, 3))
+    touching = solver.fused().touching
+    assert touching.made == 1
+    assert float(touching.margin) < 0.5 * dx
+    torch.testing.assert_close(ends[1].position, ends[0].position, rtol=0, atol=1e-6)
+
+
 def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
     """The rollout is done again from its start, and ends where it would have with enough room."""
     points, velocity, _ = _collision(sheet, device)
