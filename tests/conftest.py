@@ -29,6 +29,17 @@ def device(request):
     return torch.device(request.param)
 
 
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def kernel_device(request):
+    """Where Triton's kernels run: in its interpreter on a CPU, or compiled on a GPU."""
+    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
+    if request.param == "cuda":
+        return torch.device("cuda")
+    if os.environ.get("TRITON_INTERPRET") != "1":
+        pytest.skip("on this machine the kernels are compiled")
+    return torch.device("cpu")
+
+
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def dtype(request):
     """Each supported precision in turn."""

@@ -18,27 +18,9 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
-try:
-    from gaussian_swaying.mpm.triton import fused
-except ImportError:
-    fused = None
-
 DX, DT = 0.1, 1e-3
 TOLERANCE = 2e-5
 """Relative to the largest value of a field, as in tests/mpm/test_fused.py."""
-
-
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernel_device(request):
-    """Where the kernels run."""
-    if request.param == "cuda":
-        pytest.importorskip("triton")
-        return torch.device("cuda")
-    if fused is None:
-        pytest.skip("needs triton, which is available on Linux only")
-    if not fused.INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cpu")
 
 
 def _field(wraps):
