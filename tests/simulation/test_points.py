@@ -29,8 +29,8 @@ from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, S
 HALF = Box([0.0451, None, None], [None] * 3)
 
 
-def fine_flag():
-    cloud = FlagScene(spacing=0.02).generate()
+def fine_flag(spacing=0.02):
+    cloud = FlagScene(spacing=spacing).generate()
     cloud.opacities[::7] = -6.0  # some are faint
     return cloud
 
@@ -268,13 +268,21 @@ def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
         Scene(generator=FlagScene(), points_per_cell=0)
 
 
-@pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.2]])
+@pytest.mark.parametrize(
+    ("kernel_device", "up"),
+    [
+        ("interpreted", [0.0, -1.0, 0.2]),
+        pytest.param("cuda", [0.0, -1.0, 0.2], marks=pytest.mark.gpu),
+        pytest.param("cuda", [0.0, 0.0, 1.0], marks=pytest.mark.gpu),
+    ],
+    indirect=["kernel_device"],
+)
 def test_the_kernel_of_followers_is_their_definition(up, kernel_device, make_scene):
     """With arms (of faint ones), rotations and the limit of the stretch, and without."""
     kernels = pytest.importorskip("gaussian_swaying.simulation.followers_triton")
     for region, stretch in ((None, 1.05), (HALF, None)):
         scene = make_scene(
-            fine_flag(), dx=0.15, points="grid", up=up, metres_per_unit=0.5, region=region, max_stretch=stretch
+            fine_flag(0.04), dx=0.15, points="grid", up=up, metres_per_unit=0.5, region=region, max_stretch=stretch
         )
         scene = scene.to(kernel_device)
         assert scene.follow.arm is not None
