@@ -88,8 +88,18 @@ def _same(found, expected):
     torch.testing.assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
-@pytest.mark.parametrize("name", ["log", "power", "turbulence", "all", "sheltered", "half", "held", *OBSTACLES])
+WINDS = ("log", "power", "turbulence", "all", "sheltered", "half", "held", *OBSTACLES)
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "formulation", "name"),
+    [
+        *(("interpreted", "total", name) for name in WINDS),
+        *(("interpreted", "updated", name) for name in ("all", "sheltered", "several")),  # the same function blows
+        *(pytest.param("cuda", way, name, marks=pytest.mark.gpu) for way in ("total", "updated") for name in WINDS),
+    ],
+    indirect=["kernel_device"],
+)
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
     solver, state, load = _bodies(kernel_device, formulation, _wind(name))
     assert load.has_twin
