@@ -109,7 +109,7 @@ def test_a_block_that_rests_stays_where_it_is():
     assert float(state.position[:, 2].mean()) > 0.1
 
 
-@pytest.mark.parametrize("thickness", [0.0, 0.01])
+@pytest.mark.parametrize("thickness", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
 def test_a_sheet_over_a_ball_stays_outside(sheet, scene, march, thickness):
     """Every point keeps half the thickness, but for the overlap that a substep leaves (2 % of a cell)."""
     centre = torch.tensor([0.31, 0.29, -0.26], dtype=torch.float64)
