@@ -29,6 +29,44 @@ def device(request):
     return torch.device(request.param)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _quick_interpreter():
+    """A third less time: its language is patched once per launch and module, not in every call of a device function."""
+    try:
+        from triton.runtime import interpreter
+    except ImportError:
+        yield
+        return
+    launch, patch, patched = interpreter.GridExecutor.__call__, interpreter._patch_lang, set()
+
+    def quick_launch(self, *args, **kwargs):
+        patched.clear()
+        return launch(self, *args, **kwargs)
+
+    def quick_call(self, *args, **kwargs):
+        module = id(self.fn.__globals__)
+        if module not in patched:
+            patch(self.fn)
+            patched.add(module)
+        return self.rewrite()(*args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as changes:
+        changes.setattr(interpreter.GridExecutor, "__call__", quick_launch)
+        changes.setattr(interpreter.InterpretedFunction, "__call__", quick_call)
+        yield
+
+
+@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
+def kernel_device(request):
+    """Where Triton's kernels run: in its interpreter on a CPU, or compiled on a GPU."""
+    pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
+    if request.param == "cuda":
+        return torch.device("cuda")
+    if os.environ.get("TRITON_INTERPRET") != "1":
+        pytest.skip("on this machine the kernels are compiled")
+    return torch.device("cpu")
+
+
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def dtype(request):
     """Each supported precision in turn."""

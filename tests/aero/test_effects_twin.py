@@ -18,27 +18,9 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
-try:
-    from gaussian_swaying.mpm.triton import fused
-except ImportError:
-    fused = None
-
 DX, DT = 0.1, 1e-3
 TOLERANCE = 2e-5
 """Relative to the largest value of a field, as in tests/mpm/test_fused.py."""
-
-
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernel_device(request):
-    """Where the kernels run."""
-    if request.param == "cuda":
-        pytest.importorskip("triton")
-        return torch.device("cuda")
-    if fused is None:
-        pytest.skip("needs triton, which is available on Linux only")
-    if not fused.INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cpu")
 
 
 def _field(wraps):
@@ -106,8 +88,18 @@ def _same(found, expected):
     torch.testing.assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
-@pytest.mark.parametrize("name", ["log", "power", "turbulence", "all", "sheltered", "half", "held", *OBSTACLES])
+WINDS = ("log", "power", "turbulence", "all", "sheltered", "half", "held", *OBSTACLES)
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "formulation", "name"),
+    [
+        *(("interpreted", "total", name) for name in WINDS),
+        *(("interpreted", "updated", name) for name in ("all", "sheltered", "several")),  # the same function blows
+        *(pytest.param("cuda", way, name, marks=pytest.mark.gpu) for way in ("total", "updated") for name in WINDS),
+    ],
+    indirect=["kernel_device"],
+)
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name):
     solver, state, load = _bodies(kernel_device, formulation, _wind(name))
     assert load.has_twin

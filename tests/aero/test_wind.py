@@ -121,16 +121,12 @@ BLOWN = {
 }
 
 
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def blow(request):
+@pytest.fixture
+def blow(kernel_device):
     """The kernel, and where it runs."""
-    pytest.importorskip("triton")
     from gaussian_swaying.aero.wind_triton import blow
-    from gaussian_swaying.mpm.triton.fused import INTERPRETED
 
-    if request.param == "interpreted" and not INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return blow, torch.device("cuda" if request.param == "cuda" else "cpu")
+    return blow, kernel_device
 
 
 @pytest.mark.parametrize("case", BLOWN)

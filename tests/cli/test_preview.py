@@ -79,6 +79,7 @@ def test_starter_runs_unchanged(splat, tmp_path, capsys):
     assert simulate(["--config", str(out / "draft.yaml"), "--output", str(tmp_path / "draft"), *short]) == 0
 
 
+@pytest.mark.usefixtures("untried")
 def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
     assert preview(splat, tmp_path / "plain") == 0
     assert "hang on nothing" not in capsys.readouterr().out

@@ -31,7 +31,7 @@ from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.laws.triton.body import BodyLaws, pk1_adjoint
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.mpm.triton import fused, fused_total
+from gaussian_swaying.mpm.triton import fused_total
 from gaussian_swaying.mpm.triton.damping import kelvin_voigt_adjoint
 
 LAWS = {
@@ -41,14 +41,6 @@ LAWS = {
     "springs": SpringNetwork(),
 }
 WIDE = torch.float64
-
-
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernel_device(request):
-    """Where the kernels run."""
-    if request.param == "interpreted" and not fused.INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cuda" if request.param == "cuda" else "cpu")
 
 
 @pytest.fixture(autouse=True)

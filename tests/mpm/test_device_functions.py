@@ -34,14 +34,6 @@ from gaussian_swaying.mpm.triton import fused
 MU, LAM, DT = 4e3, 6e3, 1e-3
 
 
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernel_device(request):
-    """The device on which the functions run."""
-    if request.param == "interpreted" and not fused.INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cuda" if request.param == "cuda" else "cpu")
-
-
 @triton.jit
 def _matrix(pointer, index, mask):
     return (

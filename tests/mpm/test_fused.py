@@ -78,19 +78,6 @@ PLASTIC = {
 }
 
 
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernel_device(request):
-    """Where the kernels run."""
-    if request.param == "cuda":
-        pytest.importorskip("triton")
-        return torch.device("cuda")
-    if fused is None:
-        pytest.skip("needs triton, which is available on Linux only")
-    if not fused.INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cpu")
-
-
 @pytest.fixture(autouse=True)
 def _one_width(monkeypatch):
     """The number of lanes is a constant of the compiled kernel: the same for all bodies."""

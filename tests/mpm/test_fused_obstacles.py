@@ -20,20 +20,11 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 
 pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
-from gaussian_swaying.mpm.triton import fused
 from gaussian_swaying.mpm.triton import obstacle_kernels as kernels
 from gaussian_swaying.mpm.triton.obstacles import Solids
 
 DT = 1e-3
 MESH = str(Path(__file__).parent / "boundaries" / "octahedron.obj")
-
-
-@pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request):
-    """Where the kernels run."""
-    if request.param == "interpreted" and not fused.INTERPRETED:
-        pytest.skip("on this machine the kernels are compiled")
-    return torch.device("cuda" if request.param == "cuda" else "cpu")
 
 
 def _path():
@@ -81,14 +72,14 @@ def _ask_kernel(obstacle, place, time, device):
 @pytest.mark.parametrize("moment", [0.0, 7.3 * DT, 40 * DT])
 @pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize("name", SHAPES)
-def test_distance_normal_and_velocity(device, name, moves, moment):
+def test_distance_normal_and_velocity(kernel_device, name, moves, moment):
     more = {"path": _path()} if moves else {}
     frame = SimFrame(torch.tensor([0.02, 0.0, 0.01], dtype=torch.float64), rotation_from_z([0, -1, 0]).T, 1.2)
     obstacle = SHAPES[name](gap=0.01, start=DT, end=39 * DT, **more) if name != "still" else _still()
     obstacle = obstacle.in_frame(frame)
-    place = (0.9 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.45).to(device)
-    time = torch.tensor(moment, dtype=torch.float64, device=device)
-    gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, device)
+    place = (0.9 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.45).to(kernel_device)
+    time = torch.tensor(moment, dtype=torch.float64, device=kernel_device)
+    gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, kernel_device)
     distance, normal, own = obstacle.touch(place.double(), time, DT)
     torch.testing.assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
     torch.testing.assert_close(facing.double(), normal, rtol=0, atol=2e-4)
@@ -129,23 +120,23 @@ SETS = {
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_nodes_are_stopped_as_in_torch(device, name):
-    solver, (expected, found) = _bodies(device, SETS[name])
+def test_nodes_are_stopped_as_in_torch(kernel_device, name):
+    solver, (expected, found) = _bodies(kernel_device, SETS[name])
     assert len(solver.fused().solids.parts) == len(SETS[name]())
     for field in ("position", "velocity", "F_total", "impulse"):
         a, b = getattr(found, field), getattr(expected, field)
         torch.testing.assert_close(a, b, rtol=0, atol=5e-5 * float(b.abs().max()))
-    free = _bodies(device, list)[1][0]
+    free = _bodies(kernel_device, list)[1][0]
     assert float((free.velocity - expected.velocity).abs().max()) > 0.05
     assert bool((expected.impulse.abs().amax(-1) > 1e-5).all())
 
 
-def test_an_obstacle_of_a_user_runs_in_torch(device):
+def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
     class Bumpy(BallObstacle):
         def distance(self, place):
             distance, normal = super().distance(place)
             return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
 
-    solver, (expected, found) = _bodies(device, lambda: [Bumpy([0.1, 0.1, 0.05], 0.06)])
+    solver, (expected, found) = _bodies(kernel_device, lambda: [Bumpy([0.1, 0.1, 0.05], 0.06)])
     assert solver.fused().solids.parts == []
     torch.testing.assert_close(found.velocity, expected.velocity, rtol=0, atol=1e-4)

@@ -1,11 +1,13 @@
 """Sweeps of tiny flags: as a file, and done once without disturbance."""
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
 import yaml
 
 from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.sweeps import pool
 from gaussian_swaying.validation.small_sweep import AXES, SETTINGS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
@@ -25,7 +27,27 @@ def sweep_file():
 
 
 @pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory):
+def _workers():
+    """Workers that have imported everything: forks of one process. Sweeps in a process of their own spawn theirs."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        yield
+        return
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(
+        ["gaussian_swaying.cli.sweep", "gaussian_swaying.simulation.simulation", "torch._dynamo"]
+    )
+    with pytest.MonkeyPatch.context() as changes:
+        changes.setattr(pool, "get_context", lambda method: server)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _quick_workers(_workers):
+    """For every test of this folder."""
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory, _workers):
     """Folder of the sweep of eight runs."""
     folder = tmp_path_factory.mktemp("sweep")
     file = write_sweep(folder / "tiny.yaml")

@@ -1,15 +1,20 @@
 """``bench.py winds`` and its tables."""
 
 import json
+from functools import partial
 
 from bench.cases import winds
 from bench.tables import winds as tables
+
+from gaussian_swaying.mpm.state import GridSpec
 
 
 def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
     monkeypatch.setattr(winds, "BOX", (16, 8, 8))
     monkeypatch.setattr(winds, "STEPS", {"cpu": 2})
     monkeypatch.setattr(winds, "ROUNDS", {"cpu": 3})
+    monkeypatch.setattr(winds, "MeshObstacle", partial(winds.MeshObstacle, cells=8))
+    monkeypatch.setattr(winds, "CUBE", GridSpec(0.04, (0, 0, 0), (25, 25, 25)))
     monkeypatch.setattr("bench.pages.refill", lambda *_: None)
     bench("winds", "--device", "cpu", "--results", tmp_path, "--counts", "64", "--formulations", "total")
     found = json.loads((tmp_path / "winds_cpu.json").read_text())

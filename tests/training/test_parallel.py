@@ -47,6 +47,14 @@ def test_the_rates_of_a_step_of_several_images():
     assert four["eps"] == pytest.approx(5e-16)
 
 
+def _start(function, *arguments):
+    """Two processes; on Linux forks of one that has imported Lightning."""
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    if method == "forkserver":
+        multiprocessing.get_context(method).set_forkserver_preload(["lightning", "gaussian_swaying.training.module"])
+    multiprocessing.start_processes(function, arguments, nprocs=2, start_method=method)
+
+
 def _share(rank, address, out):
     distributed.init_process_group("gloo", init_method=f"file://{address}", rank=rank, world_size=2)
     try:
@@ -69,7 +77,7 @@ def _share(rank, address, out):
 
 
 def test_gradients_are_averaged(tmp_path):
-    multiprocessing.spawn(_share, args=(tmp_path / "meeting", tmp_path), nprocs=2)
+    _start(_share, tmp_path / "meeting", tmp_path)
     for rank in range(2):
         held = torch.load(tmp_path / f"{rank}.pt")
         assert float(held["mean"]) == 1.5
@@ -136,7 +144,7 @@ def test_hooks_come_together_and_change_nothing(data, tmp_path):
     cloud = data.initial_cloud(1)
     for every in (1, 10):
         shared = (every, data.train.views, cloud, tmp_path, _free_port())
-        multiprocessing.spawn(_fit, args=shared, nprocs=2)
+        _start(_fit, *shared)
     held = {(every, rank): torch.load(tmp_path / f"{every}_{rank}.pt") for every in (1, 10) for rank in (0, 1)}
     for rank in (0, 1):
         assert held[1, rank]["heard"] == list(range(1, 14))

@@ -651,16 +651,17 @@ def test_sand_and_rubber_in_one_run():
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("steps", [1000, pytest.param(10_000, marks=pytest.mark.slow)])
 @torch.inference_mode()
-def test_ten_thousand_steps_of_nothing(formulation):
-    """No gravity, no wind, float32: a body at rest has drifted by less than a micrometre."""
+def test_many_steps_of_nothing(formulation, steps):
+    """No gravity, no wind, float32: a body at rest drifts by less than a micrometre in ten thousand steps."""
     points = _points(_lattice(3, 3, 2, low=(0.3, -0.2, 0.1)))
     solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
     state = solver.init_state(points)
     dt = 0.5 * solver.stable_substep()
-    state = solver.rollout(state, dt, 10_000)
+    state = solver.rollout(state, dt, steps)
     check_state(solver, state)
-    assert float((state.position - points.position).abs().max()) < 1e-6
+    assert float((state.position - points.position).abs().max()) < 1e-10 * steps
     assert float(solver.energies(state)["kinetic"]) < 1e-12
 
 

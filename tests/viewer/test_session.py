@@ -96,13 +96,15 @@ def test_gravity_that_was_changed_acts(session, until):
 def test_another_grid_starts_anew_and_the_same_grid_goes_on(session, until):
     session.start()
     until(lambda: session.snapshot.health.time > 0.1)
+    session.pause()
     session.change({"solver.dx": 0.15})
-    until(lambda: session.simulation.solver.dx == 0.15)
-    assert session.snapshot.health.time < 0.1
+    until(lambda: session.snapshot.simulation.solver.dx == 0.15)
+    assert session.snapshot.health.time == 0.0
+    session.pause(False)
     until(lambda: session.snapshot.health.time > 0.1)
     before, simulation = session.snapshot.health.time, session.simulation
     session.change({"solver.boundaries": []})  # let go
-    until(lambda: session.simulation is not simulation)
+    until(lambda: session.snapshot.simulation is not simulation)
     assert session.snapshot.health.time >= before
     low = _position(session)[:, 2].mean()
     until(lambda: _position(session)[:, 2].mean() < low - 0.1)

@@ -23,7 +23,11 @@ def _collision(sheet, device):
     return points, velocity, [PinnedPoints([[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]]), ball]
 
 
-@pytest.mark.parametrize("iterations", [1, 4])
+@pytest.mark.parametrize(
+    ("device", "iterations"),
+    [("cpu", 4), *(pytest.param("cuda", number, marks=pytest.mark.gpu) for number in (1, 4))],
+    indirect=["device"],
+)
 def test_the_kernels_do_what_torch_does(sheet, scene, device, iterations):
     """Four substeps of free flight and four of collision; round-off grows in it, but not to a thousandth of it."""
     points, velocity, boundaries = _collision(sheet, device)

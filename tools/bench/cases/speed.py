@@ -43,6 +43,7 @@ class Plan:
         exact_limit: Most particles for which the error against float64 is measured.
         sand: Particles of the block of sand.
         cubes: Points of elastic cubes.
+        cube_steps: Substeps of the timed rollout of a cube.
         scenes: Flags of the batch.
         side: Particles along a side of each of them.
         steps: Substeps of the timed rollout, and of the longer one that gives the slope.
@@ -68,6 +69,7 @@ class Plan:
     spacing: float
     dx: tuple[float, ...]
     cubes: tuple[int, ...] = ()
+    cube_steps: int = 96
     small: bool = False
     large: float | None = None
     side: int = 64
@@ -116,7 +118,15 @@ def plan_for(kind: str, counts: str | None = None, quick: bool = False) -> Plan:
         plan = replace(plan, counts=(64, 400), exact_limit=64, sand=64, scenes=2, side=8, steps=(4, 8))
         plan = replace(plan, torch_steps=2, warm=2, repeats=(2, 2), copy_bytes=2**20)
         plan = replace(
-            plan, frames=(1, 2), picture=(64, 36), spacing=0.025, dx=(0.1,), cubes=(1000,), small=False, large=None
+            plan,
+            frames=(1, 2),
+            picture=(64, 36),
+            spacing=0.025,
+            dx=(0.1,),
+            cubes=(1000,),
+            cube_steps=4,
+            small=False,
+            large=None,
         )
     return plan if counts is None else replace(plan, counts=tuple(int(n) for n in counts.split(",")))
 
@@ -235,7 +245,7 @@ def bench_cube(plan: Plan, asked: int, walls: bool, turning: bool, device: torch
     box = [EnclosingBox([0.03] * 3, [1.6] * 3)] if walls else []
     solver = MPMSolver(dx=1 / 128, formulation="updated", boundaries=box)
     start = solver.init_state(points, spin(points.position) if turning else None, margin=24)
-    dt, steps = 0.7 * solver.stable_substep(start), 96
+    dt, steps = 0.7 * solver.stable_substep(start), plan.cube_steps
     state = start
 
     def go() -> None:
