@@ -32,10 +32,10 @@ from gaussian_swaying.fitting.least_squares import (
     START,
     Normal,
     Progress,
-    central_sensitivities,
     huber,
     iterate,
     normal_equations,
+    sensitivities,
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
@@ -275,7 +275,7 @@ class Fit:
         )
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:
-        blocks, steps = central_sensitivities(self.residuals(evidence, times), place)
+        blocks, steps = sensitivities(self.residuals(evidence, times), place)
         return normal_equations(blocks, scales_of(blocks, {part.kind: part.floor for part in evidence}), steps)
 
     def _check_apart(self, course: Course) -> None:

@@ -36,6 +36,7 @@ class Shown:
         camera: Its name.
         fitted: PSNR of the fitted frames [dB].
         predicted: PSNR of the predicted frames [dB]; NaN if there are none.
+        rest: PSNR of the first frame, at rest [dB]: what noise, light and the splat itself leave, before any motion.
         picture: Rows of video, simulation and difference, dtype uint8, shape (H, W, 3).
         rows: What each row is, such as ``0.5 s, fitted``.
     """
@@ -43,6 +44,7 @@ class Shown:
     camera: str
     fitted: float
     predicted: float
+    rest: float
     picture: Tensor
     rows: tuple[str, ...]
 
@@ -154,7 +156,9 @@ def predictions(
     found = []
     for video, own, row in zip(videos, squares, rows, strict=True):
         picture = (torch.cat([part for _, part in row]) * 255).round().to(torch.uint8)
-        found.append(Shown(video.name, _psnr(own[0]), _psnr(own[1]), picture, tuple(told for told, _ in row)))
+        found.append(
+            Shown(video.name, _psnr(own[0]), _psnr(own[1]), _psnr(own[0][:1]), picture, tuple(told for told, _ in row))
+        )
     return found
 
 
@@ -176,7 +180,13 @@ def write_results(
             "covariance_of_shares": result.covariance.tolist(),
             "sensitivities": [{"strength": d.strength, "direction": d.sentence} for d in result.directions],
             "cameras": [
-                {"camera": s.camera, "psnr_fitted_db": s.fitted, "psnr_predicted_db": s.predicted} for s in result.shown
+                {
+                    "camera": s.camera,
+                    "psnr_fitted_db": s.fitted,
+                    "psnr_predicted_db": s.predicted,
+                    "psnr_rest_db": s.rest,
+                }
+                for s in result.shown
             ],
             "not_determined": result.vague,
             "at_an_end": result.at_an_end,

@@ -5,7 +5,7 @@ import torch
 
 from gaussian_swaying.fitting.evidence import Block, scales_of
 from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
-from gaussian_swaying.fitting.least_squares import Progress, iterate, linearised
+from gaussian_swaying.fitting.least_squares import Progress, iterate, linearised, sensitivities
 from gaussian_swaying.fitting.unknowns import Unknown
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
@@ -73,3 +73,31 @@ def test_an_exact_combination_is_named_and_refused():
     for words in ("`material.E` and `material.thickness`", "raising", "lowering", "10%", "`known`"):
         assert words in str(error.value)
     check_apart(directions(torch.eye(2, dtype=torch.float64), unknowns, place), unknowns, 1e3)
+
+
+def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
+    def squares(places):
+        assert bool(((places >= 0) & (places <= 1)).all())
+        return [
+            Block("tracks", (places.square() * torch.tensor([1.0, 3.0]))[:, None], torch.zeros(1, dtype=torch.long))
+        ]
+
+    place = torch.tensor([0.5, 0.25], dtype=torch.float64)
+    blocks, steps = sensitivities(squares, place)
+    slopes = (blocks[0].values[1:] - blocks[0].values[:1])[:, 0] / steps[:, None]
+    assert slopes.diagonal().tolist() == pytest.approx([1.0, 1.5])
+    assert sensitivities(squares, torch.tensor([0.0, 1.0], dtype=torch.float64))[1].min() > 0
+
+
+def test_the_lowest_place_of_a_narrow_valley_is_found():
+    """Along the valley y = 0.9 x**2 the residuals change by a thirtieth of what they change across it."""
+
+    def valley(places):
+        x, y = places.T
+        values = torch.stack([x - 0.7, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
+        return [Block("tracks", values, torch.arange(2))]
+
+    progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
+    while not progress.done and progress.iteration < 60:
+        iterate(valley, lambda blocks: {"tracks": 0.1}, progress, 1e-5)
+    assert progress.place.tolist() == pytest.approx([0.7, 0.441], abs=1e-3)

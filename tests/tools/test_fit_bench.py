@@ -59,3 +59,26 @@ def test_missed_goals_are_said_to_be_missed():
     ]
     assert any("| 0.75 s; `solver.dx` 0.06 | no |" in line for line in found)
     assert tables.blender([HEAD]) == ["Not measured yet."]
+
+
+def test_rows_of_a_case_of_blender():
+    truth = {"flow": [3.0, -4.0, 0.0], "speed": 5.0, "C_D": 1.0}
+    rows = case.blender_rows({"aero.law": "linear", "solver.dx": 0.1}, truth)
+    assert rows["tracks alone"] == {"stages": ["tracks"]}
+    assert rows["without patches"]["known"] == {
+        "aero.law": "projected",
+        "solver.dx": 0.1,
+        "aero.C_D": pytest.approx(0.8),
+        "aero.C_F": pytest.approx(0.8),
+    }
+
+
+def test_predicted_frames_are_compared_with_what_the_splat_reaches_at_rest():
+    rows = {
+        f"flag {k}, two cameras": ROW | {"psnr_predicted_db": p, "psnr_rest_db": r, "known": {}}
+        for k, (p, r) in enumerate([(28.5, 30.0), (27.0, 30.0), (26.5, 26.0)])
+    }
+    rows["flag 3, tracks alone"] = ROW | {"psnr_rest_db": 30.0}
+    found = [line.split(" | ") for line in tables.blender([HEAD | {"blender": rows}]) if line.startswith("| flag")]
+    assert [line[7] for line in found] == ["yes", "no", "yes", "yes"]
+    assert found[3][-1] == " |" or found[3][-1] == "|"

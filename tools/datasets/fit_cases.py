@@ -9,6 +9,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from blender_cloth import SPRING_TIME
 from flag_reference import FlagPattern, least_quality
 
 LAWS = ("linear", "projected")
@@ -133,6 +134,7 @@ def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
         "law": "linear",
         "air_density": pattern.air_density,
         "damping": pattern.damping,
+        "stiffness_damping": SPRING_TIME,
         "gravity": [0.0, 0.0, -pattern.gravity],
         "held": f"the {pattern.pinned} edge, a line of points that is free to turn",
         "fps": pattern.fps,
@@ -195,6 +197,7 @@ def scene_settings(
             "cfl": 0.4,
             "gravity": [0.0, 0.0, -pattern.gravity],
             "damping": pattern.damping,
+            "stiffness_damping": SPRING_TIME,
             "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": None, "region": held}}],
         },
         "wind": {"flow": START["flow"], "modulations": []},
