@@ -99,7 +99,9 @@ def test_the_page_compares_pins():
     result["uncertainty"] = {"1": {"coarser": known}, "4": {"steps doubled": known}}
     assert tables.device(result) == ["a GPU; torch 2; seed 0.", "Other options of `tools/sim.py`: `--a=1`.", "Quiet."]
     table = tables.rows_table(result)
-    names = "pattern 1 | pattern 2 | pattern 3 | pattern 4 (curtain) | pattern 5 (light, stiff) | curtain | light, stiff"
+    names = (
+        "pattern 1 | pattern 2 | pattern 3 | pattern 4 (curtain) | pattern 5 (light, stiff) | curtain | light, stiff"
+    )
     assert table[0] == f"|  | {names} |"
     assert table[2] == "| nodes held, dx = 0.015 to 0.025 m | 2.66 % | 1.25 % | - | - | - | - | - |"
     assert table[3] == "| hinges, dx = 0.04 m | 2.50 % | 1.30 % | - | 1.49 % | failed | - | 2.10 % |"

@@ -206,7 +206,12 @@ def what_failed(told: str) -> str:
 
 
 def run_row(
-    pattern: Flag, variant: Variant, options: argparse.Namespace, splat: Path | None, output: Path, pictures: bool = True
+    pattern: Flag,
+    variant: Variant,
+    options: argparse.Namespace,
+    splat: Path | None,
+    output: Path,
+    pictures: bool = True,
 ) -> Row:
     """Simulate a row into the folder ``output`` and compare it with the reference, with ``pictures`` if it has all."""
     dataset = Path(options.dataset)
