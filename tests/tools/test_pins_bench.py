@@ -60,7 +60,8 @@ def test_rows_are_recorded_and_others_kept(tmp_path, monkeypatch):
         return {"pattern": pattern, "title": variant.title, "chamfer_per_frame_m": [0.1]}
 
     monkeypatch.setattr(flags, "run_row", row)
-    options = type("Options", (), {"dataset": tmp_path, "rows": "nodes_04,nodes", "patterns": "5", "more": None})()
+    given = {"dataset": tmp_path, "rows": "nodes_04,nodes", "patterns": "5", "more": None, "note": None}
+    options = type("Options", (), given)()
     result, saved = {"rows": {"hinge": {"5": {}}}}, []
     pins.measure(options, result, lambda now: saved.append(sorted(now["rows"])))
     assert saved == [["hinge", "nodes_04"], ["hinge", "nodes", "nodes_04"]]

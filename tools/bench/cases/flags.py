@@ -311,6 +311,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
+    command.add_argument("--note", help="a sentence for the page about how the rows were measured")
 
 
 def splat_folder(options: argparse.Namespace, name: str, pattern: int) -> Path:
@@ -358,7 +359,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     patterns = [int(p) for p in options.patterns.split(",")]
     open_dataset(Path(options.dataset), patterns, result)
     result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
-    result["more"] = options.more or ""
+    result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
     rows = result.setdefault("rows", {})
     made = options.splats == "made"
     jobs = [(name, p) for name in names for p in patterns if p in VARIANTS[name].patterns]

@@ -85,6 +85,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", type=int, help="only the first frames")
     command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
+    command.add_argument("--note", help="a sentence for the page about how the rows were measured")
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
@@ -94,7 +95,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
         raise SystemExit(f"--rows takes {', '.join(ROWS)}, not {', '.join(sorted(unknown))}")
     patterns = flags.flags_named(options.patterns)
     flags.open_dataset(Path(options.dataset), patterns, result)
-    result["more"] = options.more or ""
+    result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
     rows = result.setdefault("rows", {})
     for name in names:
         for pattern in patterns:
