@@ -87,7 +87,7 @@ def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
 
 
 def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
-    """A known limit (docs/validation.md): inner leaves of a crown are hidden from all sides, as clutter in a body is."""
+    """A known limit (docs/validation.md): inner leaves are hidden from all sides, as clutter in a body is."""
     body = bodies.of_cloud(FicusScene(leaves=300).generate(), above=bodies.CROWN)
     weight, areas = weights(body)
     assert 0.8 < float((weight * areas).sum() / areas.sum()) <= 1
