@@ -9,6 +9,7 @@ from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.openness import LEAST, openness
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.validation import bodies
@@ -83,6 +84,18 @@ def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
     """A leaf that is reached through a gap counts fully; some leaves are hidden between others from all sides."""
     weight, areas = weights(bodies.of_cloud(LeavesScene(leaves=leaves).generate()))
     assert least < float((weight * areas).sum() / areas.sum()) <= 1
+
+
+def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
+    """A known limit (docs/validation.md): inner leaves are hidden from all sides, as clutter in a body is."""
+    body = bodies.of_cloud(FicusScene(leaves=300).generate(), above=bodies.CROWN)
+    weight, areas = weights(body)
+    assert 0.8 < float((weight * areas).sum() / areas.sum()) <= 1
+    away = (body.means - body.means.mean(0)).norm(dim=-1)
+    outer = away > away.quantile(0.8)
+    share = [float((weight * areas)[part].sum() / areas[part].sum()) for part in (outer, ~outer)]
+    assert share[0] > 0.95
+    assert share[0] > share[1]
 
 
 def test_two_parallel_sheets_stay_two():

@@ -221,13 +221,15 @@ def test_rows_with_trainings_at_the_same_time(tmp_path, monkeypatch):
     for pattern in (1, 2):
         (tmp_path / f"pattern{pattern}").mkdir()
         (tmp_path / f"pattern{pattern}" / "cloth.npz").write_bytes(b"")
-    given = {"rows": "ours,neighbours,two_views", "patterns": "1,2", "splats": str(tmp_path / "splats"), "more": None}
+    given = {"rows": "ours,neighbours,two_views", "patterns": "1,2", "splats": str(tmp_path / "splats")}
+    given |= {"more": None, "note": "Quiet."}
     given |= {"dataset": str(tmp_path), "train_steps": 7, "at_once": 3, "sims_at_once": 2, "pictures": str(tmp_path)}
     result = {"rows": {"membrane": {"1": {"status": "complete"}}}}
     flags.measure(flags.argparse.Namespace(**given), result, lambda now: saved.append(len(now["rows"])))
     assert sorted(trained) == [(1, "all_losses"), (1, "two_views"), (2, "all_losses"), (2, "two_views")]
     assert sorted(simulated) == [1, 1, 2, 2]
     rows = result["rows"]
+    assert result["note"] == "Quiet."
     assert rows["membrane"] == {"1": {"status": "complete"}}
     assert rows["two_views"]["2"]["failed"] == "ValueError: no photos"
     assert rows["ours"]["1"]["tilt"] == {"gaussians": 3}

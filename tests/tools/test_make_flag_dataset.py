@@ -589,18 +589,18 @@ def test_without_blender_one_sentence_names_the_extra(tool, monkeypatch, tmp_pat
 def test_options_reach_the_flag_and_the_pictures(tool, reference):
     shape = ["--cells", "60", "--frames", "50", "--flag-size", "0.6", "0.4", "--texture", "white", "--drag", "0.5"]
     options = tool.parse([*shape, "--damping", "0.3", "--size", "640x360", "--samples", "4"])
-    flag, pictures = tool.flag_of(2, options), tool.pictures_of(options)
+    flag, pictures = tool.flag_of(reference.PATTERNS[2], options), tool.pictures_of(options)
     assert (flag.cells, flag.frames, flag.width, flag.height) == (60, 50, 0.6, 0.4)
     assert (flag.texture, flag.drag, flag.damping) == ("white", 0.5, 0.3)
     assert flag.quality == reference.least_quality(flag) == 64  # cells of 1 cm
     assert (pictures.size, pictures.samples, pictures.views) == ((640, 360), 4, 200)
     default = tool.parse([])
-    for number in reference.PATTERNS:
-        assert tool.flag_of(number, default) == reference.PATTERNS[number]
+    for pattern in reference.PATTERNS.values():
+        assert tool.flag_of(pattern, default) == pattern
     assert tool.pictures_of(default) == tool.Pictures()
     preview = tool.parse(["--preview", "--views", "3"])
     assert tool.pictures_of(preview) == replace(tool.PREVIEW, views=3)
-    assert tool.flag_of(1, preview).cells == 30
+    assert tool.flag_of(reference.PATTERNS[1], preview).cells == 30
     with pytest.raises(ValueError, match="`samples`"):
         tool.pictures_of(tool.parse(["--samples", "0"]))
 
@@ -610,6 +610,117 @@ def test_bad_options_are_one_sentence(tool, monkeypatch, tmp_path, capsys):
     assert tool.main(["--pattern", "1", "--quality", "20", "--out", str(tmp_path / "flags")]) == 1
     assert "`quality`" in capsys.readouterr().err
     assert not (tmp_path / "flags").exists()
+
+
+# ---- flags of one's own
+
+FLAG = {"size": [1.0, 1.4], "E": 4e3, "density": 25, "flow": [1, 1.5, 0], "pins": "top", "yaw": 20, "drag": 1.0}
+CONFIGS = TOOLS.parents[1] / "configs" / "flags"
+
+
+def _written(folder, name="own.yaml", **changed):
+    """A file of FLAG with changes; a field that is None is left out."""
+    fields = {key: value for key, value in (FLAG | changed).items() if value is not None}
+    (folder / name).write_text(json.dumps(fields))  # JSON is YAML
+    return folder / name
+
+
+def test_any_flag_is_read_from_a_file(tool, tmp_path):
+    path = _written(tmp_path, damping=0.5, cells=56, texture="own.png", thickness="5e-3")
+    flag = tool.read_flag(path)
+    assert (flag.width, flag.height, flag.youngs_modulus, flag.poisson_ratio) == (1.0, 1.4, 4000.0, 0.3)
+    assert (flag.density, flag.thickness, flag.flow, flag.yaw) == (25.0, 0.005, (1.0, 1.5, 0.0), 20.0)
+    assert (flag.pinned, flag.drag, flag.damping, flag.cells) == ("top", 1.0, 0.5, 56)
+    assert (flag.frames, flag.fps, flag.gravity, flag.texture) == (250, 25, 9.8, "own.png")
+    (tmp_path / "own.png").write_bytes(b"")
+    assert tool.read_flag(path).texture == str(tmp_path / "own.png")  # beside the file
+    flags = tool.flags_of(tool.parse(["--flag", str(path), "--frames", "50"]))
+    assert list(flags) == ["own"]
+    assert flags["own"].frames == 50
+    assert flags["own"].quality == sys.modules["flag_reference"].least_quality(flags["own"])
+    assert list(tool.flags_of(tool.parse([]))) == ["pattern1", "pattern2", "pattern3"]
+    both = tool.parse(["--pattern", "2", "--flag", str(path)])
+    assert list(tool.flags_of(both)) == ["pattern2", "own"]
+    (tmp_path / "more").mkdir()
+    twice = tool.parse(["--flag", str(path), str(_written(tmp_path / "more"))])
+    with pytest.raises(ValueError, match=r"the folder `own`: rename .*more"):
+        tool.flags_of(twice)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"E": None}, "has no `E`: add it, in Pa"),
+        ({"pins": None}, "has no `pins`: add it, one of left, corners, top"),
+        ({"pins": "right"}, "Expected `pins` to be one of left, corners, top, but got 'right'"),
+        ({"pins": ["top"]}, "Expected `pins` in .* to be one of left, corners, top"),
+        ({"size": 1.2}, "Expected `size` in .* to be a list of 2 numbers, width and height in m, but got 1.2"),
+        ({"size": [1.2, 0]}, "Expected `size` to be positive and finite, but got 0"),
+        ({"E": "soft"}, "Expected `E` in .* to be a number in Pa, but got 'soft'"),
+        ({"E": True}, "Expected `E` in .* to be a number in Pa"),
+        ({"E": -1}, "Expected `E` to be positive and finite, but got -1"),
+        ({"nu": 0.5}, "Expected `nu` to be at least 0 and below 0.5"),
+        ({"flow": [1, "x", 0]}, "Expected `flow` in .* to be a list of 3 numbers, the velocity of the air in m/s"),
+        ({"yaw": float("inf")}, "Expected `yaw` in .* to be a number in degrees"),
+        ({"damping": -1}, "Expected `damping` not to be negative"),
+        ({"cells": 10.5}, "Expected `cells` in .* to be a whole number"),
+        ({"self_collision": 1}, "Expected `self_collision` in .* to be true or false"),
+        ({"texture": 1}, "Expected `texture` in .* to be white, stripes, or the path of an image"),
+        ({"colour": "red"}, "has an unknown field `colour`: use size, E, density, pins, flow"),
+    ],
+)
+def test_a_bad_field_of_a_flag_is_one_sentence(tool, monkeypatch, tmp_path, capsys, changed, message):
+    monkeypatch.setattr(tool, "require_bpy", lambda: None)
+    path = _written(tmp_path, **changed)
+    with pytest.raises(ValueError, match=message) as error:
+        tool.read_flag(path)
+    assert str(path) in str(error.value)
+    assert tool.main(["--flag", str(path), "--out", str(tmp_path / "flags")]) == 1
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not (tmp_path / "flags").exists()
+
+
+def test_a_file_that_is_no_flag_is_one_sentence(tool, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tool, "require_bpy", lambda: None)
+    for name, text in (("list.yaml", "[1, 2]"), ("broken.yaml", "E: ["), ("bytes.yaml", "\udcff")):
+        (tmp_path / name).write_text(text, errors="surrogateescape")
+        with pytest.raises(ValueError, match=name):
+            tool.read_flag(tmp_path / name)
+    assert tool.main(["--flag", str(tmp_path / "none.yaml")]) == 1
+    assert "none.yaml does not exist" in capsys.readouterr().err
+
+
+def test_a_flag_of_a_file_has_its_own_truth(tool, flag_motion, monkeypatch, tmp_path):
+    """The folder has the name of the file; the rest shape and the motion are those of the fields."""
+    _fake_solver(monkeypatch, flag_motion, [])
+    monkeypatch.setattr(tool, "require_bpy", lambda: None)
+    path = _written(tmp_path, cells=14, frames=3)
+    assert tool.main(["--flag", str(path), "--only", "cloth", "--out", str(tmp_path / "flags")]) == 0
+    folder = tmp_path / "flags" / "own"
+    with np.load(folder / "cloth.npz") as data:
+        assert data["areal_density"] == pytest.approx(0.25)
+        assert data["membrane_stiffness"] == pytest.approx(40)
+        np.testing.assert_allclose(data["flow"], [1, 1.5, 0])
+        np.testing.assert_array_equal(data["pin_uv"], [[0, 1, 1, 1]])
+        assert data["positions"].shape == (3, 14 * 10, 3)
+    with np.load(folder / "truth.npz") as data:
+        assert data["area"] == pytest.approx(1.4)
+        turned = np.array([math.sin(math.radians(20)), -math.cos(math.radians(20)), 0])
+        np.testing.assert_allclose(data["normals"], np.broadcast_to(turned, data["normals"].shape), atol=1e-12)
+    assert tool.main(["--flag", str(path), "--only", "cloth", "--damping", "3", "--out", str(tmp_path / "flags")]) == 1
+
+
+def test_two_flags_that_nothing_was_tuned_for(tool):
+    """A curtain in an oblique wind, and a light stiff flag in 3 m/s at 60 degrees to its plane."""
+    expected = {"curtain": ((1.0, 1.4), 4e3, 25.0, 56.31), "light": ((1.2, 1.0), 8e3, 15.0, 60.0)}
+    assert {path.stem for path in CONFIGS.glob("*.yaml")} == set(expected)
+    for name, (sides, modulus, density, angle) in expected.items():
+        flag = tool.read_flag(CONFIGS / f"{name}.yaml")
+        assert ((flag.width, flag.height), flag.youngs_modulus, flag.density) == (sides, modulus, density)
+        assert (flag.thickness, flag.poisson_ratio, flag.pinned, flag.damping) == (0.01, 0.3, "top", 1.0)
+        speed = math.hypot(*flag.flow)
+        assert speed == pytest.approx({"curtain": 1.803, "light": 3.0}[name], abs=1e-3)
+        assert math.degrees(math.asin(-flag.normal() @ flag.flow / speed)) == pytest.approx(angle, abs=0.01)
 
 
 # ---- with Blender

@@ -34,3 +34,25 @@ def test_what_another_process_wrote_meanwhile_is_kept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["flags_cpu.json"]
     record.go_on(options, "flags_cpu", {"device": "b"}, lambda _, result, save: save(result))
     assert json.loads((tmp_path / "flags_cpu.json").read_text()) == {"device": "b"}
+
+
+def test_a_row_that_another_process_measures_anew_is_not_put_back(tmp_path):
+    """Each process holds the rows that it read at its start, and writes only those that it changed."""
+    options = argparse.Namespace(results=str(tmp_path))
+    old = {"device": "a", "note": "Old.", "rows": {"one": {"1": {"x": 1}, "2": {"x": 1}}, "two": {"1": {"x": 1}}}}
+    record.write(tmp_path, "flags_cpu", old, quiet=True)
+
+    def measure(_, result, save):
+        def other(_, rows, keep):
+            rows["rows"]["two"]["1"] = {"x": 2}
+            rows["rows"]["one"]["2"] = {"x": 2}
+            keep(rows | {"note": "New."})
+
+        record.go_on(options, "flags_cpu", {"device": "a"}, other)
+        result["rows"]["one"]["1"] = {"y": 3}
+        save(result)
+
+    record.go_on(options, "flags_cpu", {"device": "a"}, measure)
+    found = json.loads((tmp_path / "flags_cpu.json").read_text())
+    assert found["rows"] == {"one": {"1": {"y": 3}, "2": {"x": 2}}, "two": {"1": {"x": 2}}}
+    assert found["note"] == "New."

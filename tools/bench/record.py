@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -50,20 +51,23 @@ def kept_rows(folder: Path, name: str, keep: Callable[[Row], bool]) -> list[Row]
 def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable[..., None]) -> None:
     """Add to an earlier record of the same device, and write after each part.
 
-    What another process has added to the record meanwhile is kept.
+    What another process has added to the record or measured anew meanwhile is kept.
     """
     folder = Path(options.results)
     path = folder / f"{name}.json"
+    before: Row = {}
     if path.exists():
         kept = json.loads(path.read_text())
         if kept["device"] == result["device"]:
-            result = kept | result
+            result, before = kept | result, kept
+    before = copy.deepcopy(before)
 
     def save(now: Row) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(path.with_suffix(".lock")):
             there = json.loads(path.read_text()) if path.exists() else {}
-            write(folder, name, merged(there, now) if there.get("device") == now["device"] else now, quiet=True)
+            same = there.get("device") == now["device"]
+            write(folder, name, merged(there, changed(before, now)) if same else now, quiet=True)
 
     measure(options, result, save)
     path.with_suffix(".lock").unlink(missing_ok=True)
@@ -74,7 +78,18 @@ def merged(old: Row, new: Row) -> Row:
     """A record with the rows of both, those of ``new`` where both have one; tables of rows are merged, rows are not."""
     both = dict(old)
     for key, value in new.items():
-        tables = [part for part in (value, both.get(key)) if isinstance(part, dict)]
-        deeper = len(tables) == 2 and all(isinstance(row, dict) for part in tables for row in part.values())
-        both[key] = merged(both[key], value) if deeper else value
+        both[key] = merged(both[key], value) if _are_tables(value, both.get(key)) else value
     return both
+
+
+def changed(before: Row, now: Row) -> Row:
+    """The rows of a record that are not as they were."""
+    found: Row = {}
+    for key, value in now.items():
+        if key not in before or before[key] != value:
+            found[key] = changed(before[key], value) if _are_tables(value, before.get(key)) else value
+    return found
+
+
+def _are_tables(*parts: object) -> bool:
+    return all(isinstance(part, dict) and all(isinstance(row, dict) for row in part.values()) for part in parts)

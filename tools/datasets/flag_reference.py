@@ -104,10 +104,14 @@ class FlagPattern:
                 "Expected `quality` to be a power of two, since Blender adds up its steps in float32, but got "
                 f"{self.quality}."
             )
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise ValueError(f"Expected `poisson_ratio` to be at least 0 and below 0.5, but got {self.poisson_ratio}.")
+        if not math.isfinite(self.yaw):
+            raise ValueError(f"Expected `yaw` to be finite, but got {self.yaw}.")
         if self.pinned not in PINNED:
             raise ValueError(f"Expected `pinned` to be one of {', '.join(PINNED)}, but got {self.pinned!r}.")
-        if len(self.flow) != 3:
-            raise ValueError(f"Expected `flow` to have 3 numbers, but got {self.flow}.")
+        if len(self.flow) != 3 or not all(map(math.isfinite, self.flow)):
+            raise ValueError(f"Expected `flow` to have 3 finite numbers, but got {self.flow}.")
 
     # ---- shape
 

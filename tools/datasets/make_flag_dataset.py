@@ -3,16 +3,17 @@
 ``python tools/datasets/make_flag_dataset.py --preview``      the paper's three, small, in two minutes on two cores
 ``python tools/datasets/make_flag_dataset.py --pattern 2``    one, at full size
 ``python tools/datasets/make_flag_dataset.py --pattern 1 2 3 4 5 --only cloth``  the motions for ``bench.py pins``
+``python tools/datasets/make_flag_dataset.py --flag configs/flags/curtain.yaml``  any flag, described in a YAML file
 ``python tools/datasets/make_flag_dataset.py --check``        measures how Blender's settings relate to SI units
 ``python tools/datasets/make_flag_dataset.py --uncertainty``  how far each motion is from other solutions of it
 
 Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
 
-For each pattern a folder, ``pattern1`` and so on, holds ``cloth.npz`` (the motion, see ``flag_motion.py``),
-``mesh.ply`` and ``truth.npz`` (the rest shape with its normals), ``train/`` (photographs of the rest shape from all
-around, with ``transforms.json``) and ``video/`` (``frames/``, ``camera.json``, ``reference.mp4``). The same settings
-give the same files. What is there is not made again, so an interrupted run is continued by the same command; where
-settings changed, the run stops and names them.
+For each flag a folder, ``pattern1`` and so on or the name of the YAML file, holds ``cloth.npz`` (the motion, see
+``flag_motion.py``), ``mesh.ply`` and ``truth.npz`` (the rest shape with its normals), ``train/`` (photographs of the
+rest shape from all around, with ``transforms.json``) and ``video/`` (``frames/``, ``camera.json``, ``reference.mp4``).
+The same settings give the same files. What is there is not made again, so an interrupted run is continued by the same
+command; where settings changed, the run stops and names them.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from blender_checks import check_relations
 from blender_cloth import require_bpy
 from blender_images import TRANSFERS, Studio
 from flag_difference import VARIANTS, difference, variants
+from flag_file import read_flag
 from flag_motion import SOLVERS, check_settings, motion_settings, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture, frame_order, lamp_position, reference_view, sphere_views, transforms_fields
 from flag_reference import PAPER, PATTERNS, FlagPattern, least_quality
@@ -270,7 +272,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     add = parser.add_argument
     add("--out", type=Path, default=Path("outputs/flags"), help="folder to write (default: %(default)s)")
-    add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), default=list(PAPER), help="which flags (1 2 3)")
+    add("--pattern", type=int, nargs="+", choices=sorted(PATTERNS), help="which flags (1 2 3, or none with --flag)")
+    add("--flag", type=Path, nargs="+", default=[], metavar="FILE", help="YAML files of other flags")
     add("--only", nargs="+", choices=PARTS, default=list(PARTS), help="which parts")
     add("--preview", action="store_true", help="coarse mesh, small pictures, every tenth frame")
     add("--cells", type=int, help="cells of the mesh along the longer side (120, 120, 140, 112, 100)")
@@ -297,8 +300,25 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
-    """The pattern chosen on the command line.
+def flags_of(options: argparse.Namespace) -> dict[str, FlagPattern]:
+    """The flags chosen on the command line, by the names of their folders.
+
+    Raises:
+        FileNotFoundError: If a file of ``--flag`` does not exist.
+        ValueError: If such a file is invalid, or two flags have one name.
+    """
+    numbers = (() if options.flag else PAPER) if options.pattern is None else options.pattern
+    flags = {f"pattern{number}": PATTERNS[number] for number in numbers}
+    for file in options.flag:
+        flag = read_flag(file)
+        if file.stem in flags:
+            raise ValueError(f"Two flags would have the folder `{file.stem}`: rename {file}.")
+        flags[file.stem] = flag
+    return {name: flag_of(flag, options) for name, flag in flags.items()}
+
+
+def flag_of(flag: FlagPattern, options: argparse.Namespace) -> FlagPattern:
+    """A flag with the options of the command line.
 
     Raises:
         ValueError: If an option is out of range.
@@ -307,11 +327,10 @@ def flag_of(number: int, options: argparse.Namespace) -> FlagPattern:
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     if options.flag_size:
         given["width"], given["height"] = options.flag_size
-    pattern = PATTERNS[number]
     if options.preview:
-        given = {"cells": pattern.cells // 4} | given
-    pattern = replace(pattern, **given)
-    return replace(pattern, quality=options.quality or least_quality(pattern))
+        given = {"cells": max(flag.cells // 4, 2)} | given
+    flag = replace(flag, **given)
+    return replace(flag, quality=options.quality or least_quality(flag))
 
 
 def pictures_of(options: argparse.Namespace) -> Pictures:
@@ -329,18 +348,18 @@ def pictures_of(options: argparse.Namespace) -> Pictures:
     return replace(base, **given)
 
 
-def make(number: int, options: argparse.Namespace) -> None:
-    """Make the missing files of one pattern."""
-    pattern, pictures = flag_of(number, options), pictures_of(options)
-    folder = options.out / f"pattern{number}"
+def make(name: str, pattern: FlagPattern, options: argparse.Namespace) -> None:
+    """Make the missing files of one flag, in a folder of that name."""
+    pictures = pictures_of(options)
+    folder = options.out / name
 
     def report(line: str) -> None:
-        print(f"pattern {number}: {line}", flush=True)
+        print(f"{name}: {line}", flush=True)
 
     if options.uncertainty:
         found = make_uncertainty(pattern, folder, options.variants, report, solver=options.solver)
-        for name, row in found["variants"].items():
-            report(f"{name}: Chamfer distance {100 * row['chamfer']:.2f} % of the longer side")
+        for variant, row in found["variants"].items():
+            report(f"{variant}: Chamfer distance {100 * row['chamfer']:.2f} % of the longer side")
         return
     started = time.time()
     if "cloth" in options.only:
@@ -369,9 +388,9 @@ def main(argv: list[str] | None = None) -> int:
             for row in rows["checks"]:
                 print(f"{row['name']}: {row['measured']:.4g} {row['unit']}, {row['ratio']:.4f} of what was expected")
             return 0
-        for number in options.pattern:
-            make(number, options)
-    except (ImportError, ValueError, ArithmeticError) as error:
+        for name, flag in flags_of(options).items():
+            make(name, flag, options)
+    except (ImportError, ValueError, ArithmeticError, FileNotFoundError) as error:
         print(f"make_flag_dataset.py: {error}", file=sys.stderr)
         return 1
     return 0

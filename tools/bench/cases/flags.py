@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,11 +25,20 @@ from gaussian_swaying.evaluation.compare import compare_run
 
 sys.path.append(str(ROOT / "tools" / "datasets"))  # scripts that import each other from their own folder
 
+from flag_file import read_flag
 from flag_reference import PAPER as PATTERNS
-from flag_reference import PATTERNS as REFERENCES
+from flag_reference import PATTERNS as NUMBERED
+from flag_reference import FlagPattern
 
 BENCH = ROOT / "configs" / "bench"
 Row = dict[str, Any]
+Flag = int | str  # the number of a pattern, or the name of a file in configs/flags
+
+REFERENCES: dict[Flag, FlagPattern] = {
+    **NUMBERED,
+    **{name: read_flag(ROOT / "configs" / "flags" / f"{name}.yaml") for name in ("curtain", "light")},
+}
+"""All flags with a reference: the numbered patterns, and those of configs/flags."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +90,7 @@ VARIANTS: dict[str, Variant] = {
     "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), grid_options(0.03)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), grid_options(0.02)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
+    "linear": Variant("pressure linear in the cloth's speed", options=("--aero.law=linear",), patterns=(2, 3)),
     "stiffness_damping": Variant("stiffness damping, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
     "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
@@ -102,14 +112,28 @@ VARIANTS: dict[str, Variant] = {
 _TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
 
 
-def matched_configs(pattern: int) -> list[Path]:
+def folder_of(pattern: Flag) -> str:
+    """Name of the folder of a flag in a data set."""
+    return f"pattern{pattern}" if isinstance(pattern, int) else pattern
+
+
+def flags_named(text: str) -> list[Flag]:
+    """The flags in a list separated by commas; exits if one has no reference."""
+    found: list[Flag] = [int(name) if name.isdigit() else name for name in text.split(",")]
+    if unknown := [name for name in found if name not in REFERENCES]:
+        raise SystemExit(f"--patterns takes {', '.join(map(str, REFERENCES))}, not {unknown[0]}")
+    return found
+
+
+def matched_configs(pattern: Flag) -> list[Path]:
     """The configuration files that match a reference, each on top of those before it."""
     base = pattern if pattern in PATTERNS else 3  # the others hang by their top edge like pattern 3
     files = [ROOT / "configs" / "sim" / f"flag{base}.yaml", BENCH / f"flag{base}.yaml"]
-    return files if base == pattern else [*files, BENCH / f"flag{pattern}.yaml"]
+    own = f"flag{pattern}" if isinstance(pattern, int) else pattern
+    return files if base == pattern else [*files, BENCH / f"{own}.yaml"]
 
 
-def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | None) -> list[str]:
+def sim_arguments(pattern: Flag, variant: Variant, dataset: Path, splat: Path | None) -> list[str]:
     """Command line of tools/sim.py for a row."""
     configs = matched_configs(pattern)
     configs += [BENCH / "variants" / f"{name}.yaml" for name in variant.overlays]
@@ -118,7 +142,7 @@ def sim_arguments(pattern: int, variant: Variant, dataset: Path, splat: Path | N
         arguments += ["--scene.ply", str(splat)]
     else:  # the same ripple: 3 mm more would change the incidence of the wind by over a degree
         arguments += [f"--scene.generator.init_args.ripple={REFERENCES[pattern].ripple}"]
-    camera = dataset / f"pattern{pattern}" / "video" / "camera.json"
+    camera = dataset / folder_of(pattern) / "video" / "camera.json"
     if camera.exists():
         arguments += ["--camera=TransformsCamera", f"--camera.path={camera}"]
         described = json.loads(camera.read_text())
@@ -182,11 +206,16 @@ def what_failed(told: str) -> str:
 
 
 def run_row(
-    pattern: int, variant: Variant, options: argparse.Namespace, splat: Path | None, output: Path, pictures: bool = True
+    pattern: Flag,
+    variant: Variant,
+    options: argparse.Namespace,
+    splat: Path | None,
+    output: Path,
+    pictures: bool = True,
 ) -> Row:
     """Simulate a row into the folder ``output`` and compare it with the reference, with ``pictures`` if it has all."""
     dataset = Path(options.dataset)
-    reference = dataset / f"pattern{pattern}"
+    reference = dataset / folder_of(pattern)
     command = [sys.executable, str(ROOT / "tools" / "sim.py")]
     command += sim_arguments(pattern, variant, dataset, splat)
     command += ["--device", options.device, "--output", str(output)]
@@ -282,6 +311,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
     command.add_argument("--pictures", default=str(ROOT / "docs" / "pictures"), help="folder of the figures")
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
+    command.add_argument("--note", help="a sentence for the page about how the rows were measured")
 
 
 def splat_folder(options: argparse.Namespace, name: str, pattern: int) -> Path:
@@ -306,13 +336,13 @@ def train_all(jobs: list[tuple[str, int]], options: argparse.Namespace) -> dict[
         return dict(pool.map(one, wanted.items()))
 
 
-def open_dataset(dataset: Path, patterns: list[int], result: Row) -> None:
+def open_dataset(dataset: Path, patterns: Sequence[Flag], result: Row) -> None:
     """Check that the references exist, and copy what is known of their uncertainty into the record."""
     for pattern in patterns:
-        folder = dataset / f"pattern{pattern}"
+        folder = dataset / folder_of(pattern)
         if not (folder / "cloth.npz").exists():
             raise SystemExit(
-                f"{dataset} has no pattern{pattern}/cloth.npz: make it with tools/datasets/make_flag_dataset.py"
+                f"{dataset} has no {folder.name}/cloth.npz: make it with tools/datasets/make_flag_dataset.py"
             )
         path = folder / "uncertainty.json"
         if path.exists():
@@ -329,7 +359,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     patterns = [int(p) for p in options.patterns.split(",")]
     open_dataset(Path(options.dataset), patterns, result)
     result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
-    result["more"] = options.more or ""
+    result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
     rows = result.setdefault("rows", {})
     made = options.splats == "made"
     jobs = [(name, p) for name in names for p in patterns if p in VARIANTS[name].patterns]

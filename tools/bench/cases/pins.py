@@ -13,12 +13,12 @@ from typing import Any
 import yaml
 
 from bench.cases import flags
-from bench.cases.flags import REFERENCES, Variant
+from bench.cases.flags import REFERENCES, Flag, Variant
 
 Row = dict[str, Any]
 
-PATTERNS = tuple(sorted(REFERENCES))
-"""The paper's three flags and two that leave their held edge at an angle."""
+PATTERNS: tuple[Flag, ...] = tuple(REFERENCES)
+"""The paper's three flags, two that leave their held edge at an angle, and two that nothing was tuned for."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,28 @@ class Pin:
 ROWS = {
     f"{kind}{name}": Pin(kind, dx)
     for kind in ("nodes", "hinge")
-    for name, dx in (("", None), ("_025", 0.025), ("_04", 0.04), ("_08", 0.08))
-} | {f"{kind}_04_linear": Pin(kind, 0.04, linear=True) for kind in ("nodes", "hinge")}
+    for name, dx in (("", None), ("_02", 0.02), ("_025", 0.025), ("_04", 0.04), ("_08", 0.08))
+} | {
+    f"{kind}{name}_linear": Pin(kind, dx, linear=True)
+    for kind in ("nodes", "hinge")
+    for name, dx in (("_02", 0.02), ("_04", 0.04))
+}
 """All rows, by name."""
 
-_EDGES = {1: "max=[0.00625,9,9]", 3: "min=[-9,-9,1.19]", 5: "min=[-9,-9,0.794]"}  # of the held box [m]: one row of
-# Gaussians, because a hinge lies in the middle of what is held; pattern 2 holds squares, pattern 4 one row already
+_EDGES: dict[Flag, str] = {
+    1: "max=[0.00625,9,9]", 3: "min=[-9,-9,1.19]", 5: "min=[-9,-9,0.794]", "light": "min=[-9,-9,0.994]"
+}  # fmt: skip
+"""Edge of the held box [m] for hinges: one row of Gaussians, because a hinge lies in the middle of what is held.
+Pattern 2 holds squares; pattern 4 and the curtain hold one row already."""
 
 
-def grid_spacing(pin: Pin, pattern: int) -> float:
+def grid_spacing(pin: Pin, pattern: Flag) -> float:
     """The grid spacing of a row [m]."""
     files = flags.matched_configs(pattern)
     return float(pin.dx or yaml.safe_load(files[-1].read_text())["solver"]["dx"])
 
 
-def variant(pin: Pin, pattern: int) -> Variant:
+def variant(pin: Pin, pattern: Flag) -> Variant:
     """A row as a variant of the flag benchmark, with the Gaussians of the configuration."""
     options = flags.grid_options(pin.dx) if pin.dx else ()
     held = "--solver.boundaries.init_args"  # of the last boundary: each flag has one
@@ -67,7 +74,7 @@ def variant(pin: Pin, pattern: int) -> Variant:
     options += ("--aero.law=linear",) if pin.linear else ()
     if pin.kind == "hinge" and pattern in _EDGES:
         options += (f"{held}.region.init_args.{_EDGES[pattern]}",)
-    return Variant(pin.title(), options=options, patterns=(pattern,))
+    return Variant(pin.title(), options=options)
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
@@ -78,6 +85,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--frames", type=int, help="only the first frames")
     command.add_argument("--points", type=int, default=10_000, help="points on the reference's surface")
     command.add_argument("--more", help='other options of tools/sim.py: --more="--frames=25"')
+    command.add_argument("--note", help="a sentence for the page about how the rows were measured")
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
@@ -85,9 +93,9 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     names = options.rows.split(",")
     if unknown := set(names) - set(ROWS):
         raise SystemExit(f"--rows takes {', '.join(ROWS)}, not {', '.join(sorted(unknown))}")
-    patterns = [int(p) for p in options.patterns.split(",")]
+    patterns = flags.flags_named(options.patterns)
     flags.open_dataset(Path(options.dataset), patterns, result)
-    result["more"] = options.more or ""
+    result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
     rows = result.setdefault("rows", {})
     for name in names:
         for pattern in patterns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from bench.cases.flags import PATTERNS, REFERENCES, VARIANTS
+from bench.cases.flags import PATTERNS, REFERENCES, VARIANTS, Flag
 from bench.slots import table, value
 from bench.tables.markdown import gib, grid, source, yes_no
 
@@ -40,13 +40,13 @@ _OTHER = {  # variants of the reference that are different flags, or have a mesh
 _SHARE = 0.03  # goal for Chamfer distances, as a share of the longer side
 
 
-def complete(rows: Row, name: str, pattern: int) -> Row | None:
+def complete(rows: Row, name: str, pattern: Flag) -> Row | None:
     """A row that ran to its end and was compared."""
     row = rows.get(name, {}).get(str(pattern))
     return row if row and row.get("status") == "complete" and "chamfer_share" in row else None
 
 
-def doubt(result: Row, pattern: int) -> str:
+def doubt(result: Row, pattern: Flag) -> str:
     """How far the reference is from itself at most, in brackets, or nothing."""
     known = {n: v for n, v in result.get("uncertainty", {}).get(str(pattern), {}).items() if n not in _OTHER}
     return f" (reference itself: {100 * max(v['chamfer'] for v in known.values()):.2f} %)" if known else ""
@@ -183,9 +183,10 @@ def uncertainty_lines(known: Row) -> list[str]:
             for name, v in found.items()
             if name not in _OTHER
         ]
-        lines.append(f"- pattern {pattern}: {', '.join(shown)}")
+        named = f"pattern {pattern}" if pattern.isdigit() else pattern
+        lines.append(f"- {named}: {', '.join(shown)}")
         told = [f"{what} {100 * found[name]['chamfer']:.2f} %" for name, what in _OTHER.items() if name in found]
-        lines += [f"- pattern {pattern}, {'; '.join(told)}"] if told else []
+        lines += [f"- {named}, {'; '.join(told)}"] if told else []
     return lines
 
 
