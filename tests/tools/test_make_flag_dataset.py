@@ -7,6 +7,7 @@ import json
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -615,7 +616,7 @@ def test_bad_options_are_one_sentence(tool, monkeypatch, tmp_path, capsys):
 # ---- flags of one's own
 
 FLAG = {"size": [1.0, 1.4], "E": 4e3, "density": 25, "flow": [1, 1.5, 0], "pins": "top", "yaw": 20, "drag": 1.0}
-CONFIGS = TOOLS.parents[1] / "configs" / "flags"
+CONFIGS = Path(__file__).parents[2] / "configs" / "flags"
 
 
 def _written(folder, name="own.yaml", **changed):
