@@ -65,7 +65,7 @@ def _bytes(picture: Tensor):  # type: ignore[no-untyped-def] # noqa: ANN202
 
 def _opengl(camera: Camera) -> Tensor:
     """Camera-to-world matrix with OpenGL axes."""
-    return torch.linalg.inv(camera.world_to_camera.double()) * torch.tensor([1.0, -1.0, -1.0, 1.0])
+    return torch.linalg.inv(camera.world_to_camera.cpu().double()) * torch.tensor([1.0, -1.0, -1.0, 1.0])
 
 
 __all__ = ["write_video"]
