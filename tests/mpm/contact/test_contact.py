@@ -129,7 +129,7 @@ def test_a_pile_at_rest_stays_at_rest(sheet, scene, march):
     assert moved < 0.01 * THICKNESS
 
 
-_A_MINUTE = pytest.mark.xfail(strict=False, reason="measured for 12 s only, see docs/contact.md")
+_A_MINUTE = pytest.mark.xfail(strict=False, reason="the layers slide until the pile tilts, see docs/contact.md")
 
 
 @pytest.mark.slow
