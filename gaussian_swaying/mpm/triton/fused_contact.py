@@ -113,8 +113,7 @@ class FusedContact:
         self.numbers = [touched.index(o) if is_known(o) else None for _, o in stage.obstacles]
         """Which of the solids each obstacle is; None for one that runs in torch."""
         self.programs = self._programs()
-        self.room, self.slots = ROOM if stage.contact is not None else 1, SLOTS if stage.contact is not None else walls
-        self._take_room()
+        self._take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.zeros(shape, dtype=dtype, device=self.device)
@@ -127,18 +126,21 @@ class FusedContact:
         needed = max(-(-max(self.places, len(self.active)) // BLOCK), -(-len(self.touched) // TALL))
         return max(1, min(room, needed, int(list_kernels.MOST_PROGRAMS.value)))
 
-    def _take_room(self) -> None:
-        """Make the buffers whose size depends on how crowded the surface is."""
+    def _take_room(self, room: int, slots: int) -> None:
+        """Make the buffers whose size depends on how crowded the surface is; if they are refused, the old ones stay."""
         places, planes = self.places, int(kernels.PLANES.value)
-        if max(self.room, planes * self.slots) * places > MOST_ENTRIES:
+        for needed in (list_kernels.NEEDED_ROOM, list_kernels.NEEDED_SLOTS):
+            self.status[int(needed.value)] = 0  # what a refused rollout needed says nothing about the next one
+        self.margin.fill_(-1.0)
+        if max(room, planes * slots) * places > MOST_ENTRIES:
             raise ValueError(
-                f"A place of the surface is close to {max(self.room, self.slots):,} others: the material has "
-                "collapsed; lower `contact.thickness`, or coarsen `solver.dx`."
+                f"A place of the surface is close to {max(room, slots):,} others: the material has collapsed; lower "
+                "`contact.thickness`, or coarsen `solver.dx`."
             )
+        self.room, self.slots = room, slots
         self.candidates = self._zeros(places, self.room, dtype=torch.int32)
         self.other = self._zeros(self.slots, places, dtype=torch.int32)
         self.data = self._zeros(planes, self.slots, places)
-        self.margin.fill_(-1.0)
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -171,9 +173,7 @@ class FusedContact:
         _, room, slots, *_ = self.status.tolist()
         if room <= self.room and slots <= self.slots:
             return True
-        self.room = max(self.room, 1 << (room - 1).bit_length())
-        self.slots = max(self.slots, 1 << (slots - 1).bit_length())
-        self._take_room()
+        self._take_room(max(self.room, 1 << (room - 1).bit_length()), max(self.slots, 1 << (slots - 1).bit_length()))
         return False
 
     def take(self) -> None:

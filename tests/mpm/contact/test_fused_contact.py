@@ -160,15 +160,21 @@ def test_lists_that_do_not_fit_get_more_room(sheet, scene, device, monkeypatch):
 
 
 def test_material_that_has_collapsed_is_refused(sheet, scene, device, monkeypatch):
-    """More candidates than any buffer holds: a sentence, not wrong lists."""
+    """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
     monkeypatch.setattr(fused_contact, "ROOM", 2)
     points, velocity, _ = _collision(sheet, device)
     solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="triton")
     monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 1000 * points.count)
     solver.fused()
     monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 100)
+    touching = solver.fused().touching
     with pytest.raises(ValueError, match="the material has collapsed"):
         solver.rollout(state, 4 * DT, 1)
+    assert touching.candidates.shape == (touching.places, touching.room)  # kernels would write beside them
+    assert touching.other.shape == (touching.slots, touching.places)
+    monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 1000 * points.count)
+    again = solver.rollout(state, 4 * DT, 1)
+    assert torch.isfinite(again.velocity).all()
 
 
 @pytest.mark.gpu
