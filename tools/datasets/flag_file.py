@@ -7,13 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
-import yaml
 from flag_reference import PINNED, FlagPattern
 
-from gaussian_swaying._inputs import check_regular
-from gaussian_swaying._yaml_limits import check_yaml
-
-_LARGEST = 1 << 16  # bytes
+from gaussian_swaying._yaml_limits import read_fields
 
 _NUMBERS = {  # field: its name in FlagPattern, and its unit
     "E": ("youngs_modulus", "Pa"),
@@ -48,16 +44,7 @@ def read_flag(path: str | os.PathLike[str]) -> FlagPattern:
         FileNotFoundError: If there is no such file.
         ValueError: If the file or a field is invalid; the message names the field and the remedy.
     """
-    file = check_regular(path, "the file of the flag", _LARGEST)
-    try:
-        given = yaml.safe_load(check_yaml(file.read_text(encoding="utf-8")))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not valid YAML ({' '.join(str(error).split())}): correct it.") from error
-    if not isinstance(given, dict):
-        raise ValueError(f"Expected {file} to have the fields {', '.join(_NEEDED)}, but got {given!r:.60}.")
-    for name in given:
-        if name not in FIELDS:
-            raise ValueError(f"{file} has an unknown field `{name}`: use {', '.join(FIELDS)}.")
+    given, file = read_fields(path, "the file of the flag", FIELDS), Path(path)
     for name, example in _NEEDED.items():
         if given.get(name) is None:
             raise ValueError(f"{file} has no `{name}`: add it, {example}.")
