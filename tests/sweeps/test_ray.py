@@ -1,6 +1,7 @@
 """Sweeps on Ray: a local cluster of two nodes on one machine."""
 
 import csv
+import json
 import os
 import signal
 import threading
@@ -48,9 +49,7 @@ def test_a_killed_process_and_failures(cluster, tmp_path, sweep_file):
     def kill():
         end = time.monotonic() + 300
         while not killed and time.monotonic() < end:
-            for lock in (folder / "runs").glob("*/.gaussian_swaying.lock"):
-                import json
-
+            for lock in (folder / "runs").glob("0000[02]/.gaussian_swaying.lock"):
                 try:
                     os.kill(json.loads(lock.read_bytes())["pid"], signal.SIGKILL)
                     killed.append(lock.parent.name)
@@ -63,12 +62,12 @@ def test_a_killed_process_and_failures(cluster, tmp_path, sweep_file):
     killer.start()
     assert main([str(file), "--output", str(folder), "--ray", cluster, "--device", "cpu"]) == 2
     killer.join()
-    assert killed
+    assert killed, "no run that can end well was met alive"
     rows = _rows(folder / "sweep.csv")
     assert [row["status"] for row in rows] == ["complete", "diverged", "complete"]
     attempts = [int(row["attempts"]) for row in _rows(folder / "times.csv")]
-    assert attempts[1] >= 2
-    assert sum(attempts) >= 5
+    assert attempts[1] == 2
+    assert attempts[int(killed[0])] >= 2
     done = {path: path.stat().st_mtime_ns for path in (folder / "results").glob("0000[02].json")}
     assert main([str(file), "--output", str(folder), "--ray", cluster, "--device", "cpu", "--resume"]) == 2
     assert {path: path.stat().st_mtime_ns for path in done} == done
