@@ -3,6 +3,7 @@
 import json
 from functools import partial
 
+import pytest
 from bench.cases import winds
 from bench.tables import winds as tables
 
@@ -26,6 +27,25 @@ def test_a_small_record_and_its_tables(bench, tmp_path, monkeypatch):
     assert len(tables.obstacles(found)) == 4 + len(winds.OBSTACLES)
     assert len(tables.rows(found)) == 4 + len(winds.KINDS)
     assert "at most 1.3 times" in tables.goals(found)[2]
+    bench(
+        "winds",
+        "--device",
+        "cpu",
+        "--results",
+        tmp_path,
+        "--counts",
+        "64",
+        "--formulations",
+        "total",
+        "--only",
+        "obstacles",
+    )
+    again = json.loads((tmp_path / "winds_cpu.json").read_text())
+    assert (again["rows"], again["box"]) == (found["rows"], found["box"])
+    assert [row["obstacle"] for row in again["obstacles"]] == list(winds.OBSTACLES)
+    assert again["obstacles"] != found["obstacles"]
+    with pytest.raises(SystemExit, match="--only takes box, rows, obstacles, not walls"):
+        bench("winds", "--results", tmp_path, "--only", "walls")
 
 
 def test_a_missed_goal_says_no():

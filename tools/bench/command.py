@@ -112,7 +112,7 @@ COMMANDS = {
     "sweeps": Command("Measure disturbed sweeps, many small flags and training, on one and several GPUs.",
                       _going_on("sweeps", sweeps.measure), sweeps.add_arguments, page="many.md"),
     "winds": Command("Measure substeps in winds that differ from place to place, and a box of turbulence.",
-                     winds.run, winds.add_arguments, page="wind.md"),
+                     _going_on("winds", winds.measure), winds.add_arguments, page="wind.md"),
     "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 
-from bench import record
 from bench.clock import Clock, guarded
 from bench.problems import CUBE, sheet, waves, wind_load
 from gaussian_swaying.aero.carried import Turbulence
@@ -113,7 +112,7 @@ def measure_obstacles(count: int, formulation: str, device: torch.device, steps:
     return rows
 
 
-def measure(count: int, formulation: str, device: torch.device, steps: int, rounds: int) -> list[Row]:
+def measure_winds(count: int, formulation: str, device: torch.device, steps: int, rounds: int) -> list[Row]:
     """Substeps of a sheet in each wind."""
     points = sheet(count, device)
     winds = {
@@ -155,25 +154,39 @@ def measure_box(device: torch.device, rounds: int = 7) -> Row:
     return row
 
 
+PARTS: dict[str, tuple[str, Callable[..., list[Row]]]] = {
+    "rows": ("wind", measure_winds), "obstacles": ("obstacle", measure_obstacles)
+}  # fmt: skip
+"""Tables of the record: what their rows differ by, and what measures them."""
+
+
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py winds``."""
     command.add_argument("--counts", help="particles, separated by commas")
     command.add_argument("--formulations", default="total,updated", help="separated by commas")
+    command.add_argument("--only", help=f"of box, {', '.join(PARTS)}, separated by commas (default: all)")
 
 
 @torch.no_grad()
-def run(options: argparse.Namespace) -> None:
-    """Measure substeps in winds, and a box of turbulence."""
-    device, result = record.start(options.device)
-    kind, folder = device.type, Path(options.results)
-    counts = COUNTS[kind] if options.counts is None else [int(n) for n in options.counts.split(",")]
-    result |= {"box": measure_box(device), "rows": [], "obstacles": []}
-    for count in counts:
+def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
+    """Fill ``result``, saving it after each table; rows of other sizes and formulations are kept."""
+    device = torch.device(options.device)
+    kind = device.type
+    only = options.only.split(",") if options.only else ["box", *PARTS]
+    if unknown := set(only) - {"box", *PARTS}:
+        raise SystemExit(f"--only takes box, {', '.join(PARTS)}, not {', '.join(sorted(unknown))}")
+    if "box" in only:
+        result["box"] = measure_box(device)
+    for count in COUNTS[kind] if options.counts is None else map(int, options.counts.split(",")):
         for formulation in options.formulations.split(","):
-            for key, what, take in (("rows", "wind", measure), ("obstacles", "obstacle", measure_obstacles)):
+            for key, (what, take) in PARTS.items():
+                if key not in only:
+                    continue
+                made = {"particles": sheet(count, device).count, "formulation": formulation}
                 work = partial(take, count, formulation, device, STEPS[kind], ROUNDS[kind])
                 found = guarded(lambda work=work: {"rows": work()})
-                failed = {"particles": count, "formulation": formulation, what: "-", "failed": found.get("failed")}
-                result[key] += found.get("rows", [failed])
+                failed = made | {what: "-", "failed": found.get("failed")}
+                kept = [row for row in result.get(key, []) if made.items() - row.items()]
+                result[key] = kept + found.get("rows", [failed])
                 print(json.dumps(result[key][-1]), flush=True)
-                record.write(folder, f"winds_{kind}", result, quiet=True)
+                save(result)
