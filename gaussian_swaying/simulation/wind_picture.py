@@ -139,7 +139,7 @@ def draw_wind(
         if known[STEPS]:
             (x, y), r = streak[STEPS], 0.75 * thick
             draw.ellipse([x - r, y - r, x + r, y + r], fill=(*colour[STEPS], 255))
-    over = layer.resize((camera.width, camera.height), Image.Resampling.LANCZOS)
+    over = layer.reduce(ratio)
     pixels = torch.frombuffer(bytearray(over.tobytes()), dtype=torch.uint8).view(camera.height, camera.width, 4) / 255
     under = 0.75 * picture.color.detach().cpu().float().clamp(0, 1) + 0.25
     alpha = pixels[..., 3:]
