@@ -163,7 +163,7 @@ def test_goals_and_what_one_change_does():
     ours = row(0.02, 22.0, chamfer_per_frame_m=[0.01, 0.02, 0.06])
     rows = {"ours": {"3": ours}, "particle": {"3": row(0.1, 18.0)}, "no_surface": {"3": row(0.03, 18.0)}}
     rows |= {"no_shading": {"3": row(0.02, 23.0)}, "undamped": {"3": row(0.025, 22.0)}, "thin": {"3": row(0.018, 22.0)}}
-    result = {"rows": rows, "uncertainty": {"3": {"coarser": {"chamfer": 0.0067}}}}
+    result = {"splats": "made in code", "rows": rows, "uncertainty": {"3": {"coarser": {"chamfer": 0.0067}}}}
     found = {goal: (value, ok) for goal, value, ok in tables.goals(result)}
     assert found == {
         "pattern 3: Chamfer distance within 3 % of the longer side": ("2.00 % (reference itself: 0.67 %)", True),
@@ -172,6 +172,9 @@ def test_goals_and_what_one_change_does():
         "pattern 3: Chamfer distance at least twice as large without surface modelling": ("1.50 times", False),
         "pattern 3: lower PSNR without shading": ("+1.00 dB", False),
     }
+    trained = tables.goals(result | {"splats": "trained, 7000 images"})
+    assert trained[0][0::2] == ("pattern 3: Chamfer distance within 1.2 % of the longer side", False)
+    assert [goal[2] for goal in trained[1:]] == [goal[1] for goal in list(found.values())[1:]]
     lines = tables.pattern_lines(rows, 3)
     assert lines[0].endswith("0.50 %, 1.00 %, 3.00 %")
     assert "half the thickness, double E and density -0.20; no shading +0.00; without the" in lines[1]

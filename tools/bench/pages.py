@@ -47,7 +47,7 @@ PLOTS: dict[str, Callable[[list[record.Row], Path], None]] = {
 
 
 def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Path, str]:
-    """Fill the pages of a folder that have slots, without writing them.
+    """Fill the pages of a folder that have slots, and the README beside it, without writing them.
 
     Args:
         docs: Folder of the pages.
@@ -66,7 +66,7 @@ def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Pa
                 slots.check_complete(page, (docs / page).read_text(), records)
             elif missing := slots.wanted(page, records):
                 raise slots.SlotError(f"There is no {docs / page}, which has to show the slot `{missing[0]}`.")
-    paths = sorted(docs.glob("*.md")) if only is None else [docs / only]
+    paths = [*sorted(docs.glob("*.md")), *docs.parent.glob("README.md")] if only is None else [docs / only]
     texts = {path: path.read_text() for path in paths}
     return {path: slots.fill(path.name, text, records) for path, text in texts.items() if slots.used(text)}
 

@@ -37,7 +37,8 @@ _OTHER = {  # variants of the reference that are different flags, or have a mesh
     "hardly bending": "on that mesh, with a fiftieth of its bending stiffness",
     "self-contact": "on that mesh, with self-contact",
 }
-_SHARE = 0.03  # goal for Chamfer distances, as a share of the longer side
+_SHARE = 0.03  # goal for Chamfer distances with splats made in code, as a share of the longer side
+_TRAINED = {1: 0.025, 2: 0.020, 3: 0.012}  # with trained splats
 
 
 def complete(rows: Row, name: str, pattern: Flag) -> Row | None:
@@ -55,17 +56,18 @@ def doubt(result: Row, pattern: Flag) -> str:
 def goals(result: Row) -> list[tuple[str, str, bool]]:
     """The goals, the measured values, and whether each goal is reached."""
     rows, found = result["rows"], []
+    trained = result["splats"].startswith("trained")
     for pattern in PATTERNS:
         ours = complete(rows, "ours", pattern)
         if ours is None:
             continue
-        share = ours["chamfer_share"]
+        share, wanted = ours["chamfer_share"], _TRAINED[pattern] if trained else _SHARE
         known = doubt(result, pattern)
         found.append(
             (
-                f"pattern {pattern}: Chamfer distance within {100 * _SHARE:g} % of the longer side",
+                f"pattern {pattern}: Chamfer distance within {100 * wanted:g} % of the longer side",
                 f"{100 * share:.2f} %{known}",
-                share <= _SHARE,
+                share <= wanted,
             )
         )
         decibels, factor = _GAIN[pattern]
