@@ -24,6 +24,12 @@ ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
 
 
+@pytest.fixture(autouse=True)
+def _few_frames(monkeypatch):
+    """Of those that are timed, which is tested in test_cost.py."""
+    monkeypatch.setattr("gaussian_swaying.simulation.preview.cost.MOST_FRAMES", 2)
+
+
 @pytest.fixture
 def splat(tmp_path):
     path = tmp_path / "flag.ply"
@@ -141,9 +147,9 @@ def test_edited_starter_is_kept(splat, tmp_path):
 
 @pytest.fixture
 def dense(tmp_path):
-    """A flag that is fine enough for every quality."""
+    """A pennant that is fine enough for every quality."""
     path = tmp_path / "dense.ply"
-    write_ply(path, FlagScene(spacing=0.012).generate())
+    write_ply(path, FlagScene(spacing=0.012, height=0.3).generate())
     return path
 
 
