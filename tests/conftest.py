@@ -1,6 +1,7 @@
 """Fixtures and the rule for GPU tests."""
 
 import importlib.util
+import inspect
 import math
 import os
 
@@ -146,15 +147,24 @@ def _quicken(changes):
     if not interpreter.interpreter_builder.options.debug:  # then the result of the check is thrown away
         changes.setattr(semantic, "binary_op_sanitize_overflow_impl", lambda self, lhs, rhs, binary_op: None)
 
-    # Members of the language are called with the interpreter's meaning, without a copy of their named arguments.
-    def quick_member(where, name, member, builder, scope):
+    # Members of the language are looked up once, and called without a copy of their named arguments.
+    members = {}
+
+    def quick_builtins(package, builder, scope):
+        if package not in members:  # then nothing of it is patched
+            members[package] = [pair for pair in inspect.getmembers(package) if core.is_builtin(pair[1])]
+        for name, member in members[package]:
+            if getattr(package, name) is member:
+                quick_member(package, name, member, scope)
+
+    def quick_member(where, name, member, scope):
         def called(*args, **kwargs):
             kwargs["_semantic"] = interpreter.interpreter_semantic
             return member(*args, **kwargs)
 
         scope.set_attr(where, name, called)
 
-    changes.setattr(interpreter, "_patch_attr", quick_member)
+    changes.setattr(interpreter, "_patch_builtin", quick_builtins)
 
 
 @pytest.fixture(params=["interpreted", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -147,9 +147,9 @@ def test_edited_starter_is_kept(splat, tmp_path):
 
 @pytest.fixture
 def dense(tmp_path):
-    """A pennant that is fine enough for every quality."""
+    """A flag that is fine enough for every quality."""
     path = tmp_path / "dense.ply"
-    write_ply(path, FlagScene(spacing=0.012, height=0.3).generate())
+    write_ply(path, FlagScene(spacing=0.012).generate())
     return path
 
 
