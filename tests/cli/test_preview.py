@@ -24,6 +24,12 @@ ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
 
 
+@pytest.fixture(autouse=True)
+def _few_frames(monkeypatch):
+    """Of those that are timed, which is tested in test_cost.py."""
+    monkeypatch.setattr("gaussian_swaying.simulation.preview.cost.MOST_FRAMES", 2)
+
+
 @pytest.fixture
 def splat(tmp_path):
     path = tmp_path / "flag.ply"

@@ -71,10 +71,10 @@ def _kill_workers(folder, times, seed, over):
     return killed
 
 
-def _disturbed(file, folder, kills, seed):
+def _disturbed(file, folder, kills, seed, *more):
     """A sweep in which workers are killed; how often, and its exit code."""
     codes, killed = [], []
-    options = ["--output", str(folder), "--workers", "2", "--device", "cpu"]
+    options = ["--output", str(folder), "--workers", "2", "--device", "cpu", *more]
     killer = threading.Thread(
         target=lambda: killed.append(_kill_workers(folder, kills, seed, lambda: bool(codes))), daemon=True
     )
@@ -262,11 +262,8 @@ def test_what_failed_is_told_in_one_sentence(tmp_path, monkeypatch, error, words
 
 def test_a_run_whose_process_is_killed_too_often_is_recorded(undisturbed, tmp_path, sweep_file, capsys):
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
-    driver = _start(file, folder, "--device", "cpu", "--retries", "0")
-    _wait(lambda: _holders(folder))
-    os.kill(_holders(folder)[0], signal.SIGKILL)
-    _, error = driver.communicate(timeout=200)
-    assert driver.returncode == 2, error
+    assert _disturbed(file, folder, 1, 3, "--retries", "0") == (1, 2)
+    error = capsys.readouterr().err
     (bad,) = [row for row in _rows(folder / "sweep.csv") if row["status"] != "complete"]
     assert bad["status"] == "failed"
     assert "SIGKILL" in bad["reason"]
