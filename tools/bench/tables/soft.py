@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from bench.slots import table
-from bench.tables.fit import HEAD, fit_cells
+from bench.tables.fit import HEAD
+from bench.tables.fit import _cells as fit_cells
 from bench.tables.markdown import grid, source
 
 Row = dict[str, Any]
