@@ -14,6 +14,7 @@
 ``python tools/bench.py pins``       how a held edge is modelled; writes docs/results/pins_<device>.json
 ``python tools/bench.py contact``    cost of contact, and gaps; writes docs/results/contact_<device>.json
 ``python tools/bench.py fit``        wind and material from videos; writes docs/results/fit_<device>.json
+``python tools/bench.py soft``       the same for a soft body by Newton; writes docs/results/soft_<device>.json
 ``python tools/bench.py gallery``    the paper's scenes; writes docs/results/gallery_<device>.json and pictures
 ``python tools/bench.py previews``   announced and taken times of runs; writes docs/results/previews_<device>.json
 ``python tools/bench.py area``       areas that the wind can reach; writes docs/results/area_cpu.json

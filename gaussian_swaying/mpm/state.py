@@ -73,6 +73,9 @@ class GridSpec:
 def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec:
     """The smallest box of the lattice that holds the stencils of all points between two corners.
 
+    It rounds as :func:`~gaussian_swaying.mpm.transfer.bspline_stencil` does, in the precision of the points: where a
+    corner lies on a border between two stencils, another rounding would leave the points there outside of the grid.
+
     Args:
         low: Smallest coordinates of the points [m], shape (3,).
         high: Largest coordinates of the points [m], shape (3,).
@@ -83,8 +86,8 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
         The grid.
     """
     # Python integers, which do not overflow
-    first = [math.floor(x) - margin for x in (low.double() / dx - 0.5).tolist()]
-    last = [math.floor(x) + 2 + margin for x in (high.double() / dx - 0.5).tolist()]
+    first = [math.floor(x) - margin for x in (low / dx - 0.5).tolist()]
+    last = [math.floor(x) + 2 + margin for x in (high / dx - 0.5).tolist()]
     size = [b - a + 1 for a, b in zip(first, last, strict=True)]
     return GridSpec(dx, (first[0], first[1], first[2]), (size[0], size[1], size[2]))
 

@@ -28,6 +28,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     points,
     previews,
     runs,
+    soft,
     speed,
     speed_plot,
     surfaces,

@@ -1,16 +1,19 @@
-"""Make videos of cloth in wind, for finding the wind and the material with ``gaussian-swaying fit``.
+"""Make videos of cloth and of a soft post in wind, to find wind and material with ``gaussian-swaying fit``.
 
 ``python tools/datasets/make_fit_data.py``                            all cases: six flags and a curtain
 ``python tools/datasets/make_fit_data.py --case flag_wind2_a --cameras 8``
+``python tools/datasets/make_fit_data.py --case soft``                a soft post, by Newton
 ``python tools/datasets/make_fit_data.py --preview``                  small and coarse, in a minute or two
 
-Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11. Everything runs on the CPU.
+Needs Blender as a Python module: ``pip install 'gaussian-swaying[blender]'``, Python 3.11; ``soft`` also needs the
+extra ``peers``. Everything runs on the CPU.
 
-Blender's cloth solver makes the motion and its path tracer the pictures, so neither shares anything with this package.
+Blender's cloth solver makes the motion, that of ``soft`` Newton's soft body, and Blender's path tracer the pictures, so
+neither shares anything with this package.
 The folder of each case holds ``transforms.json`` with ``images/`` and ``masks/``, ``scene.yaml`` and ``fit.yaml`` with
-wrong values for what is sought, ``truth.json``, and the true motion ``cloth.npz``. docs/fit_data.md describes them. The
-same settings give the same files; what is there is not made again, and where settings changed, the run stops and names
-them.
+wrong values for what is sought, ``truth.json``, and the true motion, ``cloth.npz`` or ``motion.npz``. docs/fit_data.md
+describes them. The same settings give the same files; what is there is not made again, and where settings changed, the
+run stops and names them.
 """
 
 from __future__ import annotations
@@ -19,11 +22,14 @@ import argparse
 import sys
 import tempfile
 import time
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import soft_case
 import yaml
 from blender_cloth import require_bpy
 from blender_images import Studio
@@ -42,27 +48,75 @@ from flag_motion import read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture
 from flag_reference import FlagPattern
 from make_flag_dataset import claim, make_uncertainty, missing_pictures
+from newton_cloth import require_newton
+from soft_case import (
+    SOFT,
+    SoftPattern,
+    moved_places,
+    read_soft,
+    skin,
+    soft_uncertainty,
+    solve_soft,
+    splat,
+    texture,
+)
 
 from gaussian_swaying._files import atomic, write_json, write_text
+from gaussian_swaying.gaussians.ply import write_ply
 
 UNCERTAINTY = ("steps doubled", "coarser")
 """How else the motions are solved, see :func:`flag_difference.variants`."""
 
 
-def make_pictures(pattern: FlagPattern, folder: Path, video: FitVideo) -> int:
-    """Render the motion ``cloth.npz`` from all cameras; returns the number of pictures made."""
+@dataclass(frozen=True)
+class Filmed:
+    """A motion to be filmed.
+
+    Attributes:
+        positions: The vertices that are drawn, at each frame [m], shape (F, V, 3).
+        normal: Direction from which the first two cameras look, see :func:`fit_video.ring_views`.
+        fps: Frames per second.
+        hash: Of the settings of the motion.
+        studio: Makes the studio.
+    """
+
+    positions: np.ndarray
+    normal: np.ndarray
+    fps: float
+    hash: str
+    studio: Callable[[], Studio]
+
+
+def filmed_cloth(pattern: FlagPattern, folder: Path, video: FitVideo) -> Filmed:
+    """The motion ``cloth.npz`` of a folder."""
+    motion = read_cloth(folder / "cloth.npz")
+    normal = mean_normal(motion.positions, motion.faces, pattern.normal())
+    grid, texture = pattern.grid(), draw_texture(pattern, 640)
+    studio = partial(_studio, grid.faces(), grid.uv(), texture, pattern.center(), pattern.longer_side, video)
+    return Filmed(motion.positions, normal, pattern.fps, settings_hash(motion.settings), studio)
+
+
+def filmed_soft(pattern: SoftPattern, folder: Path, video: FitVideo) -> Filmed:
+    """The motion ``motion.npz`` of a folder."""
+    positions, settings = read_soft(folder / "motion.npz")
+    points, faces, uv = skin(pattern)
+    middle = np.array([0.0, 0.0, 0.5 * pattern.height])
+    studio = partial(_studio, faces, uv, texture(pattern), middle, pattern.height, video)
+    return Filmed(positions[:, points], np.array([0.0, -1.0, 0.0]), pattern.fps, settings_hash(settings), studio)
+
+
+def make_pictures(filmed: Filmed, folder: Path, video: FitVideo) -> int:
+    """Render a motion from all cameras; returns the number of pictures made."""
     from PIL import Image
 
-    motion = read_cloth(folder / "cloth.npz")
     settings = {name: value for name, value in asdict(video).items() if name not in ("cameras", "threads")}
-    claim(folder / "images", settings | {"cloth": settings_hash(motion.settings)})
-    normal = mean_normal(motion.positions, motion.faces, pattern.normal())
-    views = ring_views(motion.positions, normal, video)
-    frames = len(motion.positions)
+    claim(folder / "images", settings | {"cloth": filmed.hash})
+    views = ring_views(filmed.positions, filmed.normal, video)
+    frames = len(filmed.positions)
     wanted = {frame_name(camera, frame): (camera, frame) for frame in range(frames) for camera in range(len(views))}
     missing = missing_pictures(folder, list(wanted))
     if missing:
-        studio = _studio(pattern, video)
+        studio = filmed.studio()
         for name in ("images", "masks"):
             for camera in range(len(views)):
                 (folder / name / f"camera{camera}").mkdir(parents=True, exist_ok=True)
@@ -71,7 +125,7 @@ def make_pictures(pattern: FlagPattern, folder: Path, video: FitVideo) -> int:
             for name in missing:
                 camera, frame = wanted[name]
                 if frame != shown:
-                    studio.move(motion.positions[frame])
+                    studio.move(filmed.positions[frame])
                     shown = frame
                 studio.photograph(views[camera], Path(scratch) / "picture.png")
                 rgba = np.asarray(Image.open(Path(scratch) / "picture.png"))
@@ -80,23 +134,23 @@ def make_pictures(pattern: FlagPattern, folder: Path, video: FitVideo) -> int:
                 picture = add_noise(composite(rgba, video.background), video, (camera, frame))
                 with atomic(folder / name) as temporary:
                     temporary.write_bytes(compress(picture, video.quality))
-    write_json(folder / "transforms.json", video_fields(views, frames, pattern.fps))
+    write_json(folder / "transforms.json", video_fields(views, frames, filmed.fps))
     return len(missing)
 
 
-def _studio(pattern: FlagPattern, video: FitVideo) -> Studio:
-    """The cloth, and a lamp on each side, so that both sides are lit alike."""
-    grid, center, size = pattern.grid(), pattern.center(), 0.5 * pattern.longer_side
+def _studio(
+    faces: np.ndarray, uv: np.ndarray, texture: np.ndarray, center: np.ndarray, longest: float, video: FitVideo
+) -> Studio:
+    """A body of a longest side, and a lamp on each side, so that both sides are lit alike."""
     light = np.array(video.light) / np.linalg.norm(video.light)
-    lamps = np.stack([center + side * 6.0 * pattern.longer_side * light for side in (1, -1)])
-    texture = draw_texture(pattern, 640)
+    lamps = np.stack([center + side * 6.0 * longest * light for side in (1, -1)])
     return Studio(
-        grid.faces(),
-        grid.uv(),
+        faces,
+        uv,
         texture,
         lamps,
         center,
-        size,
+        0.5 * longest,
         video.samples,
         transparent=True,
         threads=video.threads,
@@ -116,8 +170,32 @@ def make_case(name: str, pattern: FlagPattern, folder: Path, video: FitVideo, la
     write_json(folder / "truth.json", truth_fields(pattern, video))
     _write_yaml(folder / "scene.yaml", scene_settings(pattern, video, law, folder.as_posix()))
     _write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()))
+    _film(filmed_cloth(pattern, folder, video), folder, video, report)
+
+
+def make_soft(pattern: SoftPattern, folder: Path, video: FitVideo) -> None:
+    """Make what is missing of the soft post."""
+
+    def report(line: str) -> None:
+        print(f"{SOFT}: {line}", flush=True)
+
     started = time.time()
-    made = make_pictures(pattern, folder, video)
+    if solve_soft(pattern, folder / "motion.npz"):
+        report(f"soft body solved in {time.time() - started:.0f} s")
+    cloud = splat(pattern)
+    write_ply(folder / "rest.ply", cloud)
+    places = moved_places(pattern, read_soft(folder / "motion.npz")[0], cloud.means.double().numpy())
+    with atomic(folder / "gaussians.npz") as temporary:
+        np.savez_compressed(temporary, positions=places.astype(np.float32))
+    write_json(folder / "truth.json", soft_case.truth_fields(pattern, video))
+    _write_yaml(folder / "scene.yaml", soft_case.scene_settings(pattern, video, folder.as_posix()))
+    _write_yaml(folder / "fit.yaml", fit_settings(folder.as_posix()) | {"unknowns": soft_case.SOUGHT})
+    _film(filmed_soft(pattern, folder, video), folder, video, report)
+
+
+def _film(filmed: Filmed, folder: Path, video: FitVideo, report: Callable[[str], None]) -> None:
+    started = time.time()
+    made = make_pictures(filmed, folder, video)
     seconds = time.time() - started
     report(f"{made} pictures in {seconds:.0f} s" + (f", {seconds / made:.2f} s each" if made else ""))
 
@@ -131,15 +209,15 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     add, base = parser.add_argument, FitVideo()
     add("--out", type=Path, default=Path("outputs/fit_data"), help="folder to write (default: %(default)s)")
-    add("--case", nargs="+", choices=sorted(CASES), default=list(CASES), help="which (default: all)")
+    add("--case", nargs="+", choices=sorted([*CASES, SOFT]), default=list(CASES), help="which (all of cloth)")
     add("--cameras", type=int, default=base.cameras, help="cameras, 1 to 8 (2)")
-    add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), default=base.size, help="pixels (480 270)")
+    add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="pixels (480 270; soft: 270 480)")
     add("--samples", type=int, default=base.samples, help="light paths per pixel (1)")
     add("--noise", type=float, default=1.0, help="times the noise of a phone (1)")
     add("--quality", type=int, default=base.quality, help="of the JPEG files (85)")
     add("--seed", type=int, default=base.seed, help="of the noise (0)")
-    add("--cells", type=int, help="cells of the mesh along the longer side (50, or 60)")
-    add("--frames", type=int, help="number of frames, the first at rest (97)")
+    add("--cells", type=int, help="cells of the mesh along the length (50, or 60; soft: along the width, 10)")
+    add("--frames", type=int, help="number of frames, the first at rest (97; soft: 49)")
     add("--law", choices=LAWS, default="projected", help="force law in scene.yaml (projected)")
     add("--uncertainty", action="store_true", help="solve the motions otherwise, too, and compare")
     add("--threads", type=int, default=base.threads, help="threads to render with; 0 for all (1)")
@@ -147,33 +225,55 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
+def _video(options: argparse.Namespace, upright: bool) -> FitVideo:
+    base = FitVideo()
+    size = (160, 90) if options.preview else tuple(options.size or base.size)
+    return replace(
+        base,
+        cameras=options.cameras,
+        size=size[::-1] if upright and (options.preview or not options.size) else size,
+        samples=options.samples,
+        read_noise=options.noise * base.read_noise,
+        shot_noise=options.noise**2 * base.shot_noise,
+        quality=options.quality,
+        seed=options.seed,
+        threads=options.threads,
+    )
+
+
+def _do_cloth(name: str, options: argparse.Namespace) -> None:
+    video = _video(options, upright=False)
+    require_bpy()
+    cells = options.cells or (20 if options.preview else None)
+    pattern = case_of(name, cells, options.frames or (25 if options.preview else None))
+    if options.uncertainty:
+        found = make_uncertainty(pattern, options.out / name, list(UNCERTAINTY), print, every=1)
+        for variant, row in found["variants"].items():
+            print(f"{name}: {variant}: {100 * row['corresponding']:.2f} % of the longer side", flush=True)
+    else:
+        make_case(name, pattern, options.out / name, video, options.law)
+
+
+def _do_soft(name: str, options: argparse.Namespace) -> None:
+    video = _video(options, upright=True)
+    require_newton()
+    base = SoftPattern()
+    cells = options.cells or (4 if options.preview else base.cells)
+    pattern = replace(base, cells=cells, frames=options.frames or (13 if options.preview else base.frames))
+    if options.uncertainty:
+        for variant, row in soft_uncertainty(pattern, options.out / name).items():
+            print(f"{name}: {variant}: {1e3 * row['mean_m']:.2f} mm", flush=True)
+    else:
+        require_bpy()
+        make_soft(pattern, options.out / name, video)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     options = parse(argv)
     try:
-        base = FitVideo()
-        video = replace(
-            base,
-            cameras=options.cameras,
-            size=(160, 90) if options.preview else tuple(options.size),
-            samples=options.samples,
-            read_noise=options.noise * base.read_noise,
-            shot_noise=options.noise**2 * base.shot_noise,
-            quality=options.quality,
-            seed=options.seed,
-            threads=options.threads,
-        )
-        cells = options.cells or (20 if options.preview else None)
-        frames = options.frames or (25 if options.preview else None)
-        require_bpy()
         for name in options.case:
-            pattern = case_of(name, cells, frames)
-            if options.uncertainty:
-                found = make_uncertainty(pattern, options.out / name, list(UNCERTAINTY), print, every=1)
-                for variant, row in found["variants"].items():
-                    print(f"{name}: {variant}: {100 * row['corresponding']:.2f} % of the longer side", flush=True)
-            else:
-                make_case(name, pattern, options.out / name, video, options.law)
+            (_do_soft if name == SOFT else _do_cloth)(name, options)
     except (ImportError, ValueError, ArithmeticError) as error:
         print(f"make_fit_data.py: {error}", file=sys.stderr)
         return 1

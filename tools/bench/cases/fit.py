@@ -82,7 +82,7 @@ def _own(options: argparse.Namespace, result: Row, save: Callable[[Row], None], 
         given = {"unknowns": SOUGHT} | ROWS[name]
         sought = [read_unknown(key, entry) for key, entry in given.pop("unknowns").items()]
         plan = Plan([str(base)], [str(scratch / "video")], sought, until=until, search=options.search or size["search"])
-        rows[name] = _row(replace(plan, **given), scratch / name, options.device, TRUTH) | {
+        rows[name] = fit_row(replace(plan, **given), scratch / name, options.device, TRUTH) | {
             "points": simulation.scene.points.count,
             "size": list(size["size"]),
             "until_s": until,
@@ -140,7 +140,7 @@ def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], Non
             if name not in (options.row or ("two cameras", "one camera")):
                 continue
             key = f"{folder.name}, {name}"
-            found = _row(replace(plan, **change), scratch / key, options.device, wanted)
+            found = fit_row(replace(plan, **change), scratch / key, options.device, wanted)
             rows[key] = found | {"known": known, "until_s": plan.until}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
@@ -162,7 +162,7 @@ def blender_rows(known: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str
     }
 
 
-def _row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> Row:
+def fit_row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> Row:
     """A fit, and how far it is from the truth."""
     begin = time.process_time()
     try:
@@ -192,4 +192,4 @@ def errors(flow: list[float], truth: list[float]) -> dict[str, float]:
     return {"speed_error": speed / true - 1, "direction_error_deg": math.degrees(math.acos(max(-1.0, min(1.0, along))))}
 
 
-__all__ = ["ROWS", "blender_rows", "errors", "measure"]
+__all__ = ["ROWS", "blender_rows", "errors", "fit_row", "measure"]

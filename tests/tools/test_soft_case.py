@@ -1,0 +1,251 @@
+"""The soft post in wind: pressure on its skin, its mesh, print and configurations; Newton is tried where it is."""
+
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying import Simulation
+from gaussian_swaying.fitting.plan import read_plan
+from gaussian_swaying.gaussians.ply import write_ply
+
+from .conftest import dataset_tool
+
+
+@pytest.fixture(scope="module")
+def tool():
+    """tools/datasets/make_fit_data.py with the modules beside it."""
+    with dataset_tool("make_fit_data") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def soft(tool):
+    return sys.modules["soft_case"]
+
+
+@pytest.fixture(scope="module")
+def newton(tool):
+    return sys.modules["newton_soft"]
+
+
+# ---- the force of the air
+
+
+def _plate(angle):
+    """A plate of 0.3 m x 0.2 m as two triangles, its normal turned from x towards y."""
+    corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.3, 0.2], [0.0, 0.0, 0.2]])
+    c, s = math.cos(angle), math.sin(angle)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return corners @ turn.T, np.array([c, s, 0.0])
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize("order", [[[0, 1, 2], [0, 2, 3]], [[0, 2, 1], [3, 2, 0]]], ids=["one side", "both sides"])
+def test_the_pressure_on_a_plate_is_that_of_the_closed_form(newton, angle, order):
+    """f = rho C A |U| (U n) n / 2, whichever way the triangles face; a third of each at its corners."""
+    positions, normal = _plate(angle)
+    air = newton.Air((3.0, 4.0, 0.0), density=1.2, drag=0.8)
+    forces = newton.skin_forces(positions, np.zeros((4, 3)), np.array(order), air)
+    expected = 0.5 * 1.2 * 0.8 * 0.06 * 5.0 * (np.array([3.0, 4.0, 0.0]) @ normal) * normal
+    np.testing.assert_allclose(forces.sum(0), expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(forces[0], expected / 3, rtol=1e-12, atol=1e-15)  # two halves: a third of each
+    np.testing.assert_allclose(forces[1], expected / 6, rtol=1e-12, atol=1e-15)
+
+
+def test_what_moves_with_the_wind_feels_none(newton):
+    positions, _ = _plate(0.3)
+    air = newton.Air((3.0, 4.0, 1.0))
+    velocities = np.tile([3.0, 4.0, 1.0], (4, 1))
+    assert not newton.skin_forces(positions, velocities, np.array([[0, 1, 2], [0, 2, 3]]), air).any()
+    half = newton.skin_forces(positions, 0.5 * velocities, np.array([[0, 1, 2], [0, 2, 3]]), air)
+    full = newton.skin_forces(positions, 0.0 * velocities, np.array([[0, 1, 2], [0, 2, 3]]), air)
+    np.testing.assert_allclose(4 * half, full, rtol=1e-12)
+
+
+def test_it_is_the_law_of_the_package(newton):
+    """The same published law, written twice: ``projected`` without friction and lift."""
+    from gaussian_swaying.aero.force import aero_force
+
+    draw = np.random.default_rng(0)
+    positions, velocities = draw.normal(size=(3, 3)), draw.normal(size=(3, 3))
+    air = newton.Air((1.0, -2.0, 0.5), 1.3, 0.7)
+    double = np.cross(positions[1] - positions[0], positions[2] - positions[0])
+    size = np.linalg.norm(double)
+    ours = aero_force(
+        torch.tensor(air.flow).double(),
+        torch.from_numpy(velocities.mean(0, keepdims=True)),
+        torch.from_numpy(double[None] / size),
+        torch.tensor([0.5 * size]),
+        drag=0.7,
+        friction=0.0,
+        lift=0.0,
+        air_density=1.3,
+        law="projected",
+    )
+    found = newton.skin_forces(positions, velocities, np.array([[0, 1, 2]]), air)
+    np.testing.assert_allclose(found.sum(0), ours[0].numpy(), rtol=1e-9)
+
+
+# ---- the body
+
+
+def test_newtons_moduli_give_the_stress_of_hooke_at_small_strain(newton):
+    """The stress as Newton's kernel computes it, by hand, for a small strain without symmetry."""
+    young, nu = 3e4, 0.3
+    k_mu, k_lambda = newton.newton_moduli(young, nu)
+    draw = np.random.default_rng(1)
+    strain = 1e-6 * draw.normal(size=(3, 3))
+    F = np.eye(3) + strain
+    cofactor = np.linalg.det(F) * np.linalg.inv(F).T
+    alpha = 1 + 0.75 * k_mu / k_lambda
+    stress = k_mu * (1 - 1 / ((F * F).sum() + 1)) * F + k_lambda * (np.linalg.det(F) - alpha) * cofactor
+    small = 0.5 * (strain + strain.T)
+    mu, lam = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
+    np.testing.assert_allclose(stress, 2 * mu * small + lam * np.trace(small) * np.eye(3), atol=2e-4 * 2 * mu * 1e-6)
+
+
+def test_the_masses_of_tetrahedra_add_up(newton):
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [1, 2, 3]])
+    mass = newton.lumped_mass(corners, np.array([[0, 1, 2, 3], [1, 2, 3, 4]]), 10.0)
+    assert mass[0] == pytest.approx(10.0 * 1.0 / 4)
+    assert mass.sum() == pytest.approx(10.0 * (1.0 + 2.0))
+
+
+def test_meshes_that_do_not_end_where_the_held_part_ends_are_refused(soft):
+    assert soft.SoftPattern(cells=4).block.counts == (4, 4, 20)
+    for cells in (1, 3, 5):
+        with pytest.raises(ValueError, match="`cells`"):
+            soft.SoftPattern(cells=cells)
+
+
+def test_places_follow_the_vertices(soft):
+    pattern = soft.SoftPattern(cells=2)
+    rest = pattern.block.vertices()
+    turned = rest @ np.array([[1.0, 0.2, 0.0], [0.0, 1.1, 0.3], [0.1, 0.0, 0.9]]) + [0.1, 0.0, 0.2]
+    draw = np.random.default_rng(0)
+    places = draw.uniform([-0.03, -0.03, 0.0], [0.03, 0.03, 0.3], (50, 3))
+    found = soft.moved_places(pattern, np.stack([rest, turned]), places)
+    np.testing.assert_allclose(found[0], places, atol=1e-12)
+    expected = places @ np.array([[1.0, 0.2, 0.0], [0.0, 1.1, 0.3], [0.1, 0.0, 0.9]]) + [0.1, 0.0, 0.2]
+    np.testing.assert_allclose(found[1], expected, atol=1e-12)
+
+
+# ---- what is seen
+
+
+def test_the_skin_is_closed_and_faces_outwards(soft):
+    pattern = soft.SoftPattern(cells=2)
+    points, squares, places = soft.skin(pattern)
+    corners = pattern.block.vertices()[points][squares]
+    area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    outwards = corners.mean(1) - [0.0, 0.0, 0.15]
+    assert np.linalg.norm(area, axis=1).sum() == pytest.approx(4 * 0.06 * 0.3 + 2 * 0.06**2)
+    assert (area * corners.mean(1)).sum() / 3 == pytest.approx(0.06**2 * 0.3)  # the volume, by Gauss
+    assert ((area * outwards).sum(1) > 0).all()
+    assert places.min() >= 0
+    assert places.max() <= 1
+
+
+def test_the_splat_has_the_colours_of_the_texture(soft):
+    pattern = soft.SoftPattern()
+    cloud = soft.splat(pattern, 0.006)
+    on_print = soft.unfolded(pattern, cloud.means.double().numpy(), cloud.normals.numpy())
+    picture = soft.texture(pattern, 0.002)
+    assert picture.shape == (150, 180, 3)
+    column = (on_print[:, 0] / 0.002).astype(int)
+    row = 149 - (on_print[:, 1] / 0.002).astype(int)
+    colours = 0.5 + 0.28209479177387814 * cloud.sh[:, 0].numpy()
+    assert np.abs(picture[row, column] - colours).mean() < 0.04  # discs have edges
+    assert colours.std(0).min() > 0.1
+
+
+# ---- files
+
+
+def test_the_scene_and_the_fit_can_be_read_and_start_wrong(soft, tool, tmp_path):
+    cases = sys.modules["fit_cases"]
+    pattern, folder = soft.SoftPattern(), tmp_path.as_posix()
+    write_ply(tmp_path / "rest.ply", soft.splat(pattern, 0.006))
+    settings = soft.scene_settings(pattern, cases.FitVideo(), folder)
+    settings["solver"]["dx"], settings["scene"]["filling"] = 0.03, {"spacing": 0.01}
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(settings))
+    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(cases.fit_settings(folder) | {"unknowns": soft.SOUGHT}))
+    simulation = Simulation.from_yaml(tmp_path / "scene.yaml", camera=None, device="cpu")
+    assert simulation.frames_wanted == pattern.frames
+    assert float(simulation.scene.points.mass.sum()) == pytest.approx(60.0 * 0.06**2 * 0.3, rel=0.05)
+    truth = soft.truth_fields(pattern, cases.FitVideo())
+    plan = read_plan(tmp_path / "fit.yaml")
+    true = {"wind.speed": truth["speed"], "wind.azimuth": truth["azimuth"], "material.E": truth["E"]}
+    assert {unknown.name for unknown in plan.unknowns} == set(true)
+    for unknown in plan.unknowns:
+        assert unknown.low < true[unknown.name] < unknown.high
+    assert settings["material"]["E"] < 0.7 * truth["E"]
+    assert np.linalg.norm(np.subtract(settings["wind"]["flow"], truth["flow"])) > 0.3 * truth["speed"]
+
+
+def test_two_motions_are_compared(soft):
+    rest = np.stack([np.zeros(11), np.zeros(11), np.linspace(0, 1, 11)], 1)
+    sway = np.array([0.0, 0.2, 0.1, 0.1])[:, None, None] * rest[None, :, 2:] * np.array([1.0, 0.0, 0.0])
+    found = soft.compared(rest + 1.1 * sway, rest + sway, np.array([2.0, 0.0, 0.0]))
+    assert found["swing"] == pytest.approx(1.1)
+    assert found["deflection"] == pytest.approx(1.1)
+    assert found["largest_m"] == pytest.approx(0.02)
+    assert found["mean_m"] == pytest.approx(0.1 * 0.1 * 0.5)
+
+
+# ---- Newton
+
+
+@pytest.mark.slow
+def test_newtons_block_bends_as_a_beam_does(newton):
+    """A push across a block of few cells; a mesh of 4 cells is 12 % stiffer than a beam with shear (Timoshenko)."""
+    pytest.importorskip("newton")
+    block = newton.Block(0.06, 0.30, 0.03, 4, 3e4, 0.0, 60.0)
+    push, free = 2.0, 0.27
+    rate = 3.516 * 0.06 / math.sqrt(12) * math.sqrt(3e4 / 60.0) / free**2
+    run = newton.SoftRun(frames=13, fps=24, steps=160, gravity=0.0, damping=1.5 * rate, push=(push, 0.0, 0.0))
+    found = newton.solve_block(block, None, run)
+    top = block.vertices()[:, 2] > 0.299
+    load = 60.0 * 0.06**2 * push
+    beam = load * free**4 / (8 * 3e4 * 0.06**4 / 12) + load * free**2 / (2 * 5 / 6 * 1.5e4 * 0.06**2)
+    assert (found[-1] - found[0])[top, 0].mean() / beam == pytest.approx(0.88, abs=0.02)
+    held = block.vertices()[:, 2] < 0.031
+    np.testing.assert_array_equal(found[-1][held], found[0][held])
+
+
+def test_a_motion_is_solved_once_and_other_settings_are_refused(soft, tmp_path):
+    pytest.importorskip("newton")
+    pattern = soft.SoftPattern(cells=2, frames=3)
+    path = tmp_path / "motion.npz"
+    assert soft.solve_soft(pattern, path)
+    assert not soft.solve_soft(pattern, path)
+    positions, settings = soft.read_soft(path)
+    assert positions.shape == (3, 3 * 3 * 11, 3)
+    assert settings["steps"] == pattern.run.steps
+    with pytest.raises(ValueError, match="`density` was 60"):
+        soft.solve_soft(replace(pattern, density=70.0), path)
+    moved = (positions[-1] - positions[0])[-1]
+    assert moved[0] > 0.01  # with the wind
+    assert moved[1] / moved[0] == pytest.approx(2.6 / 4.4, rel=0.05)
+
+
+def test_steps_that_are_too_long_are_named(newton):
+    pytest.importorskip("newton")
+    block = newton.Block(0.06, 0.30, 0.03, 2, 3e4, 0.3, 60.0)
+    with pytest.raises(ArithmeticError, match="`steps`"):
+        newton.solve_block(block, newton.Air((5.0, 0.0, 0.0)), newton.SoftRun(frames=4, fps=24, steps=5))
+
+
+def test_without_newton_the_extra_is_named(tool, monkeypatch, tmp_path, capsys):
+    def missing():
+        raise ImportError("install them with `pip install 'gaussian-swaying[peers]'`")
+
+    monkeypatch.setattr(tool, "require_newton", missing)
+    assert tool.main(["--case", "soft", "--out", str(tmp_path / "data")]) == 1
+    assert "[peers]" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()

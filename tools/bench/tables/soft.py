@@ -1,0 +1,51 @@
+"""Tables of ``bench.py soft``: our motion of a soft body beside Newton's, and what fits find."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bench.slots import table
+from bench.tables.fit import HEAD
+from bench.tables.fit import _cells as fit_cells
+from bench.tables.markdown import grid, source
+
+Row = dict[str, Any]
+
+
+@table("fit.md", "fit.soft_motion", "soft_*", together=True)
+def soft_motion(results: list[Row]) -> list[str]:
+    """Motions at the true values beside Newton's, and Newton's on other meshes."""
+    lines: list[str] = []
+    for result in results:
+        rows = []
+        for name, row in result.get("motion", {}).items():
+            rows.append([f"ours, {name}; {row['points']:,} points", *_cells(row)])
+        for name, row in result.get("reference", {}).items():
+            rows.append([f"Newton, {name}", *_cells(row)])
+        if rows:
+            head = ["", "mean distance", "largest distance", "first swing", "deflection later"]
+            lines += ["", source(result), "", *grid(head, rows)]
+    return lines[1:] or ["Not measured yet."]
+
+
+@table("fit.md", "fit.soft", "soft_*", together=True)
+def soft(results: list[Row]) -> list[str]:
+    """Fits of the videos, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("fits", {}):
+            found = []
+            for name, row in rows.items():
+                known = "; ".join(f"`{key}` {value}" for key, value in row["known"].items())
+                found.append([name, *fit_cells(row), f"{row['until_s']:.3g} s" + (f"; {known}" if known else "")])
+            lines += ["", source(result), "", *grid([*HEAD, "fitted; changes of scene.yaml"], found)]
+    return lines[1:] or ["Not measured yet."]
+
+
+def _cells(row: Row) -> list[str]:
+    distances = [f"{1e3 * row['mean_m']:.2f} mm", f"{1e3 * row['largest_m']:.1f} mm"]
+    return [*distances, _share(row["swing"]), _share(row["deflection"])]
+
+
+def _share(value: float) -> str:
+    return f"{100 * (value - 1):+.1f} %"

@@ -1,0 +1,348 @@
+"""A soft post in wind whose wind and material are to be found from video: its truth, its splat, its configurations.
+
+``newton_soft.py`` solves the motion, ``make_fit_data.py`` makes the data. Nothing here needs Newton or Blender.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from fit_cases import START, FitVideo
+from flag_motion import check_settings
+from newton_soft import Air, Block, SoftRun, solve_block
+
+from gaussian_swaying._files import atomic, write_json
+from gaussian_swaying._inputs import read_arrays
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.scenes.patches import box, to_cloud
+from gaussian_swaying.scenes.printed_cloth import printed_colours
+
+SOFT = "soft"
+"""Name of the case."""
+
+PRINT = 4.0
+"""How much smaller the print is than on cloth: discs of 4 to 14 mm."""
+
+STEP = 0.4
+"""Longest step of Newton: the time in which the fastest wave crosses this share of a cell."""
+
+SOUGHT = {
+    "wind.speed": {"range": [1.0, 12.0]},
+    "wind.azimuth": {"range": [-90.0, 90.0]},
+    "material.E": {"range": [1e4, 8e4]},
+}
+"""What is to be found, with ranges."""
+
+
+@dataclass(frozen=True)
+class SoftPattern:
+    """A post of soft foam in steady wind, held at its foot.
+
+    Attributes:
+        flow: Velocity of the air [m/s], z up.
+        youngs_modulus: [Pa].
+        poisson_ratio: Poisson's ratio.
+        density: [kg/m³].
+        side: Side of its square section [m].
+        height: Height [m].
+        held: Height of the part that does not move, at the foot [m].
+        drag: Coefficient of each face; a prism across the wind has two, together 2.
+        air_density: [kg/m³].
+        gravity: [m/s²].
+        damping: Rate at which velocities decay, besides what the air takes [1/s].
+        cells: Cells of Newton's mesh along a side of the section.
+        steps: Steps of a frame; 0 for as many as the mesh needs.
+        frames: Number of frames, the first at rest.
+        fps: Frames per second.
+    """
+
+    flow: tuple[float, float, float] = (4.4, 2.6, 0.0)
+    youngs_modulus: float = 3e4
+    poisson_ratio: float = 0.3
+    density: float = 60.0
+    side: float = 0.06
+    height: float = 0.30
+    held: float = 0.03
+    drag: float = 1.0
+    air_density: float = 1.225
+    gravity: float = 9.81
+    damping: float = 0.5
+    cells: int = 10
+    steps: int = 0
+    frames: int = 49
+    fps: int = 24
+
+    def __post_init__(self) -> None:
+        """Check the mesh.
+
+        Raises:
+            ValueError: If no layer of vertices is where the held part ends.
+        """
+        if self.cells < 2 or any(abs(part / self.block.cell - round(part / self.block.cell)) > 1e-6 for part in
+                                 (self.height, self.held)):  # fmt: skip
+            raise ValueError(
+                f"Expected `cells` to cut {self.height} m and {self.held} m into cubes, two at least along "
+                f"{self.side} m, but got {self.cells}: choose an even number."
+            )
+
+    @property
+    def block(self) -> Block:
+        """The body."""
+        return Block(
+            self.side, self.height, self.held, self.cells, self.youngs_modulus, self.poisson_ratio, self.density
+        )
+
+    @property
+    def run(self) -> SoftRun:
+        """Frames, and as many steps as the mesh needs."""
+        e, nu = self.youngs_modulus, self.poisson_ratio
+        wave = math.sqrt(e * (1 - nu) / ((1 + nu) * (1 - 2 * nu)) / self.density)
+        steps = self.steps or math.ceil(wave / (STEP * self.block.cell * self.fps))
+        return SoftRun(self.frames, self.fps, steps, self.gravity, self.damping)
+
+    @property
+    def air(self) -> Air:
+        """The wind."""
+        return Air(self.flow, self.air_density, self.drag)
+
+    def motion_settings(self) -> dict[str, Any]:
+        """Everything that the motion depends on."""
+        return asdict(self) | {"steps": self.run.steps, "solver": "newton, SolverSemiImplicit"}
+
+
+def solve_soft(pattern: SoftPattern, path: Path) -> bool:
+    """Solve the motion and write it as ``positions`` (F, V, 3) [m] of Newton's vertices, unless the file exists.
+
+    Returns:
+        Whether it was solved.
+
+    Raises:
+        ImportError: If Newton is not there.
+        ValueError: If the file exists but has other settings.
+    """
+    settings = pattern.motion_settings()
+    if path.exists():
+        check_settings(path, read_soft(path)[1], settings)
+        return False
+    positions = solve_block(pattern.block, pattern.air, pattern.run)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic(path) as temporary:
+        np.savez_compressed(temporary, positions=positions, settings=json.dumps(settings))
+    return True
+
+
+def read_soft(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """The positions (F, V, 3) [m] and the settings of a motion."""
+    found = read_arrays(path, "the motion of a soft body", ("positions", "settings"))
+    return found["positions"], json.loads(str(found["settings"]))
+
+
+def moved_places(pattern: SoftPattern, positions: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Where places of the body at rest are at each frame, between the vertices by trilinear interpolation.
+
+    Args:
+        pattern: The case; only its mesh matters.
+        positions: Of the vertices [m], shape (F, V, 3).
+        places: In the body at rest [m], shape (P, 3).
+
+    Returns:
+        Shape (F, P, 3), float64.
+    """
+    counts = np.array(pattern.block.counts)
+    at = (places + np.array([0.5 * pattern.side, 0.5 * pattern.side, 0.0])) / pattern.block.cell
+    low = np.clip(np.floor(at).astype(int), 0, counts - 1)
+    share = np.clip(at - low, 0.0, 1.0)
+    total = np.zeros((len(positions), len(places), 3))
+    for corner in np.ndindex(2, 2, 2):
+        i, j, k = (low + corner).T
+        weight = np.where(corner, share, 1 - share).prod(1)
+        total += weight[:, None] * positions[:, (k * (counts[1] + 1) + j) * (counts[0] + 1) + i]
+    return total
+
+
+def soft_uncertainty(pattern: SoftPattern, folder: Path) -> dict[str, Any]:
+    """Solve the case otherwise, and compare with it; writes ``uncertainty.json``.
+
+    Returns:
+        Fields of :func:`compared` for a mesh with two cells less along a side, one with four less, and this one with
+        twice the steps.
+    """
+    coarse = replace(pattern, cells=pattern.cells - 4)
+    other = {
+        f"{pattern.cells - 2} cells": replace(pattern, cells=pattern.cells - 2),
+        f"{coarse.cells} cells": coarse,
+        f"{coarse.cells} cells, steps doubled": replace(coarse, steps=2 * coarse.run.steps),
+    }
+    solve_soft(pattern, folder / "motion.npz")
+    places = splat(pattern, pattern.side / 6).means.double().numpy()
+    own = moved_places(pattern, read_soft(folder / "motion.npz")[0], places)
+    rows = {}
+    for name, variant in other.items():
+        path = folder / "uncertainty" / f"{name.replace(', ', '_').replace(' ', '_')}.npz"
+        solve_soft(variant, path)
+        rows[name] = compared(moved_places(variant, read_soft(path)[0], places), own, np.array(pattern.flow))
+    write_json(folder / "uncertainty.json", {"settings": pattern.motion_settings(), "variants": rows})
+    return rows
+
+
+def compared(ours: np.ndarray, true: np.ndarray, flow: np.ndarray) -> dict[str, Any]:
+    """How far two motions (F, N, 3) of the same places [m] are apart; flow is the wind.
+
+    ``deflection`` is how far the uppermost places are blown along the wind on average over the second half of the
+    frames, and ``swing`` the farthest that they go, both as shares of those of the true motion.
+    """
+    apart = np.linalg.norm(ours - true, axis=-1)
+    height = true[0, :, 2]
+    top = height > height.max() - 0.01 * np.ptp(height)
+    way = flow / np.linalg.norm(flow)
+    blown, wanted = (((each - true[0])[:, top] @ way).mean(1) for each in (ours, true))
+    half = len(true) // 2
+    return {
+        "mean_m": float(apart.mean()),
+        "largest_m": float(apart.max()),
+        "per_frame_m": [round(value, 6) for value in apart.mean(1).tolist()],
+        "swing_m": float(wanted.max()),
+        "deflection": float(blown[half:].mean() / wanted[half:].mean()),
+        "swing": float(blown.max() / wanted.max()),
+    }
+
+
+# ---- the skin
+
+
+def unfolded(pattern: SoftPattern, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Places on the print [m] of places on the skin (P, 3) with outward normals (P, 3); shape (P, 2).
+
+    The six faces lie side by side as strips, in the order -x, x, -y, y, -z, z.
+    """
+    half = 0.5 * pattern.side
+    axis = np.abs(normals).argmax(1)
+    strip = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0)
+    across = np.where(axis == 0, places[:, 1], places[:, 0]) + half
+    up = np.where(axis == 2, places[:, 1] + half, places[:, 2])
+    return np.stack([strip * pattern.side + across, up], 1)
+
+
+def colours(on_print: np.ndarray) -> np.ndarray:
+    """Colours in 0 to 1 of places on the print [m], shape (..., 2) to (..., 3)."""
+    u, v = (torch.from_numpy(np.ascontiguousarray(on_print[..., k])) for k in (0, 1))
+    return printed_colours(PRINT * u, PRINT * v).numpy()
+
+
+def texture(pattern: SoftPattern, pixel: float = 5e-4) -> np.ndarray:
+    """The print in 0 to 1, upper row first, shape (H, W, 3), float32."""
+    width, height = 6 * pattern.side, pattern.height
+    u = (np.arange(round(width / pixel)) + 0.5) * pixel
+    v = height - (np.arange(round(height / pixel)) + 0.5) * pixel
+    return colours(np.stack(np.meshgrid(u, v), -1)).astype(np.float32)
+
+
+def skin(pattern: SoftPattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The skin as squares: for each of its points a vertex of Newton's mesh, the squares, and places on the texture.
+
+    Points on an edge exist once for each face, so that edges are sharp.
+
+    Returns:
+        Shapes (R,), (Q, 4) and (R, 2).
+    """
+    counts, rest = pattern.block.counts, pattern.block.vertices()
+    number = np.arange(len(rest)).reshape(counts[2] + 1, counts[1] + 1, counts[0] + 1).transpose(2, 1, 0)
+    points: list[np.ndarray] = []
+    squares: list[np.ndarray] = []
+    places: list[np.ndarray] = []
+    begin = 0
+    for axis in range(3):
+        for end in (0, 1):
+            sheet = np.take(number, -end, axis)
+            if (axis == 1) != bool(end):  # the order of corners that makes the normal point outwards
+                sheet = sheet.T
+            index = begin + np.arange(sheet.size).reshape(sheet.shape)
+            corners = [index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]]
+            squares.append(np.stack(corners, -1).reshape(-1, 4))
+            normal = np.zeros((sheet.size, 3))
+            normal[:, axis] = 2 * end - 1
+            points.append(sheet.reshape(-1))
+            places.append(unfolded(pattern, rest[sheet.reshape(-1)], normal))
+            begin += sheet.size
+    size = [6 * pattern.side, pattern.height]
+    return np.concatenate(points), np.concatenate(squares), np.concatenate(places) / size
+
+
+def splat(pattern: SoftPattern, spacing: float = 0.004) -> GaussianCloud:
+    """The post at rest as flat Gaussians on its skin, a hollow splat as of a capture."""
+    half = 0.5 * pattern.side
+    patches = box([-half, -half, 0.0], [half, half, pattern.height], spacing)
+    on_print = unfolded(pattern, patches.center.numpy(), patches.normal.numpy())
+    painted = patches.painted(torch.from_numpy(colours(on_print)))
+    return to_cloud(painted, overlap=0.4, ambient=1.0)  # without baked light
+
+
+# ---- files
+
+
+def truth_fields(pattern: SoftPattern, video: FitVideo) -> dict[str, Any]:
+    """What ``truth.json`` says: the wind, the material, and what else a simulation needs to be comparable."""
+    x, y, _ = pattern.flow
+    seconds = (pattern.frames - 1) / pattern.fps
+    return {
+        "flow": list(pattern.flow),
+        "speed": math.hypot(*pattern.flow),
+        "azimuth": math.degrees(math.atan2(y, x)),
+        "elevation": 0.0,
+        "E": pattern.youngs_modulus,
+        "nu": pattern.poisson_ratio,
+        "density": pattern.density,
+        "C_D": pattern.drag,
+        "C_F": 0.0,
+        "C_L": 0.0,
+        "law": "projected",
+        "air_density": pattern.air_density,
+        "damping": pattern.damping,
+        "gravity": [0.0, 0.0, -pattern.gravity],
+        "held": f"the lowest {pattern.held} m",
+        "fps": pattern.fps,
+        "seconds": seconds,
+        "fit_until": 0.5 * seconds,
+        "units": "m, s, kg, degrees from +x towards +y",
+        "video": asdict(video),
+        "solver": "Newton's soft body; see docs/fit_data.md for what matches",
+    }
+
+
+def scene_settings(pattern: SoftPattern, video: FitVideo, folder: str) -> dict[str, Any]:
+    """A configuration of ``gaussian-swaying sim`` for the case in a folder, with wrong values for what is sought."""
+    foot = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [None, None, pattern.held]}}
+    return {
+        "frames": pattern.frames,
+        "frame_dt": 1 / pattern.fps,
+        "background": list(video.background),
+        "scene": {
+            "ply": f"{folder}/rest.ply",
+            "metres_per_unit": 1.0,
+            "area": "coverage",
+            "filling": {"spacing": 0.005},
+            "max_stretch": None,
+        },
+        "material": {"E": 1.5e4, "nu": pattern.poisson_ratio, "density": pattern.density, "law": "NeoHookean"},
+        "solver": {
+            "formulation": "total",
+            "dx": 0.02,
+            "cfl": 0.4,
+            "gravity": [0.0, 0.0, -pattern.gravity],
+            "damping": pattern.damping,
+            "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": "nodes", "region": foot}}],
+        },
+        "wind": {"flow": START["flow"], "modulations": []},
+        "aero": {"C_D": pattern.drag, "C_F": 0.0, "C_L": 0.0, "air_density": pattern.air_density, "law": "projected"},
+        "shader": {
+            "class_path": "DiffuseShader",
+            "init_args": {"light": list(video.light), "two_sided": True, "ambient": video.ambient},
+        },
+        "camera": {"class_path": "TransformsCamera", "init_args": {"path": f"{folder}/transforms.json", "frame": 0}},
+    }
