@@ -61,6 +61,7 @@ class Result:
         shown: How well each camera is reproduced.
         history: One row for each iteration.
         seconds: Time it took.
+        unsettled: Why the values are not those of a lowest place, and what to do; empty if they are.
     """
 
     unknowns: Sequence[Unknown]
@@ -70,6 +71,7 @@ class Result:
     shown: Sequence[Shown]
     history: Sequence[Mapping[str, Any]]
     seconds: float
+    unsettled: str = ""
 
     @property
     def values(self) -> dict[str, float]:
@@ -113,6 +115,8 @@ class Result:
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
+        if self.unsettled:
+            lines.append(self.unsettled)
         for name in self.vague:
             lines.append(f"{name} is not determined by this video: its error is a large part of its range.")
         for name in self.at_an_end:
@@ -188,6 +192,7 @@ def write_results(
                 }
                 for s in result.shown
             ],
+            "not_settled": result.unsettled,
             "not_determined": result.vague,
             "at_an_end": result.at_an_end,
             "history": list(result.history),

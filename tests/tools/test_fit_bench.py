@@ -39,6 +39,8 @@ def test_missed_goals_are_said_to_be_missed():
     lines = tables.own([HEAD | {"own": rows}])
     assert "| two cameras | +0.40 % | 0.50° | -0.80 % | 31.3 dB | 12 s | yes |" in lines
     assert "| one camera | -2.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s | no |" in lines
+    told = tables.own([HEAD | {"own": {"two cameras": ROW | {"not_settled": "The values have not settled."}}}])
+    assert any(line.startswith("| two cameras (not settled) | +0.40 %") for line in told)
     assert "| pixels alone | +90.00 % | 0.50° | -0.80 % | 31.3 dB | 12 s |  |" in lines
     found = tables.blender(
         [

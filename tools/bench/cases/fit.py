@@ -182,6 +182,7 @@ def _row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> Row
         "seconds": result.seconds,
         "processor_s": time.process_time() - begin,
         "not_determined": result.vague,
+        "not_settled": result.unsettled,
     }
 
 
