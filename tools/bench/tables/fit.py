@@ -27,7 +27,9 @@ def own(results: list[Row]) -> list[str]:
     lines: list[str] = []
     for result in results:
         if rows := result.get("own", {}):
-            found = [[_named(n, row), *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()]
+            found = [
+                [_named(n, row), *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()
+            ]
             one = next(row for row in rows.values() if "points" in row)
             width, height = one["size"]
             told = f"{one['points']:,} points, videos of {width} x {height}, {one['until_s']:.3g} s fitted."
