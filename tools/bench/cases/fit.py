@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from bench.cases import fit_bias
 from gaussian_swaying.fitting.fit import run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.unknowns import flow_of
@@ -53,6 +54,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--known", default="{}", help="options of sim for --data, as JSON, such as a coarser solver.dx"
     )
+    command.add_argument(
+        "--bias",
+        action="append",
+        help="no fit of --data: how far faults of the model move the values, with these options of sim, as JSON; "
+        "repeatable",
+    )
     command.add_argument("--search", type=int, help="simulations of the coarse search")
     command.add_argument(
         "--until", type=float, help="fit the frames up to this time [s]; half of the video if left out"
@@ -60,7 +67,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["own"]`` or ``result["blender"]``, saving it after each row."""
+    """Fill ``result["own"]``, ``result["blender"]`` or ``result["bias"]``, saving it after each row."""
+    if options.bias:
+        fit_bias.measure(options, _cases(options), result, save)
+        return
     with tempfile.TemporaryDirectory() as scratch:
         if options.data is None:
             _own(options, result, save, Path(scratch))
@@ -120,9 +130,7 @@ def _settings(size: Mapping[str, Any]) -> Row:
 
 def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], None], scratch: Path) -> None:
     rows = result.setdefault("blender", {})
-    for folder in sorted(path.parent for path in options.data.glob("*/transforms.json")):
-        if options.case and folder.name not in options.case:
-            continue
+    for folder in _cases(options):
         truth = json.loads((folder / "truth.json").read_text())
         given = yaml.safe_load((folder / "fit.yaml").read_text())
         sought = [read_unknown(key, entry) for key, entry in given["unknowns"].items()]
@@ -144,6 +152,12 @@ def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], Non
             rows[key] = found | {"known": known, "until_s": plan.until}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
+
+
+def _cases(options: argparse.Namespace) -> list[Path]:
+    """Folders of the cases that are wanted."""
+    found = sorted(path.parent for path in options.data.glob("*/transforms.json"))
+    return [folder for folder in found if not options.case or folder.name in options.case]
 
 
 def blender_rows(known: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
