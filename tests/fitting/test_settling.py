@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from gaussian_swaying.fitting.evidence import Block
+from gaussian_swaying.fitting.fit import Fit, run_fit
 from gaussian_swaying.fitting.least_squares import NO_STEP, Progress, expected_gain, iterate, linearised, step_from
 from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.report import Result, Shown
 from gaussian_swaying.fitting.settling import unsettled
 from gaussian_swaying.fitting.unknowns import Unknown
 
@@ -78,11 +80,43 @@ def test_the_expected_gain_is_that_of_linear_residuals():
     assert expected_gain(normal, target - place) == pytest.approx(1 - after.cost / normal.cost, abs=1e-6)
 
 
+def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everything():
+    """Phases that part with time: from afar, all frames at once end beside the true rate 0.7, growing parts do not."""
+
+    def end(steps):
+        place = torch.tensor([0.67], dtype=torch.float64)
+        for stage, share in steps:
+            time = torch.linspace(0, 2, 49, dtype=torch.float64)[: max(3, round(share * 49))]
+
+            def swing(places, time=time):
+                found = torch.sin(60 * places * time.square()) - torch.sin(60 * 0.7 * time.square())
+                return [Block("tracks", torch.stack([found, 0 * found], -1), torch.arange(len(time)))]
+
+            progress = Progress(place)
+            while stage == "matches" and not progress.done and progress.iteration < 8:
+                iterate(swing, lambda blocks: SCALES, progress, 1e-5)
+            place = progress.place
+        return float(place[0])
+
+    fit = Fit.__new__(Fit)
+    fit.stages = ["tracks", "matches"]
+    assert end(fit.steps()) == pytest.approx(0.7, abs=1e-4)
+    assert end([("matches", 1.0)] * 3) != pytest.approx(0.7, abs=0.01)
+
+
+def test_a_camera_that_is_not_followed_is_named():
+    picture = torch.zeros(3, 3, 3, dtype=torch.uint8)
+    shown = [Shown("left", 24.8, 19.0, 40.7, picture, ("",)), Shown("right", 37.0, 36.0, 40.0, picture, ("",))]
+    result = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), shown, (), 1.0)
+    assert result.astray == ["left"]
+    (told,) = [line for line in result.text().splitlines() if "not followed" in line]
+    assert "16 dB worse" in told
+    assert "`until`" in told
+
+
 def test_a_whole_fit_tells_it_and_goes_on(own, tmp_path):
     """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
     pytest.importorskip("cv2", reason="needs the extra [fit]")
-    from gaussian_swaying.fitting.fit import run_fit
-
     sought = [read_unknown("wind.speed", {"range": [2.0, 12.0], "start": 7.0})]
 
     def plan(iterations):
