@@ -41,6 +41,10 @@ ROWS: dict[str, dict[str, Any]] = {
     "pixels alone": {"stages": ["pixels"]},
     "without patches": {"known": {"aero.law": "projected", "aero.C_D": PUSH, "aero.C_F": PUSH, "aero.C_L": 0.0}},
     "five unknowns": {"unknowns": {**SOUGHT, "aero.C_D": [0.02, 0.5]}},
+    "five unknowns, pixels last": {
+        "unknowns": {**SOUGHT, "aero.C_D": [0.02, 0.5]},
+        "stages": ["tracks", "matches", "pixels"],
+    },
     "with the density": {"unknowns": {**SOUGHT, "material.density": [10, 60]}},
 }
 

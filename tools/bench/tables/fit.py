@@ -55,6 +55,33 @@ def blender(results: list[Row]) -> list[str]:
     return lines[1:] or ["Not measured yet."]
 
 
+@table("fit.md", "fit.bias", "fit_*", together=True)
+def bias(results: list[Row]) -> list[str]:
+    """How far faults of the model alone move the values, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("bias", {}):
+            found = [[_options(name), *_moved(row), f"{row['points']:,}"] for name, row in rows.items()]
+            head = ["case and grid", "distance", "speed", "azimuth", "E", "points"]
+            lines += ["", source(result), "", *grid(head, found)]
+    return lines[1:] or ["Not measured yet."]
+
+
+def _options(name: str) -> str:
+    """The case, and its options by their last word."""
+    case, *options = name.split(", ")
+    return ", ".join([case, *(f"`{option.split('.', option.split(' ')[0].count('.'))[-1]}`" for option in options)])
+
+
+def _moved(row: Row) -> list[str]:
+    return [
+        f"{row['rms_px']:.2f} pixels",
+        f"{100 * row['speed_error']:+.2f} %",
+        f"{row['azimuth_error_deg']:+.2f}°",
+        f"{100 * row['material.E_error']:+.2f} %",
+    ]
+
+
 def _named(name: str, row: Row) -> str:
     """The name of a row, and that its fit has not settled."""
     return f"{name} (not settled)" if row.get("not_settled") else name
