@@ -39,6 +39,7 @@ from gaussian_swaying.fitting.least_squares import (
 )
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
+from gaussian_swaying.fitting.settling import unsettled
 from gaussian_swaying.fitting.tracks import Tracks, match, track
 from gaussian_swaying.fitting.unknowns import check_unknowns
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
@@ -50,8 +51,10 @@ PROGRESS, VALUES, RESULT, SCENE, PICTURES = "fit.json", "values.csv", "result.js
 OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
 HORIZONS = (0.5, 1.0)
 """Shares of the fitted frames that the first stage takes, one after the other: chaos grows with time."""
-ROUNDS = 3
-"""How often Gaussians are matched again."""
+MATCHED = (0.5, 1.0, 1.0)
+"""The same for each time that Gaussians are matched again. Matches are exact enough to need it: in a flag that flaps, a
+hundredth of Young's modulus grows to pixels in two seconds, and over the whole of them places far from the lowest one
+are lowest among their neighbours."""
 SEARCHED = 0.5
 """Share of the fitted frames that the coarse search looks at."""
 NEAR = 0.1
@@ -76,6 +79,7 @@ class Course:
         matched: Where the Gaussians of the current step were matched; empty if they were not.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
+        ended: Why the iterations of this step ended; empty if they did not.
         stiffening: See :class:`~gaussian_swaying.fitting.ensemble.Ensemble`.
         history: One row for each iteration.
         directions: The principal directions of the sensitivities.
@@ -87,6 +91,7 @@ class Course:
     matched: list[float] = field(default_factory=list)
     damping: float = START
     iteration: int = 0
+    ended: str = ""
     stiffening: float = SAFETY
     history: list[dict[str, Any]] = field(default_factory=list)
     directions: list[dict[str, Any]] = field(default_factory=list)
@@ -183,10 +188,11 @@ class Fit:
     # ---- the steps
 
     def steps(self) -> list[tuple[str, float]]:
-        """Stage and horizon of every step: the first stage at growing horizons, the others at the full one."""
-        found = [(self.stages[0], share) for share in HORIZONS] if self.stages[0] != "matches" else []
-        for stage in self.stages if not found else self.stages[1:]:
-            found += [(stage, 1.0)] * (ROUNDS if stage == "matches" else 1)
+        """Stage and horizon of every step: the first stage and matches at growing horizons, others at the full one."""
+        found: list[tuple[str, float]] = []
+        for number, stage in enumerate(self.stages):
+            shares = MATCHED if stage == "matches" else (1.0,) if number else HORIZONS
+            found += [(stage, share) for share in shares]
         return found
 
     def search(self) -> list[float]:
@@ -247,22 +253,28 @@ class Fit:
             if stage == "matches" and not course.matched:
                 course.matched = list(course.place)
             evidence = self.evidence(stage, course.matched)
-            progress = Progress(torch.tensor(course.place, dtype=torch.float64), course.damping, course.iteration)
-            residuals, floors = self.residuals(evidence, times), {part.kind: part.floor for part in evidence}
+            place = torch.tensor(course.place, dtype=torch.float64)
+            progress = Progress(place, course.damping, course.iteration, done=course.ended)
+            last, residuals = course.step == len(steps) - 1, self.residuals(evidence, times)
+            floors = {part.kind: part.floor for part in evidence}
             while not progress.done and progress.iteration < self.plan.iterations:
-                last = course.step == len(steps) - 1
                 close = (TOLERANCE, LEAST_GAIN) if last else (ROUGH * TOLERANCE, ROUGH * LEAST_GAIN)
                 iterate(residuals, lambda blocks: scales_of(blocks, floors), progress, *close)  # noqa: B023
                 course.place, course.damping = progress.place.tolist(), progress.damping
                 course.stiffening = self.ensemble.stiffening
-                course.iteration, course.seconds = progress.iteration, time.monotonic() - clock
+                course.iteration, course.ended = progress.iteration, progress.done
+                course.seconds = time.monotonic() - clock
                 row = {"stage": stage, "horizon_s": times[-1], "iteration": progress.iteration, "cost": _cost(progress)}
+                row |= {"damping": progress.damping, "ended": progress.done}
                 course.history.append(
                     row | {f"scale_{k}": v for k, v in progress.scales.items()} | self.values(course.place)
                 )
                 self.say(f"{stage} to {times[-1]:.3g} s, {progress.iteration}: {self._shown(course.place)}")
                 keep(course)
+            if last:  # more `iterations` continue it
+                break
             course.step, course.iteration, course.damping, course.matched = course.step + 1, 0, START, []
+            course.ended = ""
             keep(course)
         place = torch.tensor(course.place, dtype=torch.float64)
         normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)
@@ -271,7 +283,14 @@ class Fit:
         state = self._run(place[None], self.times)
         shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), (own[0] for own in state))
         return Result(
-            self.plan.unknowns, tuple(course.place), normal.covariance(), found, shown, course.history, course.seconds
+            self.plan.unknowns,
+            tuple(course.place),
+            normal.covariance(),
+            found,
+            shown,
+            course.history,
+            course.seconds,
+            unsettled(normal, place, self.plan.unknowns, course.ended),
         )
 
     def _normal(self, place: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> Normal:

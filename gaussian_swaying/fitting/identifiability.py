@@ -78,18 +78,22 @@ def check_apart(found: Sequence[Direction], unknowns: Sequence[Unknown], limit: 
 
 def _sentence(parts: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:
     """What moving along a direction means, scaled so that its largest part is a change of 10 % or so."""
-    largest = max(map(abs, parts))
     turn = 1.0 if parts[max(range(len(parts)), key=lambda k: abs(parts[k]))] > 0 else -1.0
     # how far along the direction until the largest part has changed by a tenth of its value, or of its range
     lead = max(range(len(parts)), key=lambda k: abs(parts[k]))
     unknown = unknowns[lead]
     slope, value = unknown.slope(float(place[lead])), unknown.value(float(place[lead]))
     far = 0.1 * abs(value) / abs(slope * parts[lead]) if value and unknown.scale == "log" else 0.1 / abs(parts[lead])
-    words = []
-    for u, part, share in zip(unknowns, parts, place.tolist(), strict=True):
+    return changes([turn * far * part for part in parts], unknowns, place)
+
+
+def changes(step: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:
+    """A step, in shares of the ranges, in words: ``raising wind.speed by 10% and lowering material.E by 20%``."""
+    largest, words = max(map(abs, step)), []
+    for u, part, share in zip(unknowns, step, place.tolist(), strict=True):
         if abs(part) <= LARGE * largest:
             continue
-        change = turn * part * far * u.slope(share)
+        change = part * u.slope(share)
         verb = "raising" if change > 0 else "lowering"
         own = abs(u.value(share))
         amount = f"{abs(change) / own:.0%}" if u.scale == "log" and own else f"{abs(change):.2g} {u.unit}".strip()
@@ -97,4 +101,4 @@ def _sentence(parts: Sequence[float], unknowns: Sequence[Unknown], place: Tensor
     return " and ".join(words) if len(words) < 3 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
-__all__ = ["Direction", "check_apart", "condition", "directions"]
+__all__ = ["Direction", "changes", "check_apart", "condition", "directions"]

@@ -25,6 +25,7 @@ BETTER, WORSE, LEAST_DAMPING = 0.03, 30.0, 1e-3
 MOST_DAMPING = 1e4
 """Damping at which the search for a better place ends."""
 LEAST_GAIN = 1e-4
+NO_STEP = "no step is better"
 REACH = 0.25
 """Longest step, as a share of each range."""
 
@@ -172,14 +173,14 @@ def iterate(
             raise ValueError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
     normal = progress.normal
     progress.iteration += 1
-    trial = _step(normal, progress.place, progress.damping)
+    trial = step_from(normal, progress.place, progress.damping)
     moved = float((trial - progress.place).abs().amax())
     there, scales, blocks = linearised(residuals, rescale, trial)
     gain = normal.cost - float(huber([Block(b.kind, b.values[:1], b.cluster) for b in blocks], progress.scales)[0])
     if not gain > 0:
         progress.damping = max(progress.damping * WORSE, LEAST_DAMPING)
         if moved < tolerance or progress.damping > MOST_DAMPING:
-            progress.done = "no step is better"
+            progress.done = NO_STEP
         return
     progress.place, progress.normal, progress.scales = trial, there, scales
     damped, progress.damping = progress.damping > LEAST_DAMPING, progress.damping * BETTER
@@ -191,7 +192,7 @@ def iterate(
         progress.done = f"the last step lowered the cost by less than {least_gain:.2%}"
 
 
-def _step(normal: Normal, place: Tensor, damping: float) -> Tensor:
+def step_from(normal: Normal, place: Tensor, damping: float = 0.0) -> Tensor:
     """The place after a damped step that stays in the ranges; an unknown at its end that would leave it is kept."""
     free = torch.ones_like(place, dtype=torch.bool)
     for _ in range(len(place) + 1):
@@ -207,4 +208,20 @@ def _step(normal: Normal, place: Tensor, damping: float) -> Tensor:
     return (place + step * min(1.0, REACH / max(longest, 1e-12))).clamp(0.0, 1.0)
 
 
-__all__ = ["Normal", "Progress", "huber", "iterate", "normal_equations", "sensitivities"]
+def expected_gain(normal: Normal, step: Tensor) -> float:
+    """By which share of itself the cost falls along a step, as far as the residuals are linear."""
+    fall = -(normal.gradient @ step + 0.5 * step @ normal.matrix @ step) / max(normal.count, 1)
+    return float(fall) / max(normal.cost, 1e-300)
+
+
+__all__ = [
+    "Normal",
+    "Progress",
+    "expected_gain",
+    "huber",
+    "iterate",
+    "linearised",
+    "normal_equations",
+    "sensitivities",
+    "step_from",
+]

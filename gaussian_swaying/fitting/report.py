@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
+ASTRAY = 6.0
+"""How much less PSNR fitted frames may have than the one at rest [dB]: four times the squared difference."""
 VAGUE = 0.25
 """Standard error, as a share of the range, above which an unknown is called not determined."""
 
@@ -61,6 +63,7 @@ class Result:
         shown: How well each camera is reproduced.
         history: One row for each iteration.
         seconds: Time it took.
+        unsettled: Why the values are not those of a lowest place, and what to do; empty if they are.
     """
 
     unknowns: Sequence[Unknown]
@@ -70,6 +73,7 @@ class Result:
     shown: Sequence[Shown]
     history: Sequence[Mapping[str, Any]]
     seconds: float
+    unsettled: str = ""
 
     @property
     def values(self) -> dict[str, float]:
@@ -93,6 +97,11 @@ class Result:
         """Names of unknowns at an end of their range."""
         return [u.name for u, p in zip(self.unknowns, self.place, strict=True) if p < 1e-3 or p > 1 - 1e-3]
 
+    @property
+    def astray(self) -> list[str]:
+        """Names of cameras whose fitted frames the simulation does not follow: much worse than the one at rest."""
+        return [one.camera for one in self.shown if one.fitted < one.rest - ASTRAY]
+
     def rows(self) -> list[dict[str, Any]]:
         """The table: a row for each unknown."""
         values, errors = self.values, self.errors
@@ -113,6 +122,8 @@ class Result:
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
+        if self.unsettled:
+            lines.append(self.unsettled)
         for name in self.vague:
             lines.append(f"{name} is not determined by this video: its error is a large part of its range.")
         for name in self.at_an_end:
@@ -120,6 +131,12 @@ class Result:
         for one in self.shown:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
+            if one.camera in self.astray:
+                lines.append(
+                    f"camera {one.camera} is not followed: its fitted frames are {one.rest - one.fitted:.0f} dB worse "
+                    "than the one at rest, so the values may be wrong. Fit a shorter part (`until`), raise `search`, "
+                    "or check the base and `known`."
+                )
         return "\n".join(lines)
 
 
@@ -188,6 +205,8 @@ def write_results(
                 }
                 for s in result.shown
             ],
+            "not_settled": result.unsettled,
+            "not_followed": result.astray,
             "not_determined": result.vague,
             "at_an_end": result.at_an_end,
             "history": list(result.history),

@@ -71,6 +71,10 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
     Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
     simulation must already be near, within a few tens of pixels.
 
+    A splat may be drawn a part of a pixel beside the object: its camera is not quite right, or overlapping Gaussians
+    show their print on the side of the nearest. The first frame is at rest, where simulation and video are alike, so
+    the median shift that is found there is taken off everywhere.
+
     Args:
         simulation: The scene.
         video: The video.
@@ -83,7 +87,7 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
     chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
     index = scene.moving[chosen.to(scene.moving.device)]
     position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
-    seen = torch.zeros(count, len(chosen), dtype=torch.bool)
+    seen, shift = torch.zeros(count, len(chosen), dtype=torch.bool), torch.zeros(2, dtype=torch.float64)
     for k, state in enumerate(states):
         camera = video.cameras[k].to(painter.device)
         with torch.no_grad():
@@ -95,6 +99,9 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
         pair = np.stack([shown, video.images[k].numpy()])
         found, good = follow(pair, pixel.numpy())
         position[k], seen[k] = torch.from_numpy(found[1]), torch.from_numpy(good[1]) & there
+        if k == 0 and bool(seen[0].any()):
+            shift = (position[0] - pixel)[seen[0]].median(0).values
+        position[k] -= shift
     return Tracks(chosen, position, seen)
 
 

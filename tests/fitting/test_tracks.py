@@ -1,5 +1,7 @@
 """The tracker: pictures that are shifted by a known amount, and a simulation that is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -55,3 +57,20 @@ def test_matches_do_not_drift(own, simulation):
             off[name] = float(torch.cat(parts).norm(dim=-1).median())
         assert off["matches"] < 0.25
         assert off["matches"] < off["tracks"] < 2
+
+
+def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
+    """The same video, said to be from cameras whose pictures are shifted by a part of a pixel."""
+    video = read_videos(own / "video")[0]
+    turned = []
+    for camera in video.cameras:
+        intrinsics = camera.intrinsics.clone()
+        intrinsics[:2, 2] += torch.tensor([0.6, -0.4])
+        turned.append(replace(camera, intrinsics=intrinsics))
+    times = video.times[:5]
+    states = [found[0] for found in Ensemble(simulation).run([{}], times)]
+    video = replace(video, cameras=tuple(turned))
+    evidence = TrackEvidence(simulation, video, match(simulation, video, states))
+    for k in range(len(times)):  # the simulation is the truth
+        off = evidence.residuals(simulation, [states[k]], k)[0][0].median(0).values
+        assert off.tolist() == pytest.approx([0.0, 0.0], abs=0.05)

@@ -14,6 +14,7 @@ from typing import Any
 
 import yaml
 
+from bench.cases import fit_bias
 from gaussian_swaying.fitting.fit import run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.unknowns import flow_of
@@ -40,6 +41,10 @@ ROWS: dict[str, dict[str, Any]] = {
     "pixels alone": {"stages": ["pixels"]},
     "without patches": {"known": {"aero.law": "projected", "aero.C_D": PUSH, "aero.C_F": PUSH, "aero.C_L": 0.0}},
     "five unknowns": {"unknowns": {**SOUGHT, "aero.C_D": [0.02, 0.5]}},
+    "five unknowns, pixels last": {
+        "unknowns": {**SOUGHT, "aero.C_D": [0.02, 0.5]},
+        "stages": ["tracks", "matches", "pixels"],
+    },
     "with the density": {"unknowns": {**SOUGHT, "material.density": [10, 60]}},
 }
 
@@ -53,6 +58,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--known", default="{}", help="options of sim for --data, as JSON, such as a coarser solver.dx"
     )
+    command.add_argument(
+        "--bias",
+        action="append",
+        help="no fit of --data: how far faults of the model move the values, with these options of sim, as JSON; "
+        "repeatable",
+    )
     command.add_argument("--search", type=int, help="simulations of the coarse search")
     command.add_argument(
         "--until", type=float, help="fit the frames up to this time [s]; half of the video if left out"
@@ -60,7 +71,10 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["own"]`` or ``result["blender"]``, saving it after each row."""
+    """Fill ``result["own"]``, ``result["blender"]`` or ``result["bias"]``, saving it after each row."""
+    if options.bias:
+        fit_bias.measure(options, _cases(options), result, save)
+        return
     with tempfile.TemporaryDirectory() as scratch:
         if options.data is None:
             _own(options, result, save, Path(scratch))
@@ -120,9 +134,7 @@ def _settings(size: Mapping[str, Any]) -> Row:
 
 def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], None], scratch: Path) -> None:
     rows = result.setdefault("blender", {})
-    for folder in sorted(path.parent for path in options.data.glob("*/transforms.json")):
-        if options.case and folder.name not in options.case:
-            continue
+    for folder in _cases(options):
         truth = json.loads((folder / "truth.json").read_text())
         given = yaml.safe_load((folder / "fit.yaml").read_text())
         sought = [read_unknown(key, entry) for key, entry in given["unknowns"].items()]
@@ -144,6 +156,12 @@ def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], Non
             rows[key] = found | {"known": known, "until_s": plan.until}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
+
+
+def _cases(options: argparse.Namespace) -> list[Path]:
+    """Folders of the cases that are wanted."""
+    found = sorted(path.parent for path in options.data.glob("*/transforms.json"))
+    return [folder for folder in found if not options.case or folder.name in options.case]
 
 
 def blender_rows(known: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -182,6 +200,7 @@ def fit_row(plan: Plan, folder: Path, device: str, truth: Mapping[str, Any]) -> 
         "seconds": result.seconds,
         "processor_s": time.process_time() - begin,
         "not_determined": result.vague,
+        "not_settled": result.unsettled,
     }
 
 

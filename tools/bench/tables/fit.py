@@ -27,7 +27,9 @@ def own(results: list[Row]) -> list[str]:
     lines: list[str] = []
     for result in results:
         if rows := result.get("own", {}):
-            found = [[n, *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()]
+            found = [
+                [_named(n, row), *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()
+            ]
             one = next(row for row in rows.values() if "points" in row)
             width, height = one["size"]
             told = f"{one['points']:,} points, videos of {width} x {height}, {one['until_s']:.3g} s fitted."
@@ -47,10 +49,42 @@ def blender(results: list[Row]) -> list[str]:
                 free = name.split(", ")[-1] in ABLATIONS
                 goal = _reached(row, ONE if "one camera" in name else TWO)
                 sharp = ["", ""] if "refused" in row else [_decibels(row.get("psnr_rest_db")), _sharp(row)]
-                found.append([name, *_cells(row), *sharp, _base(row), "" if free else goal])
+                found.append([_named(name, row), *_cells(row), *sharp, _base(row), "" if free else goal])
             head = [*HEAD, "splat at rest", "28 dB, or as at rest", "fitted; changes of scene.yaml", "goal reached"]
             lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
+
+
+@table("fit.md", "fit.bias", "fit_*", together=True)
+def bias(results: list[Row]) -> list[str]:
+    """How far faults of the model alone move the values, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("bias", {}):
+            found = [[_options(name), *_moved(row), f"{row['points']:,}"] for name, row in rows.items()]
+            head = ["case and grid", "distance", "speed", "azimuth", "E", "points"]
+            lines += ["", source(result), "", *grid(head, found)]
+    return lines[1:] or ["Not measured yet."]
+
+
+def _options(name: str) -> str:
+    """The case, and its options by their last word."""
+    case, *options = name.split(", ")
+    return ", ".join([case, *(f"`{option.split('.', option.split(' ')[0].count('.'))[-1]}`" for option in options)])
+
+
+def _moved(row: Row) -> list[str]:
+    return [
+        f"{row['rms_px']:.2f} pixels",
+        f"{100 * row['speed_error']:+.2f} %",
+        f"{row['azimuth_error_deg']:+.2f}°",
+        f"{100 * row['material.E_error']:+.2f} %",
+    ]
+
+
+def _named(name: str, row: Row) -> str:
+    """The name of a row, and that its fit has not settled."""
+    return f"{name} (not settled)" if row.get("not_settled") else name
 
 
 def _cells(row: Row) -> list[str]:

@@ -1,0 +1,44 @@
+"""Whether a fit has settled: what a further step would still change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from gaussian_swaying.fitting.identifiability import changes
+from gaussian_swaying.fitting.least_squares import NO_STEP, Normal, expected_gain, step_from
+from gaussian_swaying.fitting.unknowns import Unknown
+
+FAR = 0.005
+"""Step, as a share of a range, above which the values have not settled."""
+GAIN = 0.003
+"""Share of the cost that such a step must be expected to gain: it changes nothing that is seen otherwise."""
+
+_BEGIN = "put `pixels` last in `stages`, raise `search`, or give a `start` that is nearer"
+
+
+def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended: str) -> str:
+    """Why the values at the end of a fit are not those of a lowest place, in a sentence; empty if they are.
+
+    The sentence names what the next step of Gauss and Newton would change, and the remedy. It cannot know of another,
+    lower place elsewhere.
+
+    Args:
+        normal: The sums at the end.
+        place: The end, shares of the ranges, shape (U,).
+        unknowns: What was sought.
+        ended: Why the last iterations ended, see :class:`~gaussian_swaying.fitting.least_squares.Progress`; empty if
+            their number ran out.
+    """
+    step = step_from(normal, place) - place
+    gain = expected_gain(normal, step)
+    if float(step.abs().amax()) <= FAR or gain <= GAIN:
+        return ""
+    why = {"": "`iterations` ran out", NO_STEP: "no step lowered the cost"}.get(ended, ended)
+    remedy = _BEGIN if ended else "raise `iterations` and continue with --resume"
+    told = f"{changes(step.tolist(), unknowns, place)}, to lower the cost by {gain:.2g} of itself"
+    return f"The values have not settled: {why}, but the sensitivities ask for {told}: {remedy}."
+
+
+__all__ = ["unsettled"]

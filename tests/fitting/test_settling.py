@@ -1,0 +1,134 @@
+"""A fit says whether its values have settled."""
+
+import json
+
+import pytest
+import torch
+
+from gaussian_swaying.fitting.evidence import Block
+from gaussian_swaying.fitting.fit import Fit, run_fit
+from gaussian_swaying.fitting.least_squares import NO_STEP, Progress, expected_gain, iterate, linearised, step_from
+from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.report import Result, Shown
+from gaussian_swaying.fitting.settling import unsettled
+from gaussian_swaying.fitting.unknowns import Unknown
+
+UNKNOWNS = [Unknown("wind.speed", 1.0, 10.0, "log"), Unknown("material.E", 1e3, 1e5, "log")]
+SCALES = {"tracks": 0.1}
+
+
+def _valley(places):
+    """Residuals that change thirty times less along the valley y = 0.9 x**2 than across it."""
+    x, y = places.T
+    values = torch.stack([x - 0.7, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
+    return [Block("tracks", values, torch.arange(2))]
+
+
+def _fitted(iterations):
+    progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
+    while not progress.done and progress.iteration < iterations:
+        iterate(_valley, lambda blocks: SCALES, progress, 1e-5)
+    return progress
+
+
+def _told(progress, ended=None):
+    return unsettled(progress.normal, progress.place, UNKNOWNS, progress.done if ended is None else ended)
+
+
+def test_a_fit_in_the_lowest_place_has_settled():
+    progress = _fitted(60)
+    assert progress.done
+    assert _told(progress) == ""
+
+
+def test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy():
+    found = _told(_fitted(1))
+    for words in ("not settled", "`iterations` ran out", "raising wind.speed by", "--resume"):
+        assert words in found
+    assert found.count(". ") == 0
+
+
+def test_a_last_step_that_was_rejected_is_told_with_another_remedy():
+    found = _told(_fitted(1), NO_STEP)
+    for words in ("not settled", "no step lowered the cost", "`pixels` last", "`start`"):
+        assert words in found
+
+
+def test_a_direction_that_nothing_shows_is_not_called_unsettled():
+    """The step along it may be large, but it gains nothing; `not_determined` names such an unknown."""
+
+    def flat(places):
+        return [Block("tracks", torch.stack([places[:, 0] - 0.5, 1e-3 * places[:, 1] + 1], -1)[:, :, None], _TWO)]
+
+    place = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    normal, _, _ = linearised(flat, lambda blocks: {"tracks": 1.0}, place)
+    assert float((step_from(normal, place) - place).abs().amax()) > 0.2
+    assert unsettled(normal, place, UNKNOWNS, NO_STEP) == ""
+
+
+_TWO = torch.arange(2)
+
+
+def test_the_expected_gain_is_that_of_linear_residuals():
+    def line(places):
+        return [Block("tracks", (places @ torch.tensor([[1.0, 2.0], [0.5, 0.1]]).double() - 0.3)[:, :, None], _TWO)]
+
+    place = torch.tensor([0.2, 0.4], dtype=torch.float64)
+    normal, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, place)
+    target = step_from(normal, place)
+    after, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, target)
+    assert expected_gain(normal, target - place) == pytest.approx(1 - after.cost / normal.cost, abs=1e-6)
+
+
+def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everything():
+    """Phases that part with time: from afar, all frames at once end beside the true rate 0.7, growing parts do not."""
+
+    def end(steps):
+        place = torch.tensor([0.67], dtype=torch.float64)
+        for stage, share in steps:
+            time = torch.linspace(0, 2, 49, dtype=torch.float64)[: max(3, round(share * 49))]
+
+            def swing(places, time=time):
+                found = torch.sin(60 * places * time.square()) - torch.sin(60 * 0.7 * time.square())
+                return [Block("tracks", torch.stack([found, 0 * found], -1), torch.arange(len(time)))]
+
+            progress = Progress(place)
+            while stage == "matches" and not progress.done and progress.iteration < 8:
+                iterate(swing, lambda blocks: SCALES, progress, 1e-5)
+            place = progress.place
+        return float(place[0])
+
+    fit = Fit.__new__(Fit)
+    fit.stages = ["tracks", "matches"]
+    assert end(fit.steps()) == pytest.approx(0.7, abs=1e-4)
+    assert end([("matches", 1.0)] * 3) != pytest.approx(0.7, abs=0.01)
+
+
+def test_a_camera_that_is_not_followed_is_named():
+    picture = torch.zeros(3, 3, 3, dtype=torch.uint8)
+    shown = [Shown("left", 24.8, 19.0, 40.7, picture, ("",)), Shown("right", 37.0, 36.0, 40.0, picture, ("",))]
+    result = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), shown, (), 1.0)
+    assert result.astray == ["left"]
+    (told,) = [line for line in result.text().splitlines() if "not followed" in line]
+    assert "16 dB worse" in told
+    assert "`until`" in told
+
+
+def test_a_whole_fit_tells_it_and_goes_on(own, tmp_path):
+    """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
+    pytest.importorskip("cv2", reason="needs the extra [fit]")
+    sought = [read_unknown("wind.speed", {"range": [2.0, 12.0], "start": 7.0})]
+
+    def plan(iterations):
+        base, videos = [str(own / "base.yaml")], [str(own / "video")]
+        return Plan(base, videos, sought, stages=["tracks"], search=0, iterations=iterations, tracks=40)
+
+    first = run_fit(plan(1), tmp_path / "fit", device="cpu", progress=False)
+    assert "not settled" in first.unsettled
+    assert first.unsettled in first.text()
+    assert json.loads((tmp_path / "fit/result.json").read_text())["not_settled"] == first.unsettled
+    again = run_fit(plan(8), tmp_path / "fit", resume=True, device="cpu", progress=False)
+    assert again.history[: len(first.history)] == first.history
+    assert len(again.history) > len(first.history)
+    assert again.unsettled == ""
+    assert again.values["wind.speed"] == pytest.approx(5.0, rel=0.05)

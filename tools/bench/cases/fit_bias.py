@@ -1,0 +1,127 @@
+"""``bench.py fit --bias``: how far faults of the model alone move what a fit finds, without a fit and without pictures.
+
+The simulation runs with the true values. What is left between it and the true motion, seen by the cameras of the video,
+is a fault of the model. One step of Gauss and Newton from the truth says which values a fit would take for it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from bench.record import ROOT
+from gaussian_swaying.fitting.evidence import Block, Evidence, TrackEvidence, compare, scales_of
+from gaussian_swaying.fitting.fit import Fit
+from gaussian_swaying.fitting.least_squares import normal_equations, sensitivities, step_from
+from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
+from gaussian_swaying.fitting.tracks import Tracks
+from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.simulation.simulation import Simulation
+
+Row = dict[str, Any]
+ALONG = (20, 14)
+"""Places on the cloth that are compared, along its width and height."""
+
+
+@dataclass
+class Sensitivity:
+    """Changes of the residuals with each unknown, and by how much of its range each was moved."""
+
+    changes: list[Tensor]
+    steps: Tensor
+
+
+def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, save: Callable[[Row], None]) -> None:
+    """Fill ``result["bias"]``: a row for each case and each ``--bias``; the first gives the sensitivities of all."""
+    rows = result.setdefault("bias", {})
+    for folder in folders:
+        known: Sensitivity | None = None
+        for text in options.bias:
+            begin = time.process_time()
+            changed = {"aero.law": options.law, **json.loads(options.known), **json.loads(text)}
+            row, known = bias(folder, changed, options.until, options.device, known)
+            key = f"{folder.name}, {', '.join(f'{name} {value}' for name, value in json.loads(text).items())}"
+            rows[key] = row | {"known": changed, "processor_s": time.process_time() - begin}
+            print(f"{key}: {rows[key]}", flush=True)
+            save(result)
+
+
+def bias(
+    folder: Path, changed: Row, until: float | None, device: str, known: Sensitivity | None = None
+) -> tuple[Row, Sensitivity]:
+    """Where one step of Gauss and Newton leads from the truth.
+
+    Args:
+        folder: A case of ``make_fit_data.py``.
+        changed: Options of ``sim`` that replace those of the case.
+        until: Compare the frames up to this time [s]; half of the video if it is None.
+        device: ``cpu`` or ``cuda``.
+        known: Sensitivities from another grid; None to compute them, which takes 1 + 2U simulations in place of one.
+    """
+    truth = json.loads((folder / "truth.json").read_text())
+    given = yaml.safe_load((folder / "fit.yaml").read_text())
+    sought = [read_unknown(name, entry) for name, entry in given["unknowns"].items()]
+    plan = Plan([str(folder / "scene.yaml")], [str(folder)], sought, known=changed, until=until or truth["fit_until"])
+    parser = Simulation.parser()
+    settings = parse_base(plan, parser)
+    settings.device, settings.camera, settings.cameras = device, None, None
+    fit = Fit(Simulation.from_settings(parser, settings), read_videos(str(folder)), plan)
+    evidence = _true_tracks(fit, folder)
+    true = {"wind.speed": truth["speed"], "wind.azimuth": truth["azimuth"], "material.E": truth["E"]}
+    place = torch.tensor([u.share(true[u.name]) for u in sought], dtype=torch.float64)
+    if known is None:
+        blocks, steps = sensitivities(fit.residuals(evidence, fit.fitted), place)
+        known = Sensitivity([b.values[1:] - b.values[:1] for b in blocks], steps)
+    else:
+        here = compare(fit.ensemble, evidence, [fit.values(place)], fit.fitted)
+        pairs = zip(here, known.changes, strict=True)
+        blocks = [Block(b.kind, torch.cat([b.values, b.values + change]), b.cluster) for b, change in pairs]
+    normal = normal_equations(blocks, scales_of(blocks, {"tracks": TrackEvidence.floor}), known.steps)
+    found = fit.values(step_from(normal, place))
+    return {
+        "speed_error": found["wind.speed"] / truth["speed"] - 1,
+        "azimuth_error_deg": found["wind.azimuth"] - truth["azimuth"],
+        "material.E_error": found["material.E"] / truth["E"] - 1,
+        "rms_px": float(torch.cat([b.values[0] for b in blocks]).square().sum(-1).mean().sqrt()),
+        "points": fit.simulation.scene.points.count,
+        "until_s": plan.until,
+    }, known
+
+
+def _true_tracks(fit: Fit, folder: Path) -> list[Evidence]:
+    """Where the cameras would see places on the true cloth, hidden ones too."""
+    sys.path.append(str(ROOT / "tools" / "datasets"))
+    from flag_motion import read_cloth
+
+    cloth, scene = read_cloth(folder / "cloth.npz"), fit.simulation.scene
+    rest = scene.model.means.detach()[scene.moving].cpu()
+    low, high = rest.amin(0), rest.amax(0)
+    flat = ((rest - low) / (high - low).clamp(min=1e-9))[:, [0, 2]]
+    axes = [(torch.arange(count) + 0.5) / count for count in ALONG]
+    index = torch.cdist(torch.cartesian_prod(*axes), flat).argmin(1)
+    chosen = rest[index].double()
+    # the cloth at rest is flat but for its ripple: its places are shares of width and height
+    size = torch.tensor([cloth.settings["width"], cloth.settings["height"]], dtype=torch.float64)
+    motion = torch.from_numpy(cloth.sample((chosen[:, [0, 2]] / size).numpy()))
+    moved = (chosen + (motion - motion[:1])).float()
+    found: list[Evidence] = []
+    for video in fit.videos:
+        frames = range(len(video.times))
+        position = torch.stack([project(moved[k], video.cameras[k])[0].double() for k in frames])
+        seen = torch.ones(len(frames), len(index), dtype=torch.bool)
+        found.append(TrackEvidence(fit.simulation, video, Tracks(index, position, seen)))
+    return found
+
+
+__all__ = ["bias", "measure"]
