@@ -64,6 +64,8 @@ def openness(
     root of the area or twice the standard deviation of the Gaussian, whichever is smaller. So two skins closer than
     about a spacing are not told apart, and neither is what hides less than two spacings below a skin. A free sheet
     whose patches are scattered more than that has two faces, and counts up to twice.
+    Leaves that are spread evenly keep their area up to a leaf area index of about 2; denser ones, and bunches of
+    leaves, look like a hazy skin and lose part of it.
 
     Patches larger than half the cross-section of a column are cut into up to 256 parts, spread over a disc as large as
     the ellipse of two standard deviations. On average a patch has at most three, so light leaks between the parts where

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -152,6 +153,27 @@ def hazy_sphere(thickness: float = 5.0, opacity: float | None = None, count: int
     return Body(body.means * inwards, normals, scales, spread, body.area)
 
 
+def leaf_ball(index: float, side: float = 0.32, across: int = 12, seed: int = 40) -> Body:
+    """Square leaves of any direction, spread evenly over a ball of radius 1 m.
+
+    Args:
+        index: Leaf area index: area of the leaves over the shadow of the ball.
+        side: Side of a leaf [m].
+        across: Gaussians along a side of a leaf.
+        seed: Seed of places and directions.
+    """
+    leaves = round(index * math.pi / side**2)
+    turn, draw = _random(leaves, seed)
+    away, helper = (torch.nn.functional.normalize(_random(leaves, seed + step)[0], dim=-1) for step in (1, 2))
+    first = torch.nn.functional.normalize(turn, dim=-1)
+    second = torch.nn.functional.normalize(torch.linalg.cross(first, helper), dim=-1)
+    step = ((torch.arange(across, dtype=torch.float64) + 0.5) / across - 0.5) * side
+    u, v = (part.reshape(1, -1, 1) for part in torch.meshgrid(step, step, indexing="ij"))
+    means = (away * draw[:, :1] ** (1 / 3))[:, None] + u * first[:, None] + v * second[:, None]
+    normals = torch.linalg.cross(first, second)[:, None].expand_as(means)
+    return _discs(means.reshape(-1, 3), normals.reshape(-1, 3), side / across, 0.95, leaves * side**2)
+
+
 def of_cloud(cloud: GaussianCloud, threshold: float = 0.1, above: float | None = None) -> Body:
     """Gaussians of at least some opacity, those above a height if one is given, with the area of ``coverage``."""
     model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
@@ -185,6 +207,8 @@ BODIES: dict[str, Callable[[], Body]] = {
     "leafy branch, 150 leaves": lambda: of_cloud(LeavesScene().generate()),
     "crown of 300 leaves": lambda: of_cloud(FicusScene(leaves=300).generate(), above=CROWN),
     "crown of 2,400 leaves": lambda: of_cloud(FicusScene().generate(), above=CROWN),
+    **{f"open ball of leaves, leaf area index {i}": partial(leaf_ball, i) for i in (1, 2)},
+    **{f"dense ball of leaves, leaf area index {i}": partial(leaf_ball, i) for i in (3, 4, 6)},
     "unresolved: plate, rough by 1 spacing": lambda: plate(roughness=1.0),
     "unresolved: clutter right under a sphere": lambda: cluttered_sphere(radius=0.98),
     "unresolved: haze with normals tilted by 45 degrees": lambda: hazy_sphere(tilt=0.8),

@@ -87,7 +87,7 @@ def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
 
 
 def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
-    """A known limit (docs/validation.md): inner leaves are hidden from all sides, as clutter in a body is."""
+    """A known limit (docs/validation.md): leaves of a bunch look like the layers of a hazy skin."""
     body = bodies.of_cloud(FicusScene(leaves=300).generate(), above=bodies.CROWN)
     weight, areas = weights(body)
     assert 0.8 < float((weight * areas).sum() / areas.sum()) <= 1
@@ -96,6 +96,22 @@ def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
     share = [float((weight * areas)[part].sum() / areas[part].sum()) for part in (outer, ~outer)]
     assert share[0] > 0.95
     assert share[0] > share[1]
+
+
+@pytest.mark.parametrize("across", [6, 12])
+def test_leaves_spread_evenly_keep_their_area_up_to_a_leaf_area_index_of_2(across):
+    """The area of the leaves is known; it is the leaf area index that decides, not how fine the Gaussians are."""
+    body = bodies.leaf_ball(2, across=across)
+    weight, areas = weights(body)
+    assert float((weight * areas).sum()) == pytest.approx(body.area, rel=0.05)
+
+
+def test_denser_leaves_lose_area():
+    """The other side of the border, a known limit (docs/validation.md)."""
+    body = bodies.leaf_ball(4, across=6)
+    weight, areas = weights(body)
+    assert 0.85 < float((weight * areas).sum()) / body.area < 0.95
+    assert float(areas.sum()) == pytest.approx(body.area, rel=0.05)  # nothing is lost with ``coverage``
 
 
 def test_two_parallel_sheets_stay_two():

@@ -10,7 +10,8 @@ from bench.tables.markdown import grid, source, yes_no
 Row = dict[str, Any]
 
 SHEETS = {"plate": "a plate", "faint plate": "a faint plate", "flag": "a flag", "leafy": "leafy branches",
-          "crown": "crowns of leaves"}  # fmt: skip
+          "crown": "crowns of leaves", "open ball": "leaves spread over a ball, leaf area index up to 2",
+          "dense ball": "the same, leaf area index from 3"}  # fmt: skip
 """How the names of bodies begin that are no closed skins, and what they are."""
 
 
