@@ -1,5 +1,6 @@
 """A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it."""
 
+import copy
 import io
 import json
 import math
@@ -16,6 +17,7 @@ from gaussian_swaying.runs.seal import check_seal, seal
 from gaussian_swaying.simulation.diagnostics import entry_names
 from gaussian_swaying.simulation.recording.checkpoint import log_lines, read_checkpoint, write_checkpoint
 from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.stepping import Stepping
 
 CONFIG = "material:\n  E: 3000.0\nwind:\n  flow:\n  - 6.0\n  - 1.5\n  - 0.0\n"
 
@@ -141,41 +143,57 @@ def _with_lines(checkpoint):
 def _broken_fields(file):
     """A checkpoint with a right checksum for each field that is missing, renamed or of another kind."""
 
+    held = torch.load(file, weights_only=True)
+    held["log"] = [json.loads(line) for line in held["log"]]
+
     def fresh():
-        checkpoint = torch.load(file, weights_only=True)
-        return checkpoint | {"log": [json.loads(line) for line in checkpoint["log"]]}
+        return copy.deepcopy(held)
 
     for prefix, fields, find in _fields(fresh()):
         for name, value in fields.items():
             if prefix + name != "splat" and not prefix.startswith("wall"):
-                copy = fresh()
-                del find(copy)[name]
-                yield f"{prefix}{name} missing", copy
-                copy = fresh()
-                find(copy)[f"{name}s"] = find(copy).pop(name)
-                yield f"{prefix}{name} renamed", copy
+                other = fresh()
+                del find(other)[name]
+                yield f"{prefix}{name} missing", other
+                other = fresh()
+                find(other)[f"{name}s"] = find(other).pop(name)
+                yield f"{prefix}{name} renamed", other
             for variant in _variants(value):
                 if variant is None and (prefix + name, None) in HARMLESS:
                     continue
                 number = type(variant) in (int, float)
                 if number and (prefix == "log[1]." or (prefix == "wall_s." and 0 <= variant < float("inf"))):
                     continue  # a number is a number
-                copy = fresh()
-                find(copy)[name] = variant
-                yield f"{prefix}{name} = {variant!r}"[:80], copy
-    copy = fresh()
-    copy["log"].pop()
-    yield "a log of too few frames", copy
-    copy = fresh()
-    copy["frame"] = 0
-    yield "the frame before", copy
-    copy = fresh()
-    copy["state"]["time"] = copy["state"]["time"] + 0.04
-    yield "the time of another frame", copy
+                other = fresh()
+                find(other)[name] = variant
+                yield f"{prefix}{name} = {variant!r}"[:80], other
+    other = fresh()
+    other["log"].pop()
+    yield "a log of too few frames", other
+    other = fresh()
+    other["frame"] = 0
+    yield "the frame before", other
+    other = fresh()
+    other["state"]["time"] = other["state"]["time"] + 0.04
+    yield "the time of another frame", other
     yield "a list", [1, 2]
     yield "nothing", {}
 
 
+@pytest.fixture
+def _one_start(monkeypatch):
+    """The state at rest is the same for all that are refused, and making it takes most of the time."""
+    start, made = Stepping.start, {}
+
+    def once(self):
+        if self not in made:
+            made[self] = start(self)
+        return made[self]
+
+    monkeypatch.setattr(Stepping, "start", once)
+
+
+@pytest.mark.usefixtures("_one_start")
 def test_forty_bits_and_more_than_a_hundred_other_damages(run):
     """None goes on silently, none ends in anything but the one sentence; then the right one goes on."""
     folder, resume = run
