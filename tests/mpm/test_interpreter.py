@@ -1,4 +1,4 @@
-"""Tests run Triton's interpreter with shortcuts (`conftest.py`): the same bits as without them."""
+"""Tests run Triton's interpreter with shortcuts (`quick_interpreter.py`): the same bits as without them."""
 
 import pytest
 import torch
