@@ -109,7 +109,7 @@ def test_layers_pressed_together_stay_in_order(sheet, scene, march, layers):
 
 
 def _rest(sheet, scene, march, layers, seconds):
-    """Changes of the energy and of its elastic part after a pile has settled for 0.5 s; how far a layer rises or sinks."""
+    """Changes of the energy and of its elastic part after a pile has settled; how far a layer rises or sinks."""
     solver, state = _pile(sheet, scene, layers, THICKNESS, 9.8, per_side=5, stiffness_damping=1e-3)
     settled = march(solver, state, 0.5, frame=0.1)[-1]
     later = march(solver, settled, seconds, frame=0.1)
