@@ -5,7 +5,7 @@ and moves with :math:`\sum_i w_i v_i`. An impulse :math:`j` at it changes the no
 :math:`k` has a normal :math:`n`, a gap :math:`d` and two places, or one place and an obstacle. Its relative velocity
 along the normal after the substep must satisfy
 
-.. math:: v_n \ge -d / \Delta t \quad (d > 0), \qquad v_n \ge \min(0.02\,|d| / \Delta t,\; 0.004\,\Delta x / \Delta t)
+.. math:: v_n \ge -d / \Delta t \quad (d > 0), \qquad v_n \ge \min(0.01\,|d| / \Delta t,\; 0.004\,\Delta x / \Delta t)
           \quad (d \le 0),
 
 so that a gap closes at most to zero within a substep, and an overlap is removed in some substeps, at no more than one
@@ -19,6 +19,14 @@ values of its row in :math:`A = J M^{-1} J^T`, so the iteration cannot overshoot
 the mass that the place really has, and for a whole area in contact the mass of the area. With :math:`c` constraints at
 each place the sum is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, without forming A.
 
+Friction that sticks yields a little: with step :math:`\alpha` and friction :math:`j_t` it leaves the slip
+:math:`v_t = -c\,j_t / \alpha`, c = ``CREEP`` (Todorov 2014, "Convex and analytically-invertible dynamics with contacts
+and constraints", regularises friction so). The iterations are never finished, and with momentum they overshoot: k of
+them leave the share :math:`r_k(\lambda)` of the slip of a mode that one step reduces by :math:`\lambda`. Where it is
+negative, friction has pushed the material instead of holding it, in every substep again. What is left with c is
+:math:`(c + \lambda\,r_k(\lambda + c)) / (c + \lambda)`. From c = 0.01 on it is nowhere negative, after any number of
+iterations.
+
 The two places of a pair get opposite impulses, so momentum is conserved to round-off; angular momentum up to the torque
 of an impulse times the shift of the two places along the surface.
 """
@@ -30,11 +38,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-PUSH = 0.02
+PUSH = 0.01
 """Share of an overlap that a substep removes."""
 
 PUSH_CELLS = 0.004
 """Most of an overlap that a substep removes [cells]."""
+
+CREEP = 0.01
+"""How much friction yields where it sticks: the share of the free slip of a substep that a lone place keeps."""
 
 SLACK = 0.02
 """Gap up to which a constraint counts as acting [cells]."""
@@ -187,7 +198,7 @@ def resolve(
             break
         ahead = (applied * normal).sum(-1)
         press = (ahead + step * lacking).clamp(min=0.0)
-        rub = applied - ahead[:, None] * normal - step[:, None] * (relative - along[:, None] * normal)
+        rub = (1 - CREEP) * (applied - ahead[:, None] * normal) - step[:, None] * (relative - along[:, None] * normal)
         length = (rub * rub).sum(-1).clamp(min=tiny).sqrt()
         rub = rub * (held.friction * press / length).clamp(max=1.0)[:, None]
         new, old = press[:, None] * normal + rub, pressed[:, None] * normal + rubbed

@@ -9,6 +9,7 @@ import triton
 import triton.language as tl
 
 from gaussian_swaying.geometry.linalg_triton import load3
+from gaussian_swaying.mpm.contact.solve import CREEP
 from gaussian_swaying.mpm.triton.contact_list_kernels import (
     ACTING,
     CHANGES,
@@ -26,6 +27,9 @@ from gaussian_swaying.mpm.triton.shared import axis_weights, node_weight
 
 PLANES = tl.constexpr(10)
 """Numbers of a constraint: normal, wanted velocity, and its impulse with and without the momentum of the iteration."""
+
+KEPT = tl.constexpr(1 - CREEP)
+"""Share of the friction of the last iteration that stays."""
 
 
 @triton.jit
@@ -260,9 +264,9 @@ def _impulses(
         o2 = tl.load(t + 2 * plane, acts & later, 0.0)
         ahead = y0 * n0 + y1 * n1 + y2 * n2
         press = tl.maximum(ahead + step * lacking, 0.0)
-        t0 = y0 - ahead * n0 - step * (r0 - along * n0)
-        t1 = y1 - ahead * n1 - step * (r1 - along * n1)
-        t2 = y2 - ahead * n2 - step * (r2 - along * n2)
+        t0 = KEPT * (y0 - ahead * n0) - step * (r0 - along * n0)
+        t1 = KEPT * (y1 - ahead * n1) - step * (r1 - along * n1)
+        t2 = KEPT * (y2 - ahead * n2) - step * (r2 - along * n2)
         length = tl.sqrt(tl.maximum(t0 * t0 + t1 * t1 + t2 * t2, 1.2e-38))
         share = tl.minimum(mu * press / length, 1.0)
         t0 = press * n0 + share * t0

@@ -1,6 +1,7 @@
 """Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -108,7 +109,7 @@ def test_layers_pressed_together_stay_in_order(sheet, scene, march, layers):
 
 
 def _rest(sheet, scene, march, layers, seconds):
-    """How the energy of a pile changes after it has settled for half a second, and how far a layer rises or sinks."""
+    """Changes of the energy and of its elastic part after a pile has settled; how far a layer rises or sinks."""
     solver, state = _pile(sheet, scene, layers, THICKNESS, 9.8, per_side=5, stiffness_damping=1e-3)
     settled = march(solver, state, 0.5, frame=0.1)[-1]
     later = march(solver, settled, seconds, frame=0.1)
@@ -116,29 +117,30 @@ def _rest(sheet, scene, march, layers, seconds):
     weight = float(solver.points.mass.sum() * 9.8)
     for end in later:
         energy = solver.energies(end)
-        assert float(energy["kinetic"]) < 1e-4 * weight * THICKNESS  # thirty times that if overlaps leave fast
-    change = float(energy["potential"] + energy["elastic"] - first["potential"] - first["elastic"])
+        assert float(energy["kinetic"]) < 1e-4 * weight * THICKNESS
+    bent = float(energy["elastic"] - first["elastic"])
+    change = float(energy["potential"] - first["potential"]) + bent
     height = settled.position[:, 2].reshape(layers, -1).mean(1), end.position[:, 2].reshape(layers, -1).mean(1)
-    return change / (weight * THICKNESS), float((height[1] - height[0]).abs().max())
+    scale = weight * THICKNESS
+    return change / scale, bent / scale, float((height[1] - height[0]).abs().max())
 
 
 def test_a_pile_at_rest_stays_at_rest(sheet, scene, march):
-    """No layer moves by more than 1 % of the thickness; energy grows by no more than 1 % of weight times thickness."""
-    change, moved = _rest(sheet, scene, march, 5, 0.5)
-    assert change < 0.01
+    """No layer moves by more than 1 % of the thickness, energy does not grow, and no bending builds up."""
+    change, bent, moved = _rest(sheet, scene, march, 5, 0.5)
+    assert change < 1e-3
+    assert bent < 5e-6  # 30e-6 if friction does not yield, and it then grows
     assert moved < 0.01 * THICKNESS
 
 
-_A_MINUTE = pytest.mark.xfail(strict=False, reason="the layers slide until the pile tilts, see docs/contact.md")
-
-
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("seconds", [11.5, pytest.param(60.0, marks=_A_MINUTE)])
-def test_a_pile_rests_for_long(sheet, scene, march, seconds):
-    """As above, with twice the bounds: bending builds up against friction for five seconds, and stays."""
-    change, moved = _rest(sheet, scene, march, 8, seconds)
-    assert change < 0.02
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize(("dtype", "seconds"), [(torch.float64, 11.5), (torch.float32, 60.0)])
+def test_a_pile_rests_for_long(sheet, scene, march, dtype, seconds):
+    """It slides slowly, and so sinks a little; energy does not grow."""
+    change, bent, moved = _rest(partial(sheet, dtype=dtype), scene, march, 8, seconds)
+    assert change < 1e-3
+    assert bent < 1e-4
     assert moved < 0.02 * THICKNESS
 
 
@@ -247,6 +249,31 @@ def test_lone_and_joint_impulses_are_exact():
         torch.testing.assert_close(impulse[:, 2], mass[:count])
         torch.testing.assert_close(impulse[:, 0], -0.1 * mass[:count])  # sliding: Coulomb's bound
         torch.testing.assert_close(after[:count, 2], torch.zeros(count, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("count", [2, 4, 8])
+def test_unfinished_friction_does_not_push(count):
+    """A column of blocks that stick to each other, on a slope: however few iterations are made, none moves uphill."""
+    weight = torch.zeros(count, 27, dtype=torch.float64)
+    weight[:, 0] = 1.0
+    rows = Rows.of(torch.arange(count)[:, None].repeat(1, 27), weight, torch.ones(count, dtype=torch.float64))
+    held = Constraints(
+        torch.arange(count),
+        torch.cat([torch.tensor([count]), torch.arange(count - 1)]),
+        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).repeat(count, 1),
+        torch.zeros(count, dtype=torch.float64),
+        torch.zeros(count, 3, dtype=torch.float64),
+        torch.full((count,), 10.0, dtype=torch.float64),
+        torch.ones(count, dtype=torch.bool),
+    )
+    velocity = torch.tensor([[0.3, 0.0, -1.0]], dtype=torch.float64).repeat(count, 1)
+    for iterations in (1, 2, 5, 10, 15, 20, 25, 30, 35, 40):
+        after, impulse = resolve(velocity, rows, held, 1e-3, 0.1, iterations)
+        moving = rows.read(after)
+        relative = moving[held.first] - moving[held.second]
+        assert float((impulse * relative)[:, 0].sum()) < 0.0  # the work of friction
+        assert float(after[:, 0].min()) > 0.0
+        assert float(after[:, 0].max()) < 0.3 + 1e-12
 
 
 @pytest.mark.parametrize(
