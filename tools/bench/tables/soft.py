@@ -37,8 +37,18 @@ def soft(results: list[Row]) -> list[str]:
             found = []
             for name, row in rows.items():
                 known = "; ".join(f"`{key}` {value}" for key, value in row["known"].items())
-                found.append([name, *fit_cells(row), f"{row['until_s']:.3g} s" + (f"; {known}" if known else "")])
-            lines += ["", source(result), "", *grid([*HEAD, "fitted; changes of scene.yaml"], found)]
+                more = ["", ""]
+                if "refused" not in row:
+                    more = [f"{row['processor_s']:.0f} s", f"{row['psnr_rest_db']:.1f} dB"]
+                found.append(
+                    [name, *fit_cells(row), *more, f"{row['until_s']:.3g} s" + (f"; {known}" if known else "")]
+                )
+            lines += [
+                "",
+                source(result),
+                "",
+                *grid([*HEAD, "of the processor", "splat at rest", "fitted; changes of scene.yaml"], found),
+            ]
     return lines[1:] or ["Not measured yet."]
 
 
