@@ -36,7 +36,7 @@ def soft(results: list[Row]) -> list[str]:
         if rows := result.get("fits", {}):
             found = []
             for name, row in rows.items():
-                known = "; ".join(f"`{key}` {value}" for key, value in row["known"].items())
+                base = [f"{row['until_s']:.3g} s", *(f"`{key}` {value}" for key, value in row["known"].items())]
                 more = ["", ""]
                 if "refused" not in row:
                     more = [f"{row['processor_s']:.0f} s", f"{row['psnr_rest_db']:.1f} dB"]
