@@ -40,15 +40,9 @@ def soft(results: list[Row]) -> list[str]:
                 more = ["", ""]
                 if "refused" not in row:
                     more = [f"{row['processor_s']:.0f} s", f"{row['psnr_rest_db']:.1f} dB"]
-                found.append(
-                    [name, *fit_cells(row), *more, f"{row['until_s']:.3g} s" + (f"; {known}" if known else "")]
-                )
-            lines += [
-                "",
-                source(result),
-                "",
-                *grid([*HEAD, "of the processor", "splat at rest", "fitted; changes of scene.yaml"], found),
-            ]
+                found.append([name, *fit_cells(row), *more, "; ".join(base)])
+            head = [*HEAD, "of the processor", "splat at rest", "fitted; changes of scene.yaml"]
+            lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
 
 
