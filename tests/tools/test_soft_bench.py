@@ -59,6 +59,7 @@ def test_the_motion_at_the_true_values_is_compared(folder):
 def test_the_tables_say_what_differs():
     row = {"mean_m": 0.0012, "largest_m": 0.0056, "swing": 1.021, "deflection": 0.985, "points": 1480}
     fit = {"speed_error": 0.02, "direction_error_deg": 0.4, "material.E_error": 0.03, "psnr_predicted_db": 27.0}
+    fit |= {"psnr_rest_db": 28.5, "processor_s": 60.0}
     record = HEAD | {
         "motion": {"`solver.dx` 0.03": row},
         "reference": {"8 cells": row},
@@ -68,5 +69,8 @@ def test_the_tables_say_what_differs():
     assert "| ours, `solver.dx` 0.03; 1,480 points | 1.20 mm | 5.6 mm | +2.1 % | -1.5 % |" in found
     assert "| Newton, 8 cells | 1.20 mm | 5.6 mm | +2.1 % | -1.5 % |" in found
     found = tables.soft([record])
-    assert "| two cameras | +2.00 % | 0.40° | +3.00 % | 27.0 dB | 100 s | 0.75 s; `solver.dx` 0.03 |" in found
+    assert (
+        "| two cameras | +2.00 % | 0.40° | +3.00 % | 27.0 dB | 100 s | 60 s | 28.5 dB | 0.75 s; `solver.dx` 0.03 |"
+        in found
+    )
     assert tables.soft([HEAD]) == tables.soft_motion([HEAD]) == ["Not measured yet."]

@@ -36,9 +36,13 @@ def soft(results: list[Row]) -> list[str]:
         if rows := result.get("fits", {}):
             found = []
             for name, row in rows.items():
-                known = "; ".join(f"`{key}` {value}" for key, value in row["known"].items())
-                found.append([name, *fit_cells(row), f"{row['until_s']:.3g} s" + (f"; {known}" if known else "")])
-            lines += ["", source(result), "", *grid([*HEAD, "fitted; changes of scene.yaml"], found)]
+                base = [f"{row['until_s']:.3g} s", *(f"`{key}` {value}" for key, value in row["known"].items())]
+                more = ["", ""]
+                if "refused" not in row:
+                    more = [f"{row['processor_s']:.0f} s", f"{row['psnr_rest_db']:.1f} dB"]
+                found.append([name, *fit_cells(row), *more, "; ".join(base)])
+            head = [*HEAD, "of the processor", "splat at rest", "fitted; changes of scene.yaml"]
+            lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
 
 
