@@ -103,6 +103,8 @@ def test_faults_of_the_model_are_shown_with_the_grid_that_has_them():
     }
     found = tables.bias([HEAD | {"bias": {"flag, solver.dx 0.04, scene.generator.init_args.spacing 0.01": row}}])
     assert "| flag, `dx 0.04`, `spacing 0.01` | 2.17 pixels | +0.63 % | -0.00° | +0.98 % | 1,800 |" in found
+    lost = tables.bias([HEAD | {"bias": {"flag, solver.dx 0.01": row | {"rms_px": 320.0}}}])
+    assert "| flag, `dx 0.01` | the simulation diverged |  |  |  | 1,800 |" in lost
     assert tables.bias([HEAD]) == ["Not measured yet."]
 
 

@@ -14,7 +14,8 @@ TWO, ONE = (0.05, 3.0, 0.10), (0.10, 6.0, 0.20)
 """Goals: error of the speed, angle between the winds [degrees], error of E."""
 ABLATIONS = ("tracks alone", "pixels alone", "without patches")
 """Rows that have no goal."""
-
+LOST = 100.0
+"""Distance [pixels] above which a simulation with the true values does not show the same motion at all."""
 
 HEAD = ["", "speed", "direction", "E", "predicted frames", "time"]
 SHARP = 28.0
@@ -74,6 +75,8 @@ def _options(name: str) -> str:
 
 
 def _moved(row: Row) -> list[str]:
+    if row["rms_px"] > LOST:
+        return ["the simulation diverged", "", "", ""]
     return [
         f"{row['rms_px']:.2f} pixels",
         f"{100 * row['speed_error']:+.2f} %",
