@@ -30,7 +30,7 @@ def test_the_cases_are_what_they_say(case):
 
 def test_rows_are_recorded_and_shown(monkeypatch):
     monkeypatch.setattr(contact, "collision", partial(contact.collision, points=225, frames=10))
-    options = argparse.Namespace(points="100", repeats=1, speeds="5", device="cpu")
+    options = argparse.Namespace(points="100", repeats=1, speeds="5", pile=0.0, device="cpu")
     result = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0, "rows": [], "collisions": []}
     saved = []
     contact.measure(options, result, lambda now: saved.append(json.dumps(now)))
@@ -42,6 +42,16 @@ def test_rows_are_recorded_and_shown(monkeypatch):
     assert len(result["rows"]) == len(contact.CASES)  # measured again, not twice
     assert tables.cost(result)[-1].startswith("| 98 |")
     assert "thicknesses" in tables.collisions(result)[-1]
+
+
+def test_a_pile_rests_for_a_second():
+    (row,) = contact.pile(1.0, CPU, layers=2, per_side=2)
+    assert row["kinetic"] < 1e-4
+    assert row["top"] == pytest.approx(1.0, abs=0.05)  # the ground lies half a thickness below the lower layer
+    shown = tables.pile({"device": "a CPU", "versions": {"torch": "2"}, "seed": 0, "pile": [row]})
+    assert shown[-1].startswith("| 1 | ")
+    assert shown[-1].endswith(" | +0.0e+00 | +0.0e+00 | +0.0000 | +0.00 | - |")
+    assert tables.pile({}) == ["Not recorded."]
 
 
 def test_crossings_are_counted():

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from bench.clock import spread, timed
+from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
@@ -125,11 +126,56 @@ def collision(speed: float, device: torch.device, points: int = 900, frames: int
     }
 
 
+def pile(seconds: float, device: torch.device, layers: int = 8, per_side: int = 5) -> list[Row]:
+    """Layers that lie on each other and on the ground, shifted by some millimetres: what moves, each second.
+
+    Energies are in units of the weight times a thickness, ``top`` is the height of the uppermost layer in thicknesses,
+    ``slid`` its mean place along x [m], and ``rounds`` the iterations of a substep, where the kernels count them.
+    """
+    spacing, thickness = 0.02, 0.01
+    axis = torch.arange(per_side, device=device, dtype=torch.float32) * spacing
+    low = [torch.tensor([0.003 * (k % 3), 0.002 * (k % 2), 0.2 * k], device=device) for k in range(layers)]
+    flat = torch.cartesian_prod(axis, axis, torch.zeros(1, device=device))
+    made = MaterialPoints.create(
+        torch.cat([flat + corner for corner in low]),
+        volume=spacing**2 * thickness,
+        density=100.0,
+        youngs_modulus=2e4,
+        poisson_ratio=0.3,
+    )
+    normal = torch.tensor([0.0, 0.0, 1.0], device=device).expand(made.count, 3)
+    ground = HalfSpaceObstacle([0.0, 0.0, -0.5 * thickness], [0.0, 0.0, 1.0])
+    solver = MPMSolver(dx=2.2 * spacing, gravity=(0.0, 0.0, -9.8), boundaries=[ground], stiffness_damping=1e-3)
+    state = solver.init_state(made, surface=Surface.of_points(made, normal, spacing, thickness, Contact()))
+    nodes = state.grid.node_positions(state.position)
+    layer = ((nodes[:, 2] + 0.1) / 0.2).floor().clamp(0, layers - 1)
+    moved = torch.zeros_like(nodes)
+    moved[:, 2] = layer * (thickness - 0.2)  # apart at rest, so that no layer is the neighbour of another one
+    state = solver.bound.read_particles(state, moved, torch.zeros_like(moved))  # type: ignore[attr-defined]
+    weight = float(solver.points.mass.sum()) * 9.8
+    rows: list[Row] = []
+    for second in range(round(seconds)):
+        fused = solver.fused()
+        before = 0 if fused is None else fused.touching.rounds  # type: ignore[attr-defined]
+        count = solver.substeps(state, 0.1) * 10
+        state = solver.rollout(state, 1.0 / count, count)
+        energy = {name: float(value) / (weight * thickness) for name, value in solver.energies(state).items()}
+        top = state.position[-(per_side**2) :].mean(0)
+        row = {"time": second + 1.0, **{name: energy[name] for name in ("kinetic", "elastic", "potential")}}
+        rows.append(row | {"top": float(top[2]) / thickness, "slid": float(top[0])})
+        if fused is not None:
+            rows[-1]["rounds"] = (fused.touching.rounds - before) / count  # type: ignore[attr-defined]
+    return rows
+
+
 def add_arguments(command: argparse.ArgumentParser) -> None:
     """Options of ``bench.py contact``."""
     command.add_argument("--points", help="separated by commas (default: 10000,100000 and, on a GPU, 1000000)")
     command.add_argument("--repeats", type=int, default=5, help="timed rollouts of each case (default: %(default)s)")
     command.add_argument("--speeds", default="2,50", help="of the collisions [m/s] (default: %(default)s)")
+    command.add_argument(
+        "--pile", type=float, default=0.0, help="seconds that eight layers rest (default: %(default)g)"
+    )
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
@@ -153,4 +199,9 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
             row = collision(speed, device)
         collisions[:] = [one for one in collisions if one["speed_m_s"] != speed] + [row]
         print(json.dumps(row), flush=True)
+        save(result)
+    if options.pile:
+        with torch.inference_mode():
+            result["pile"] = pile(options.pile, device)
+        print(json.dumps(result["pile"][-1]), flush=True)
         save(result)

@@ -11,16 +11,14 @@ import json
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import yaml
-from torch import Tensor
 
 from bench.record import ROOT
-from gaussian_swaying.fitting.evidence import Block, Evidence, TrackEvidence, compare, scales_of
+from gaussian_swaying.fitting.evidence import Evidence, TrackEvidence, scales_of
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.least_squares import normal_equations, sensitivities, step_from
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
@@ -34,32 +32,21 @@ ALONG = (20, 14)
 """Places on the cloth that are compared, along its width and height."""
 
 
-@dataclass
-class Sensitivity:
-    """Changes of the residuals with each unknown, and by how much of its range each was moved."""
-
-    changes: list[Tensor]
-    steps: Tensor
-
-
 def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["bias"]``: a row for each case and each ``--bias``; the first gives the sensitivities of all."""
+    """Fill ``result["bias"]``: a row for each case and each ``--bias``."""
     rows = result.setdefault("bias", {})
     for folder in folders:
-        known: Sensitivity | None = None
         for text in options.bias:
             begin = time.process_time()
             changed = {"aero.law": options.law, **json.loads(options.known), **json.loads(text)}
-            row, known = bias(folder, changed, options.until, options.device, known)
+            row = bias(folder, changed, options.until, options.device)
             key = f"{folder.name}, {', '.join(f'{name} {value}' for name, value in json.loads(text).items())}"
             rows[key] = row | {"known": changed, "processor_s": time.process_time() - begin}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
 
 
-def bias(
-    folder: Path, changed: Row, until: float | None, device: str, known: Sensitivity | None = None
-) -> tuple[Row, Sensitivity]:
+def bias(folder: Path, changed: Row, until: float | None, device: str) -> Row:
     """Where one step of Gauss and Newton leads from the truth.
 
     Args:
@@ -67,7 +54,6 @@ def bias(
         changed: Options of ``sim`` that replace those of the case.
         until: Compare the frames up to this time [s]; half of the video if it is None.
         device: ``cpu`` or ``cuda``.
-        known: Sensitivities from another grid; None to compute them, which takes 1 + 2U simulations in place of one.
     """
     truth = json.loads((folder / "truth.json").read_text())
     given = yaml.safe_load((folder / "fit.yaml").read_text())
@@ -80,14 +66,8 @@ def bias(
     evidence = _true_tracks(fit, folder)
     true = {"wind.speed": truth["speed"], "wind.azimuth": truth["azimuth"], "material.E": truth["E"]}
     place = torch.tensor([u.share(true[u.name]) for u in sought], dtype=torch.float64)
-    if known is None:
-        blocks, steps = sensitivities(fit.residuals(evidence, fit.fitted), place)
-        known = Sensitivity([b.values[1:] - b.values[:1] for b in blocks], steps)
-    else:
-        here = compare(fit.ensemble, evidence, [fit.values(place)], fit.fitted)
-        pairs = zip(here, known.changes, strict=True)
-        blocks = [Block(b.kind, torch.cat([b.values, b.values + change]), b.cluster) for b, change in pairs]
-    normal = normal_equations(blocks, scales_of(blocks, {"tracks": TrackEvidence.floor}), known.steps)
+    blocks, steps = sensitivities(fit.residuals(evidence, fit.fitted), place)
+    normal = normal_equations(blocks, scales_of(blocks, {"tracks": TrackEvidence.floor}), steps)
     found = fit.values(step_from(normal, place))
     return {
         "speed_error": found["wind.speed"] / truth["speed"] - 1,
@@ -96,7 +76,7 @@ def bias(
         "rms_px": float(torch.cat([b.values[0] for b in blocks]).square().sum(-1).mean().sqrt()),
         "points": fit.simulation.scene.points.count,
         "until_s": plan.until,
-    }, known
+    }
 
 
 def _true_tracks(fit: Fit, folder: Path) -> list[Evidence]:

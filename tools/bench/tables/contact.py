@@ -44,3 +44,26 @@ def collisions(result: Row) -> list[str]:
         for row in result["collisions"]
     ]
     return [source(result), "", *grid(head, lines)]
+
+
+@table(PAGE, "contact.pile", "contact_cuda")
+def pile(result: Row) -> list[str]:
+    """How a pile rests: its first second, and every tenth."""
+    rows = result.get("pile", [])
+    if not rows:
+        return ["Not recorded."]
+    first, lines = rows[0], []
+    for row in [first, *(row for row in rows if round(row["time"]) % 10 == 0)]:
+        lines.append(
+            [
+                f"{row['time']:.0f}",
+                f"{row['kinetic']:.1e}",
+                f"{row['elastic'] - first['elastic']:+.1e}",
+                f"{row['potential'] - first['potential']:+.1e}",
+                f"{row['top'] - first['top']:+.4f}",
+                f"{1e3 * (row['slid'] - first['slid']):+.2f}",
+                f"{row['rounds']:.1f}" if "rounds" in row else "-",
+            ]
+        )
+    head = ["time [s]", "motion", "bending", "height", "top layer [thicknesses]", "slid [mm]", "iterations"]
+    return [source(result), "", *grid(head, lines)]

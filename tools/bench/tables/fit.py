@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from bench.slots import table
 from bench.tables.markdown import grid, source, yes_no
+from gaussian_swaying.fitting.report import ASTRAY
 
 Row = dict[str, Any]
 
@@ -86,8 +88,9 @@ def _moved(row: Row) -> list[str]:
 
 
 def _named(name: str, row: Row) -> str:
-    """The name of a row, and that its fit has not settled."""
-    return f"{name} (not settled)" if row.get("not_settled") else name
+    """The name of a row, and whether its fit has not settled or does not follow the video."""
+    lost = row.get("psnr_rest_db", 0.0) - row.get("psnr_fitted_db", math.inf) > ASTRAY
+    return name + " (not settled)" * bool(row.get("not_settled")) + " (not followed)" * lost
 
 
 def _cells(row: Row) -> list[str]:
