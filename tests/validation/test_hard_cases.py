@@ -236,18 +236,23 @@ def test_an_inverted_body_turns_back(law):
     assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
 
 
-def test_a_deeply_inverted_body_does_not_gain_energy():
-    """`total`, neo-Hookean, det F = -0.6: what it passes within a frame is far stiffer than either end of it."""
+@pytest.mark.parametrize("seed", range(4))
+def test_a_deeply_inverted_body_does_not_gain_energy(seed):
+    """`total`, neo-Hookean, det F = -0.6, in frames that are short beside its motion.
+
+    The substep is chosen at the start of a frame. What the body passes on its way back is far stiffer than either end of
+    it, so with frames five times as long the energy of some seeds rises (docs/limits.md).
+    """
     position = _lattice(3, 3, 3)
     simulation = _simulation(
-        _points(position, law=NeoHookean()), formulation="total", damping=20.0, frame_dt=1e-3, cfl=0.1
+        _points(position, law=NeoHookean()), formulation="total", damping=20.0, frame_dt=2e-4, cfl=0.1
     )
     state = simulation.start()
     nodes = state.grid.node_positions(position)
-    noise = 5e-3 * torch.randn(nodes.shape, generator=torch.Generator().manual_seed(0))
+    noise = 5e-3 * torch.randn(nodes.shape, generator=torch.Generator().manual_seed(seed))
     moved = nodes @ torch.diag(torch.tensor([-1.6, 0.1, -0.1])) + noise
     state = simulation.solver.step(state.replace(node_displacement=moved), 1e-7)
-    _, log = _advance(simulation, 30, state)
+    _, log = _advance(simulation, 150, state)
     share = 0.1 / 0.47
     assert _rise(log) <= (1 + share) / (1 - share)
 
