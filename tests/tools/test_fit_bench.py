@@ -108,6 +108,10 @@ def test_faults_of_the_model_are_shown_with_the_grid_that_has_them():
     lost = tables.bias([HEAD | {"bias": {"flag, solver.dx 0.01": row | {"rms_px": 320.0}}}])
     assert "| flag, `dx 0.01` | the simulation diverged |  |  |  | 1,800 |" in lost
     assert tables.bias([HEAD]) == ["Not measured yet."]
+    name = fit_bias.name_of("flag", {"solver.dx": 0.01, "solver.boundaries": [{}]}, 1.0)
+    assert name == "flag, solver.dx 0.01, solver.boundaries, to 1 s"
+    told = tables.bias([HEAD | {"bias": {name: row}}])
+    assert any(line.startswith("| flag, `dx 0.01`, `boundaries`, `to 1 s` | 2.17") for line in told)
 
 
 def test_a_bias_is_the_step_that_undoes_the_difference(tmp_path):

@@ -240,8 +240,8 @@ def test_an_inverted_body_turns_back(law):
 def test_a_deeply_inverted_body_does_not_gain_energy(seed):
     """`total`, neo-Hookean, det F = -0.6, in frames that are short beside its motion.
 
-    The substep is chosen at the start of a frame. What the body passes on its way back is far stiffer than either end of
-    it, so with frames five times as long the energy of some seeds rises (docs/limits.md).
+    The substep is chosen at the start of a frame. What the body passes on its way back is far stiffer than either end,
+    so with frames five times as long the energy of some seeds rises (docs/limits.md).
     """
     position = _lattice(3, 3, 3)
     simulation = _simulation(

@@ -40,10 +40,16 @@ def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, s
             begin = time.process_time()
             changed = {"aero.law": options.law, **json.loads(options.known), **json.loads(text)}
             row = bias(folder, changed, options.until, options.device)
-            key = f"{folder.name}, {', '.join(f'{name} {value}' for name, value in json.loads(text).items())}"
+            key = name_of(folder.name, json.loads(text), options.until)
             rows[key] = row | {"known": changed, "processor_s": time.process_time() - begin}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
+
+
+def name_of(case: str, options: Row, until: float | None) -> str:
+    """The name of a row: the case, its options (of lists only which they are), and the time if it is given."""
+    told = [f"{key} {value}" if isinstance(value, (int, float, str)) else key for key, value in options.items()]
+    return ", ".join([case, *told, *([] if until is None else [f"to {until:g} s"])])
 
 
 def bias(folder: Path, changed: Row, until: float | None, device: str) -> Row:
