@@ -112,8 +112,8 @@ def case_of(name: str, cells: int | None = None, frames: int | None = None) -> F
     return replace(pattern, quality=least_quality(pattern))
 
 
-def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
-    """What ``truth.json`` says: the wind, the material, and what else a simulation needs to be comparable."""
+def shared_truth(pattern: Any, video: FitVideo) -> dict[str, Any]:
+    """What ``truth.json`` says of a flag (``FlagPattern``) and of a soft post (``SoftPattern``) alike."""
     x, y, _ = pattern.flow
     seconds = (pattern.frames - 1) / pattern.fps
     return {
@@ -122,26 +122,32 @@ def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
         "azimuth": math.degrees(math.atan2(y, x)),
         "elevation": 0.0,
         "E": pattern.youngs_modulus,
-        "nu": 1 / 3,
         "density": pattern.density,
-        "thickness": pattern.thickness,
-        "areal_density": pattern.density * pattern.thickness,
-        "membrane_stiffness": pattern.youngs_modulus * pattern.thickness,
-        "bending_stiffness": pattern.material().bending,
         "C_D": pattern.drag,
         "C_F": 0.0,
         "C_L": 0.0,
-        "law": "linear",
         "air_density": pattern.air_density,
         "damping": pattern.damping,
-        "stiffness_damping": SPRING_TIME,
         "gravity": [0.0, 0.0, -pattern.gravity],
-        "held": f"the {pattern.pinned} edge, a line of points that is free to turn",
         "fps": pattern.fps,
         "seconds": seconds,
         "fit_until": 0.5 * seconds,
         "units": "m, s, kg, degrees from +x towards +y",
         "video": asdict(video),
+    }
+
+
+def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
+    """What ``truth.json`` says: the wind, the material, and what else a simulation needs to be comparable."""
+    return shared_truth(pattern, video) | {
+        "nu": 1 / 3,
+        "thickness": pattern.thickness,
+        "areal_density": pattern.density * pattern.thickness,
+        "membrane_stiffness": pattern.youngs_modulus * pattern.thickness,
+        "bending_stiffness": pattern.material().bending,
+        "law": "linear",
+        "stiffness_damping": SPRING_TIME,
+        "held": f"the {pattern.pinned} edge, a line of points that is free to turn",
         "solver": "Blender's cloth; see docs/fit_data.md for what matches",
     }
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit_cases import START, FitVideo
+from fit_cases import START, FitVideo, shared_truth
 from flag_motion import check_settings
 from newton_soft import Air, Block, SoftRun, solve_block
 
@@ -288,29 +288,10 @@ def splat(pattern: SoftPattern, spacing: float = 0.004) -> GaussianCloud:
 
 def truth_fields(pattern: SoftPattern, video: FitVideo) -> dict[str, Any]:
     """What ``truth.json`` says: the wind, the material, and what else a simulation needs to be comparable."""
-    x, y, _ = pattern.flow
-    seconds = (pattern.frames - 1) / pattern.fps
-    return {
-        "flow": list(pattern.flow),
-        "speed": math.hypot(*pattern.flow),
-        "azimuth": math.degrees(math.atan2(y, x)),
-        "elevation": 0.0,
-        "E": pattern.youngs_modulus,
+    return shared_truth(pattern, video) | {
         "nu": pattern.poisson_ratio,
-        "density": pattern.density,
-        "C_D": pattern.drag,
-        "C_F": 0.0,
-        "C_L": 0.0,
         "law": "projected",
-        "air_density": pattern.air_density,
-        "damping": pattern.damping,
-        "gravity": [0.0, 0.0, -pattern.gravity],
         "held": f"the lowest {pattern.held} m",
-        "fps": pattern.fps,
-        "seconds": seconds,
-        "fit_until": 0.5 * seconds,
-        "units": "m, s, kg, degrees from +x towards +y",
-        "video": asdict(video),
         "solver": "Newton's soft body; see docs/fit_data.md for what matches",
     }
 

@@ -31,7 +31,7 @@ def own(results: list[Row]) -> list[str]:
     for result in results:
         if rows := result.get("own", {}):
             found = [
-                [_named(n, row), *_cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()
+                [_named(n, row), *cells(row), "" if n in ABLATIONS else _reached(row, OWN)] for n, row in rows.items()
             ]
             one = next(row for row in rows.values() if "points" in row)
             width, height = one["size"]
@@ -52,7 +52,7 @@ def blender(results: list[Row]) -> list[str]:
                 free = name.split(", ")[-1] in ABLATIONS
                 goal = _reached(row, ONE if "one camera" in name else TWO)
                 sharp = ["", ""] if "refused" in row else [_decibels(row.get("psnr_rest_db")), _sharp(row)]
-                found.append([_named(name, row), *_cells(row), *sharp, _base(row), "" if free else goal])
+                found.append([_named(name, row), *cells(row), *sharp, _base(row), "" if free else goal])
             head = [*HEAD, "splat at rest", "28 dB, or as at rest", "fitted; changes of scene.yaml", "goal reached"]
             lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
@@ -93,7 +93,8 @@ def _named(name: str, row: Row) -> str:
     return name + " (not settled)" * bool(row.get("not_settled")) + " (not followed)" * lost
 
 
-def _cells(row: Row) -> list[str]:
+def cells(row: Row) -> list[str]:
+    """What a fit found: errors of speed, direction and E, predicted frames, and the time it took."""
     if "refused" in row:
         return ["refused", "", "", "", ""]
     stiffness = row.get("material.E_error")

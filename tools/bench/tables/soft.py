@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bench.slots import table
-from bench.tables.fit import HEAD
-from bench.tables.fit import _cells as fit_cells
+from bench.tables.fit import HEAD, cells
 from bench.tables.markdown import grid, source
 
 Row = dict[str, Any]
@@ -19,9 +18,9 @@ def soft_motion(results: list[Row]) -> list[str]:
     for result in results:
         rows = []
         for name, row in result.get("motion", {}).items():
-            rows.append([f"ours, {name}; {row['points']:,} points", *_cells(row)])
+            rows.append([f"ours, {name}; {row['points']:,} points", *_moved(row)])
         for name, row in result.get("reference", {}).items():
-            rows.append([f"Newton, {name}", *_cells(row)])
+            rows.append([f"Newton, {name}", *_moved(row)])
         if rows:
             head = ["", "mean distance", "largest distance", "first swing", "deflection later"]
             lines += ["", source(result), "", *grid(head, rows)]
@@ -40,13 +39,13 @@ def soft(results: list[Row]) -> list[str]:
                 more = ["", ""]
                 if "refused" not in row:
                     more = [f"{row['processor_s']:.0f} s", f"{row['psnr_rest_db']:.1f} dB"]
-                found.append([name, *fit_cells(row), *more, "; ".join(base)])
+                found.append([name, *cells(row), *more, "; ".join(base)])
             head = [*HEAD, "of the processor", "splat at rest", "fitted; changes of scene.yaml"]
             lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
 
 
-def _cells(row: Row) -> list[str]:
+def _moved(row: Row) -> list[str]:
     distances = [f"{1e3 * row['mean_m']:.2f} mm", f"{1e3 * row['largest_m']:.1f} mm"]
     return [*distances, _share(row["swing"]), _share(row["deflection"])]
 
