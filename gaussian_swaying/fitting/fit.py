@@ -49,12 +49,14 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 PROGRESS, VALUES, RESULT, SCENE, PICTURES = "fit.json", "values.csv", "result.json", "scene.yaml", "pictures"
 OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
-HORIZONS = (0.5, 1.0)
-"""Shares of the fitted frames that the first stage takes, one after the other: chaos grows with time."""
-MATCHED = (0.5, 1.0, 1.0)
-"""The same for each time that Gaussians are matched again. Matches are exact enough to need it: in a flag that flaps, a
-hundredth of Young's modulus grows to pixels in two seconds, and over the whole of them places far from the lowest one
-are lowest among their neighbours."""
+HORIZONS = (0.25, 0.5)
+"""Shares of the fitted frames that the first stage takes, one after the other, and all frames if no matches follow.
+
+Chaos grows with time: in a flag that flaps, a hundredth of Young's modulus grows to pixels in two seconds, and over the
+whole of them places far from the lowest one are lowest among their neighbours. So the shortest time that tells the
+unknowns comes first, and what it finds must be exact before time is added."""
+MATCHED = (0.5, 0.5, 0.75, 1.0, 1.0)
+"""The same for each time that Gaussians are matched again."""
 SEARCHED = 0.5
 """Share of the fitted frames that the coarse search looks at."""
 NEAR = 0.1
@@ -188,10 +190,16 @@ class Fit:
     # ---- the steps
 
     def steps(self) -> list[tuple[str, float]]:
-        """Stage and horizon of every step: the first stage and matches at growing horizons, others at the full one."""
+        """Stage and horizon of every step: horizons grow up to the last matches, then all fitted frames are taken."""
         found: list[tuple[str, float]] = []
         for number, stage in enumerate(self.stages):
-            shares = MATCHED if stage == "matches" else (1.0,) if number else HORIZONS
+            later = "matches" in self.stages[number + 1 :]
+            if stage == "matches":
+                shares: tuple[float, ...] = MATCHED
+            elif number == 0:
+                shares = HORIZONS if later else (*HORIZONS, 1.0)
+            else:
+                shares = HORIZONS[-1:] if later else (1.0,)
             found += [(stage, share) for share in shares]
         return found
 

@@ -1,6 +1,8 @@
 """A fit says whether its values have settled."""
 
 import json
+from itertools import groupby
+from operator import itemgetter
 
 import pytest
 import torch
@@ -104,6 +106,25 @@ def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everyth
     assert end([("matches", 1.0)] * 3) != pytest.approx(0.7, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("stages", "steps"),
+    [
+        (["tracks"], "tracks 0.25 0.5 1"),
+        (["tracks", "matches"], "tracks 0.25 0.5 matches 0.5 0.5 0.75 1 1"),
+        (["tracks", "matches", "pixels"], "tracks 0.25 0.5 matches 0.5 0.5 0.75 1 1 pixels 1"),
+        (["tracks", "silhouettes", "matches"], "tracks 0.25 0.5 silhouettes 0.5 matches 0.5 0.5 0.75 1 1"),
+        (["tracks", "silhouettes", "pixels"], "tracks 0.25 0.5 1 silhouettes 1 pixels 1"),
+    ],
+)
+def test_no_stage_takes_more_time_than_is_exact_by_then(stages, steps):
+    fit = Fit.__new__(Fit)
+    fit.stages = stages
+    told = [
+        f"{stage} {' '.join(f'{share:g}' for _, share in own)}" for stage, own in groupby(fit.steps(), itemgetter(0))
+    ]
+    assert " ".join(told) == steps
+
+
 def test_a_camera_that_is_not_followed_is_named():
     picture = torch.zeros(3, 3, 3, dtype=torch.uint8)
     shown = [Shown("left", 24.8, 19.0, 40.7, picture, ("",)), Shown("right", 37.0, 36.0, 40.0, picture, ("",))]
@@ -117,7 +138,10 @@ def test_a_camera_that_is_not_followed_is_named():
 def test_a_whole_fit_tells_it_and_goes_on(own, tmp_path):
     """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
     pytest.importorskip("cv2", reason="needs the extra [fit]")
-    sought = [read_unknown("wind.speed", {"range": [2.0, 12.0], "start": 7.0})]
+    sought = [
+        read_unknown("wind.speed", {"range": [2.0, 12.0], "start": 11.0}),
+        read_unknown("material.E", {"range": [2e3, 5e4], "start": 4e4}),
+    ]
 
     def plan(iterations):
         base, videos = [str(own / "base.yaml")], [str(own / "video")]

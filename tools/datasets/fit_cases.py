@@ -162,11 +162,16 @@ def scene_settings(
         video: Its video.
         law: ``projected``, that of a plate, or ``linear``, that of the data.
         folder: Where the case is.
-        spacing: Distance between Gaussians [m].
+        spacing: Distance between Gaussians [m]. For a cloth that is held at its top it is made a little less, so that a
+            row of them lies on the held line: half a spacing further in turns the wind that is found by degrees.
     """
+    height = pattern.height
     edge: dict[str, Any] = {"min": [None, None, None], "max": [round(1.1 * spacing, 6), None, None]}
     if pattern.pinned == "top":
-        edge = {"min": [None, None, round(pattern.height - 1.1 * spacing, 6)], "max": [None, None, None]}
+        rows = round(height / spacing) + 1
+        spacing = height / (rows - 0.5)
+        edge = {"min": [None, None, round(height - 0.3 * spacing, 6)], "max": [None, None, None]}
+        height = rows * spacing
     held = {"class_path": "Box", "init_args": edge}
     return {
         "frames": pattern.frames,
@@ -177,7 +182,7 @@ def scene_settings(
                 "class_path": "FlagScene",
                 "init_args": {
                     "width": pattern.width,
-                    "height": pattern.height,
+                    "height": height,
                     "spacing": spacing,
                     "overlap": 0.4,
                     "ripple": pattern.ripple,
