@@ -14,9 +14,12 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.fitting.videos import Footage
+from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
 WINDOW = 15
@@ -24,6 +27,8 @@ WINDOW = 15
 LEVELS = 3
 BACK = 0.5
 """Largest distance between a point and the one found by following it back [pixels]."""
+_DRAWN = 1e-3
+"""Least sum of the weights of a Gaussian that a picture shows [pixels]."""
 QUALITY = 0.02
 """Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
 EDGE = 4.0
@@ -32,6 +37,9 @@ OPAQUE = 0.3
 """Least opacity of a Gaussian that is followed."""
 BEHIND = 0.03
 """How far behind the picture's depth a visible Gaussian may lie, as a share of the object's size."""
+THIN = 0.25
+"""Share of the Gaussians in sight that must lie inside the object, a window away from its border, to leave the others
+out. Of a thing as thin as a window all are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +79,13 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
     Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
     simulation must already be near, within a few tens of pixels.
 
-    A splat may be drawn a part of a pixel beside the object: its camera is not quite right, or overlapping Gaussians
-    show their print on the side of the nearest. The first frame is at rest, where simulation and video are alike, so
-    the median shift that is found there is taken off everywhere.
+    Of Gaussians that overlap, the nearest are drawn, so the print of a splat is seen beside their centres, by a part
+    of a pixel that depends on how the surface is turned (:func:`drawn_beside`). A video of the thing does not have
+    that, and one that was made with the splat has it, too. The first frame tells: it is at rest, and simulation and
+    video are alike. What is left there comes from a camera that is not quite right: its median is taken off everywhere.
+
+    Near the border of the object a window holds more border than print, and the border of a splat is not quite that
+    of the thing. Such Gaussians are left out.
 
     Args:
         simulation: The scene.
@@ -87,22 +99,70 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
     chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
     index = scene.moving[chosen.to(scene.moving.device)]
     position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
-    seen, shift = torch.zeros(count, len(chosen), dtype=torch.bool), torch.zeros(2, dtype=torch.float64)
+    seen = torch.zeros(count, len(chosen), dtype=torch.bool)
+    share, shift = 0.0, torch.zeros(2, dtype=torch.float64)
     for k, state in enumerate(states):
         camera = video.cameras[k].to(painter.device)
         with torch.no_grad():
             gaussians = painter.deformed(state)
             picture = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
         pixel, depth = project(gaussians.means[index], video.cameras[k])
-        there = _in_sight(pixel, depth, picture, BEHIND * scene.size)
+        there = _inside(pixel, picture, _in_sight(pixel, depth, picture, BEHIND * scene.size))
         shown = (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         pair = np.stack([shown, video.images[k].numpy()])
         found, good = follow(pair, pixel.numpy())
         position[k], seen[k] = torch.from_numpy(found[1]), torch.from_numpy(good[1]) & there
+        beside = drawn_beside(painter, gaussians, camera, pixel)
         if k == 0 and bool(seen[0].any()):
-            shift = (position[0] - pixel)[seen[0]].median(0).values
-        position[k] -= shift
+            share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
+        position[k] += share * beside - shift
     return Tracks(chosen, position, seen)
+
+
+def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
+    """How far from the centres of Gaussians a picture shows them, averaged over a window around each place.
+
+    Where a Gaussian is seen is the mean of all pixels by its weights in them: what alpha compositing leaves of it
+    behind those in front. The weights are derivatives of the picture by the colours.
+
+    Args:
+        painter: Draws the picture.
+        gaussians: All Gaussians of it, N.
+        camera: Its camera, on their device.
+        places: Where it is asked [pixels], shape (T, 2).
+
+    Returns:
+        Towards where the picture shows them [pixels], float64, shape (T, 2).
+    """
+    opacity, width, height = painter.scene.model.opacity().detach(), camera.width, camera.height
+
+    def drawn(colours: Tensor) -> Tensor:
+        return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
+
+    row, column = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    middle = torch.tensor([0.5 * width, 0.5 * height])
+    asked = torch.stack([torch.ones(height, width), column - middle[0], row - middle[1]], -1).to(opacity)
+    colours = torch.zeros(len(opacity), 3, device=opacity.device, requires_grad=True)
+    with torch.enable_grad():
+        (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
+    weight, centre = sums[:, :1], (project(gaussians.means, camera)[0] - middle).to(sums)
+    shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
+    with torch.no_grad():
+        field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
+    found = torch.nn.functional.avg_pool2d(field.permute(2, 0, 1)[None], WINDOW, 1, WINDOW // 2)[0]
+    column, row = _pixels(places, width, height)
+    return (found[:2] / found[2:].clamp(min=1e-6))[:, row, column].mT
+
+
+def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
+    """How much of the shift of a splat's print a video at rest lacks, from 0 to 1, and the median of what is left (2,).
+
+    Args:
+        off: How far from the centres of Gaussians the video was found to show them [pixels], shape (T, 2).
+        beside: From :func:`drawn_beside`, shape (T, 2).
+    """
+    share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
+    return share, (off + share * beside).median(0).values
 
 
 def follow(images: Any, start: Any) -> tuple[Any, Any]:
@@ -177,6 +237,21 @@ def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float
     return inside & (depth < expected[row, column] + behind)
 
 
+def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
+    """Which points of those that are ``there`` have a window without a border of the object; all if hardly any has."""
+    outside = (picture.alpha[..., 0] < 0.5).float().cpu()[None, None]
+    near = torch.nn.functional.max_pool2d(outside, WINDOW, 1, WINDOW // 2)[0, 0] > 0
+    column, row = _pixels(pixel, near.shape[1], near.shape[0])
+    inside = there & ~near[row, column]
+    return inside if int(inside.sum()) >= THIN * int(there.sum()) else there
+
+
+def _pixels(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Column and row of each place (T, 2), the nearest within the picture for those outside."""
+    column, row = places.long().unbind(-1)
+    return column.clamp(0, width - 1), row.clamp(0, height - 1)
+
+
 def _grey(images: Tensor) -> Any:
     weights = torch.tensor([0.299, 0.587, 0.114])
     return (images.float() @ weights).round().clamp(0, 255).to(torch.uint8).numpy()
@@ -192,4 +267,4 @@ def _opencv() -> Any:
     return cv2
 
 
-__all__ = ["Tracks", "follow", "match", "track"]
+__all__ = ["Tracks", "drawn_beside", "follow", "match", "track"]

@@ -5,11 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.fitting.evidence import TrackEvidence
-from gaussian_swaying.fitting.tracks import match, track
-from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track
+from gaussian_swaying.fitting.videos import Footage, read_videos
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.scenes.printed_cloth import printed_colours
+from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.simulation.simulation import Simulation
+
+from .conftest import base, cameras
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
 
@@ -74,3 +82,88 @@ def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
     for k in range(len(times)):  # the simulation is the truth
         off = evidence.residuals(simulation, [states[k]], k)[0][0].median(0).values
         assert off.tolist() == pytest.approx([0.0, 0.0], abs=0.05)
+
+
+def _printed(folder, spacing):
+    """Simulation of a printed flag, 0.4 m x 0.3 m."""
+    flag = {"width": 0.4, "height": 0.3, "spacing": spacing, "ripple": 0.0, "pattern": "printed", "overlap": 0.5}
+    scene = {"generator": {"class_path": "FlagScene", "init_args": flag}, "metres_per_unit": 1.0}
+    file = folder / f"{spacing}.yaml"
+    file.write_text(yaml.safe_dump(base(scene=scene)))
+    return Simulation.from_yaml(file, device="cpu")
+
+
+def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
+    """Against pictures of one Gaussian after the other: white, behind and in front of black ones."""
+    painter, camera = simulation.painter, cameras()["left"]
+    gaussians, opacity = painter.scene.rest(), painter.scene.model.opacity()
+    centres = project(gaussians.means, camera)[0]
+    rows, columns = torch.meshgrid(torch.arange(120) + 0.5, torch.arange(200) + 0.5, indexing="ij")
+    sums = torch.zeros(len(centres), 3)
+    for k in range(len(centres)):
+        colours = torch.zeros(len(centres), 3)
+        colours[k] = 1
+        white = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color[..., 0]
+        sums[k] = torch.stack([white.sum(), (white * columns).sum(), (white * rows).sum()])
+    shift = sums[:, 1:] / sums[:, :1] - centres
+    assert shift.norm(dim=-1).amax() > 1
+    field = torch.zeros(120, 200, 3)
+    for k in range(len(centres)):
+        colours = torch.zeros(len(centres), 3)
+        colours[k] = torch.cat([shift[k], torch.ones(1)])
+        field += painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
+    column, row = centres[20].long().tolist()
+    window = field[row - 7 : row + 8, column - 7 : column + 8].sum((0, 1))
+    found = drawn_beside(painter, gaussians, camera, centres[20:21])[0]
+    torch.testing.assert_close(found.float(), window[:2] / window[2], atol=1e-3, rtol=0)
+
+
+def _photographed(camera, finer=3):
+    """A picture of the printed sheet itself, by rays through its plane, uint8, (H, W, 3)."""
+    rows, columns = (torch.arange(n * finer).add(0.5).div(finer).double() for n in (camera.height, camera.width))
+    pixel = torch.cartesian_prod(rows, columns).flip(-1)
+    ray = torch.cat([pixel, torch.ones(len(pixel), 1)], 1) @ camera.intrinsics.double().inverse().T
+    ray = ray @ camera.world_to_camera[:3, :3].double()
+    eye = camera.position.double()
+    x, _, z = (eye - ray * (eye[1] / ray[:, 1:2])).unbind(-1)
+    on = (x > 0) & (x < 0.4) & (z > 0) & (z < 0.3)
+    colour = torch.where(on[:, None], printed_colours(x, z).double(), 0.0)
+    fine = colour.reshape(camera.height, finer, camera.width, finer, 3)
+    return (255 * fine.mean((1, 3))).round().to(torch.uint8)
+
+
+@pytest.mark.parametrize("real", [True, False])
+def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
+    """Cameras on both sides of a flag at rest, from which the print of its splat is shifted to opposite sides.
+
+    A video of the thing itself shows its print where it is; one that the splat made shows what the simulation shows.
+    """
+    simulation = _printed(tmp_path, 0.01)
+    painter, gaussians = simulation.painter, simulation.scene.rest()
+    views = [look_at_camera((0.2 + x, -0.5, 0.35), (0.2, 0.0, 0.15), (0, 0, 1), 45.0, 240, 180) for x in (-0.5, 0.5)]
+    drawn = [painter.draw(gaussians, painter.colors(gaussians, view), view).color.detach() for view in views]
+    own = [(255 * picture.clamp(0, 1)).round().to(torch.uint8) for picture in drawn]
+    images = [_photographed(view) for view in views] if real else own
+    rest = next(iter(Ensemble(simulation).run([{}], [0.0])))[0]
+    found = match(simulation, Footage("moved", (0.0, 0.1), tuple(views), torch.stack(images)), [rest, rest])
+    means = simulation.scene.model.means.detach()[simulation.scene.moving[found.index]]
+    for k, view in enumerate(views):
+        pixel = project(means, view)[0]
+        off = (found.position[k] - pixel)[found.seen[k]].median(0).values
+        beside = drawn_beside(painter, gaussians, view, pixel)[found.seen[k]].median(0).values
+        assert beside.norm() > 0.5
+        assert off.norm() < 0.1
+
+
+def test_windows_over_the_border_are_left_out_unless_the_thing_is_thin():
+    """Of a square of 60 pixels, and of a stripe of 8."""
+    places = torch.cartesian_prod(torch.arange(2.5, 100, 5), torch.arange(2.5, 100, 5)).double()
+    there = torch.ones(len(places), dtype=torch.bool)
+    for low, high, kept in ((20, 80, places >= 27.5), (46, 54, None)):
+        alpha = torch.zeros(100, 100, 1)
+        alpha[:, low:high] = 1
+        alpha[:20], alpha[80:] = 0, 0
+        picture = RenderOutput(torch.zeros(100, 100, 3), alpha, torch.ones(100, 100, 1))
+        on = (alpha[places[:, 1].long(), places[:, 0].long(), 0] > 0) & there
+        inside = _inside(places, picture, on)
+        assert torch.equal(inside, on if kept is None else (places > 27).all(-1) & (places < 73).all(-1))
