@@ -288,8 +288,9 @@ class Fit:
         normal = self._normal(place, evidence or self.evidence(steps[-1][0], course.place), self.fitted)
         found = directions(normal.matrix, self.plan.unknowns, place)
         course.seconds = time.monotonic() - clock
-        state = self._run(place[None], self.times)
-        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), (own[0] for own in state))
+        painter, states = self.simulation.painter, self._run(place[None], self.times)
+        moved = (painter.deformed(own[0]) for own in states)
+        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved)
         return Result(
             self.plan.unknowns,
             tuple(course.place),

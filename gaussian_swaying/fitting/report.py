@@ -15,7 +15,7 @@ from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.unknowns import POLAR, Unknown, flow_of
 from gaussian_swaying.fitting.videos import Footage
-from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.simulation.config import config_text, option, parse_text
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -141,28 +141,31 @@ class Result:
 
 
 def predictions(
-    simulation: Simulation, videos: Sequence[Footage], times: Sequence[float], fitted: int, states: Iterable[MPMState]
+    simulation: Simulation,
+    videos: Sequence[Footage],
+    times: Sequence[float],
+    fitted: int,
+    moved: Iterable[DeformedGaussians],
 ) -> list[Shown]:
-    """Compare a simulation with whole videos.
+    """Compare moving Gaussians with whole videos.
 
     Args:
-        simulation: Draws the states.
+        simulation: Draws the Gaussians.
         videos: The videos.
-        times: Times of the states [s].
+        times: Times of ``moved`` [s].
         fitted: How many of them were fitted.
-        states: The states.
+        moved: All Gaussians at each of the times.
     """
     chosen = {k for part in (range(1, fitted), range(fitted, len(times))) for k in _spread(part)}
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
     rows: list[list[tuple[str, Tensor]]] = [[] for _ in videos]
-    for k, (time, state) in enumerate(zip(times, states, strict=True)):
+    for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
         for number, video in enumerate(videos):
             frame = next((f for f, own in enumerate(video.times) if abs(own - time) < 2e-6), None)
             if frame is None:
                 continue
             painter = simulation.painter
             camera = video.cameras[frame].to(painter.device)
-            gaussians = painter.deformed(state)
             shown = painter.draw(gaussians, painter.colors(gaussians, camera), camera).color.clamp(0, 1).float().cpu()
             real = video.images[frame].float() / 255
             squares[number][k >= fitted].append(float((shown - real).square().mean()))

@@ -1,5 +1,6 @@
 """``bench.py fit``: errors against the truth, and tables that say what is reached and what is missed."""
 
+import argparse
 import json
 import math
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 import yaml
 from bench.cases import fit as case
-from bench.cases import fit_bias
+from bench.cases import fit_bias, fit_reference
 from bench.tables import fit as tables
 
 from gaussian_swaying.fitting.ensemble import Ensemble
@@ -116,6 +117,47 @@ def test_faults_of_the_model_are_shown_with_the_grid_that_has_them():
 
 def test_a_bias_is_the_step_that_undoes_the_difference(tmp_path):
     """The true motion is that of the base in another wind and of another stiffness: the step leads there."""
+    folder, simulation, truth = _case(tmp_path)
+    other = {"wind.speed": 5.05, "wind.azimuth": truth["azimuth"] + 0.5, "material.E": 9.9e3}
+    _write_cloth(folder / "cloth.npz", simulation, other)
+    row = fit_bias.bias(folder, {}, 4 / 24, "cpu")
+    assert row["speed_error"] == pytest.approx(0.01, abs=0.001)
+    assert row["azimuth_error_deg"] == pytest.approx(0.5, abs=0.05)
+    assert row["material.E_error"] == pytest.approx(-0.01, abs=0.001)
+    assert 0 < row["rms_px"] < 1
+    changed = fit_bias.bias(folder, {"solver.gravity": [0.0, 0.0, -5.0]}, 4 / 24, "cpu")
+    assert changed["rms_px"] > row["rms_px"]
+    _write_cloth(folder / "same.npz", simulation, {})
+    same = fit_bias.bias(folder, {}, 4 / 24, "cpu", "same.npz")
+    assert same["azimuth_error_deg"] == pytest.approx(0.0, abs=0.01)
+    assert fit_bias.name_of("flag", {}, None, "same.npz") == "flag, beside same.npz"
+
+
+def test_a_splat_that_moves_as_the_reference_shows_the_video(tmp_path):
+    """The video is that of the base: beside its own motion, that of another wind looks less like it."""
+    folder, simulation, truth = _case(tmp_path)
+    _write_cloth(folder / "cloth.npz", simulation, {})
+    (folder / "uncertainty").mkdir()
+    _write_cloth(folder / "uncertainty/coarser.npz", simulation, {"wind.azimuth": truth["azimuth"] + 15})
+    result, saved = {}, []
+    options = argparse.Namespace(device="cpu")
+    fit_reference.measure(options, [folder], result, lambda found: saved.append(len(found["reference"])))
+    own, coarser = result["reference"].values()
+    assert list(result["reference"]) == ["flag, cloth", "flag, uncertainty/coarser"]
+    assert saved == [1, 2]
+    assert own["psnr_predicted_db"] > 35
+    assert coarser["psnr_predicted_db"] < own["psnr_predicted_db"] - 3
+    lines = tables.reference([HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/steps_doubled": coarser}}])
+    assert any(line.startswith("| predicted frames | cloth | steps doubled |") for line in lines)
+    assert any(
+        line == f"| flag | {own['psnr_predicted_db']:.1f} dB | {coarser['psnr_predicted_db']:.1f} dB |"
+        for line in lines
+    )
+    assert tables.reference([HEAD]) == ["Not measured yet."]
+
+
+def _case(tmp_path):
+    """A folder as of make_fit_data.py, without the motion; its simulation and its truth."""
     folder = tmp_path / "flag"
     folder.mkdir()
     size = case.SIZES["cpu"] | {"frames": 5}
@@ -126,21 +168,14 @@ def test_a_bias_is_the_step_that_undoes_the_difference(tmp_path):
     write_video(simulation, folder, {name: painter.camera_at(0, name) for name in painter.cameras}, size["frames"], 0.0)
     unknowns = {"wind.speed": [3, 8], "wind.azimuth": [0, 60], "material.E": [5e3, 2e4]}
     (folder / "fit.yaml").write_text(yaml.safe_dump({"unknowns": {k: {"range": r} for k, r in unknowns.items()}}))
-    truth = {"speed": 5.0, "azimuth": math.degrees(math.atan2(3, 4)), "E": 1e4, "fit_until": 4 / 24}
+    truth = {"speed": 5.0, "azimuth": math.degrees(math.atan2(3, 4)), "E": 1e4, "fit_until": 2 / 24}
     (folder / "truth.json").write_text(json.dumps(truth))
-    other = {"wind.speed": 5.05, "wind.azimuth": truth["azimuth"] + 0.5, "material.E": 9.9e3}
-    _write_cloth(folder / "cloth.npz", simulation, other, [k / 24 for k in range(5)])
-    row = fit_bias.bias(folder, {}, None, "cpu")
-    assert row["speed_error"] == pytest.approx(0.01, abs=0.001)
-    assert row["azimuth_error_deg"] == pytest.approx(0.5, abs=0.05)
-    assert row["material.E_error"] == pytest.approx(-0.01, abs=0.001)
-    assert 0 < row["rms_px"] < 1
-    changed = fit_bias.bias(folder, {"solver.gravity": [0.0, 0.0, -5.0]}, None, "cpu")
-    assert changed["rms_px"] > row["rms_px"]
+    return folder, simulation, truth
 
 
-def _write_cloth(path, simulation, values, times):
-    """The motion of a simulation with other values, as cloth whose vertices are the Gaussians."""
+def _write_cloth(path, simulation, values):
+    """The motion of five frames of a simulation with other values, as cloth whose vertices are the Gaussians."""
+    times = [k / 24 for k in range(5)]
     scene = simulation.scene
     rest = scene.model.means.detach()[scene.moving]
     states = Ensemble(simulation).run([values], times)

@@ -85,7 +85,7 @@ def _flag(flow: tuple[float, float, float], material: str) -> FlagPattern:
         width=1.0,
         height=0.7,
         ripple=0.003,
-        cells=50,
+        cells=100,
         frames=97,
         fps=24,
     )

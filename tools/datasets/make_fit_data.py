@@ -64,6 +64,8 @@ from soft_case import (
 from gaussian_swaying._files import atomic, write_json, write_text
 from gaussian_swaying.gaussians.ply import write_ply
 
+FAR = 60.0
+"""Distance of the lamps, in longest sides of the body."""
 UNCERTAINTY = ("steps doubled", "coarser")
 """How else the motions are solved, see :func:`flag_difference.variants`."""
 
@@ -141,16 +143,19 @@ def make_pictures(filmed: Filmed, folder: Path, video: FitVideo) -> int:
 def _studio(
     faces: np.ndarray, uv: np.ndarray, texture: np.ndarray, center: np.ndarray, longest: float, video: FitVideo
 ) -> Studio:
-    """A body of a longest side, and a lamp on each side, so that both sides are lit alike."""
+    """A body of a longest side, and a lamp on each side, so that both sides are lit alike.
+
+    The lamps are far, so that the light is nearly parallel, as a shader's is.
+    """
     light = np.array(video.light) / np.linalg.norm(video.light)
-    lamps = np.stack([center + side * 6.0 * longest * light for side in (1, -1)])
+    lamps = np.stack([center + side * FAR * longest * light for side in (1, -1)])
     return Studio(
         faces,
         uv,
         texture,
         lamps,
         center,
-        0.5 * longest,
+        0.08 * FAR * longest,
         video.samples,
         transparent=True,
         threads=video.threads,

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from bench.cases import fit_bias
+from bench.cases import fit_bias, fit_reference
 from gaussian_swaying.fitting.fit import run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.unknowns import flow_of
@@ -64,6 +64,14 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help="no fit of --data: how far faults of the model move the values, with these options of sim, as JSON; "
         "repeatable",
     )
+    command.add_argument(
+        "--motion", default=fit_reference.OWN, help="the motion that --bias compares with, a file in the case's folder"
+    )
+    command.add_argument(
+        "--reference",
+        action="store_true",
+        help="no fit of --data: the frames that a splat predicts which moves as the reference, and as its variants",
+    )
     command.add_argument("--search", type=int, help="simulations of the coarse search")
     command.add_argument(
         "--until", type=float, help="fit the frames up to this time [s]; half of the video if left out"
@@ -71,9 +79,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["own"]``, ``result["blender"]`` or ``result["bias"]``, saving it after each row."""
+    """Fill ``own``, ``blender``, ``bias`` or ``reference`` of the result, saving it after each row."""
     if options.bias:
         fit_bias.measure(options, _cases(options), result, save)
+        return
+    if options.reference:
+        fit_reference.measure(options, _cases(options), result, save)
         return
     with tempfile.TemporaryDirectory() as scratch:
         if options.data is None:

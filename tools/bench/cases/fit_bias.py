@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 import torch
 import yaml
 
-from bench.record import ROOT
+from bench.cases.fit_reference import OWN, read_motion
 from gaussian_swaying.fitting.evidence import Evidence, TrackEvidence, scales_of
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.least_squares import normal_equations, sensitivities, step_from
@@ -39,20 +38,21 @@ def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, s
         for text in options.bias:
             begin = time.process_time()
             changed = {"aero.law": options.law, **json.loads(options.known), **json.loads(text)}
-            row = bias(folder, changed, options.until, options.device)
-            key = name_of(folder.name, json.loads(text), options.until)
+            row = bias(folder, changed, options.until, options.device, options.motion)
+            key = name_of(folder.name, json.loads(text), options.until, options.motion)
             rows[key] = row | {"known": changed, "processor_s": time.process_time() - begin}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
 
 
-def name_of(case: str, options: Row, until: float | None) -> str:
-    """The name of a row: the case, its options (of lists only which they are), and the time if it is given."""
+def name_of(case: str, options: Row, until: float | None, motion: str = OWN) -> str:
+    """The name of a row: the case, its options (of lists only which they are), and time and motion if given."""
     told = [f"{key} {value}" if isinstance(value, (int, float, str)) else key for key, value in options.items()]
-    return ", ".join([case, *told, *([] if until is None else [f"to {until:g} s"])])
+    told += [] if until is None else [f"to {until:g} s"]
+    return ", ".join([case, *told, *([] if motion == OWN else [f"beside {motion}"])])
 
 
-def bias(folder: Path, changed: Row, until: float | None, device: str) -> Row:
+def bias(folder: Path, changed: Row, until: float | None, device: str, motion: str = OWN) -> Row:
     """Where one step of Gauss and Newton leads from the truth.
 
     Args:
@@ -60,6 +60,7 @@ def bias(folder: Path, changed: Row, until: float | None, device: str) -> Row:
         changed: Options of ``sim`` that replace those of the case.
         until: Compare the frames up to this time [s]; half of the video if it is None.
         device: ``cpu`` or ``cuda``.
+        motion: The motion to compare with, a file in the folder.
     """
     truth = json.loads((folder / "truth.json").read_text())
     given = yaml.safe_load((folder / "fit.yaml").read_text())
@@ -69,7 +70,7 @@ def bias(folder: Path, changed: Row, until: float | None, device: str) -> Row:
     settings = parse_base(plan, parser)
     settings.device, settings.camera, settings.cameras = device, None, None
     fit = Fit(Simulation.from_settings(parser, settings), read_videos(str(folder)), plan)
-    evidence = _true_tracks(fit, folder)
+    evidence = _true_tracks(fit, folder / motion)
     true = {"wind.speed": truth["speed"], "wind.azimuth": truth["azimuth"], "material.E": truth["E"]}
     place = torch.tensor([u.share(true[u.name]) for u in sought], dtype=torch.float64)
     blocks, steps = sensitivities(fit.residuals(evidence, fit.fitted), place)
@@ -85,12 +86,9 @@ def bias(folder: Path, changed: Row, until: float | None, device: str) -> Row:
     }
 
 
-def _true_tracks(fit: Fit, folder: Path) -> list[Evidence]:
+def _true_tracks(fit: Fit, motion: Path) -> list[Evidence]:
     """Where the cameras would see places on the true cloth, hidden ones too."""
-    sys.path.append(str(ROOT / "tools" / "datasets"))
-    from flag_motion import read_cloth
-
-    cloth, scene = read_cloth(folder / "cloth.npz"), fit.simulation.scene
+    cloth, scene = read_motion(motion), fit.simulation.scene
     rest = scene.model.means.detach()[scene.moving].cpu()
     low, high = rest.amin(0), rest.amax(0)
     flat = ((rest - low) / (high - low).clamp(min=1e-9))[:, [0, 2]]

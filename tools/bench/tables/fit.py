@@ -70,6 +70,23 @@ def bias(results: list[Row]) -> list[str]:
     return lines[1:] or ["Not measured yet."]
 
 
+@table("fit.md", "fit.reference", "fit_*", together=True)
+def reference(results: list[Row]) -> list[str]:
+    """What a splat predicts that moves as the reference, and as the reference solved otherwise, on each device."""
+    lines: list[str] = []
+    for result in results:
+        if rows := result.get("reference", {}):
+            cases = list(dict.fromkeys(name.split(", ")[0] for name in rows))
+            motions = list(dict.fromkeys(name.split(", ")[1] for name in rows))
+            found = [
+                [case, *(_decibels(rows.get(f"{case}, {m}", {}).get("psnr_predicted_db")) for m in motions)]
+                for case in cases
+            ]
+            head = ["predicted frames", *(m.split("/")[-1].replace("_", " ") for m in motions)]
+            lines += ["", source(result), "", *grid(head, found)]
+    return lines[1:] or ["Not measured yet."]
+
+
 def _options(name: str) -> str:
     """The case, and its options by their last word."""
     case, *options = name.split(", ")

@@ -1,0 +1,92 @@
+"""``bench.py fit --reference``: how sharp the frames are that a splat predicts which moves as the reference.
+
+The splat is not simulated: it takes the true motion of the cloth, or that of the same cloth solved otherwise, from the
+folder ``uncertainty`` of a case. The first says what the splat can show at best, the others how far the reference is
+from itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.record import ROOT
+from gaussian_swaying.fitting.plan import Plan, parse_base
+from gaussian_swaying.fitting.report import predictions
+from gaussian_swaying.fitting.videos import frame_times, read_videos
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.simulation.simulation import Simulation
+
+Row = dict[str, Any]
+OWN = "cloth.npz"
+"""The motion that a case shows."""
+BESIDE = 0.01
+"""Distance on the cloth over which its tangents are taken [m]."""
+
+
+def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, save: Callable[[Row], None]) -> None:
+    """Fill ``result["reference"]``: a row for each case and motion."""
+    rows = result.setdefault("reference", {})
+    for folder in folders:
+        truth = json.loads((folder / "truth.json").read_text())
+        simulation = _simulation(folder, options.device)
+        for path in [folder / OWN, *sorted((folder / "uncertainty").glob("*.npz"))]:
+            begin, videos = time.process_time(), read_videos(str(folder))
+            times = frame_times(videos)
+            fitted = sum(moment <= truth["fit_until"] + 1e-6 for moment in times)
+            shown = predictions(simulation, videos, times, fitted, moved(simulation, path))
+            name = f"{folder.name}, {path.relative_to(folder).with_suffix('')}"
+            rows[name] = {
+                "psnr_fitted_db": min(one.fitted for one in shown),
+                "psnr_predicted_db": min(one.predicted for one in shown),
+                "processor_s": time.process_time() - begin,
+            }
+            print(f"{name}: {rows[name]}", flush=True)
+            save(result)
+
+
+def moved(simulation: Simulation, path: Path) -> Iterator[DeformedGaussians]:
+    """The Gaussians of a flat flag, moved as a cloth, in each of its frames."""
+    model, cloth = simulation.scene.model, read_motion(path)
+    rest = model.means.detach().double().cpu()
+    size = torch.tensor([cloth.settings["width"], cloth.settings["height"]], dtype=torch.float64)
+    places = rest[:, [0, 2]] / size
+
+    def sampled(shift: tuple[float, float]) -> Tensor:
+        return torch.from_numpy(cloth.sample((places + torch.tensor(shift) / size).numpy())).double()
+
+    position = sampled((0.0, 0.0))
+    along = (sampled((BESIDE, 0.0)) - sampled((-BESIDE, 0.0))) / (2 * BESIDE)
+    upward = (sampled((0.0, BESIDE)) - sampled((0.0, -BESIDE))) / (2 * BESIDE)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(along, upward), dim=-1)
+    axes = torch.stack([along, normal, upward], -1)
+    for frame in range(len(position)):
+        gradient = axes[frame] @ torch.linalg.inv(axes[0])
+        place = rest + position[frame] - position[0]
+        yield model.deformed(place.to(model.means), gradient.to(model.means))
+
+
+def read_motion(path: Path) -> Any:
+    """A motion of ``make_fit_data.py``, see ``flag_motion.Cloth``."""
+    sys.path.append(str(ROOT / "tools" / "datasets"))
+    from flag_motion import read_cloth
+
+    return read_cloth(path)
+
+
+def _simulation(folder: Path, device: str) -> Simulation:
+    parser = Simulation.parser()
+    settings = parse_base(Plan([str(folder / "scene.yaml")], [str(folder)], []), parser)
+    settings.device, settings.camera, settings.cameras = device, None, None
+    return Simulation.from_settings(parser, settings)
+
+
+__all__ = ["OWN", "measure", "moved", "read_motion"]
