@@ -149,9 +149,9 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     shift = torch.where(weight > _DRAWN, sums[:, 1:] / weight - centre, 0.0)
     with torch.no_grad():
         field = drawn(torch.cat([shift, (weight > _DRAWN).to(shift)], 1)).cpu().double()
-    found = torch.nn.functional.avg_pool2d(field.permute(2, 0, 1)[None], WINDOW, 1, WINDOW // 2)[0]
-    column, row = _pixels(places, width, height)
-    return (found[:2] / found[2:].clamp(min=1e-6))[:, row, column].mT
+    column, row = _windows(places, width, height)
+    found = field[row, column].mean(1)
+    return found[:, :2] / found[:, 2:].clamp(min=1e-6)
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
@@ -239,16 +239,17 @@ def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float
 
 def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
     """Which points of those that are ``there`` have a window without a border of the object; all if hardly any has."""
-    outside = (picture.alpha[..., 0] < 0.5).float().cpu()[None, None]
-    near = torch.nn.functional.max_pool2d(outside, WINDOW, 1, WINDOW // 2)[0, 0] > 0
-    column, row = _pixels(pixel, near.shape[1], near.shape[0])
-    inside = there & ~near[row, column]
+    alpha = picture.alpha[..., 0].cpu()
+    column, row = _windows(pixel, alpha.shape[1], alpha.shape[0])
+    inside = there & (alpha[row, column] >= 0.5).all(-1)
     return inside if int(inside.sum()) >= THIN * int(there.sum()) else there
 
 
-def _pixels(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Column and row of each place (T, 2), the nearest within the picture for those outside."""
-    column, row = places.long().unbind(-1)
+def _windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Columns and rows of the pixels in the window around each place (T, 2), shape (T, W²); none beyond the picture."""
+    reach = torch.arange(WINDOW) - WINDOW // 2
+    beside = torch.cartesian_prod(reach, reach)
+    column, row = (places.long()[:, None] + beside).unbind(-1)
     return column.clamp(0, width - 1), row.clamp(0, height - 1)
 
 
