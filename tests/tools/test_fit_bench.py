@@ -57,7 +57,7 @@ def test_missed_goals_are_said_to_be_missed():
             HEAD
             | {
                 "blender": {
-                    "flag, two cameras": ROW | {"speed_error": 0.07, "known": {"solver.dx": 0.06}},
+                    "flag, two cameras": ROW | {"speed_error": 0.07, "known": {"solver.dx": 0.06}, "cells": 50},
                     "flag, one camera": ROW | {"speed_error": 0.07},
                     "curtain, two cameras": {"refused": "The video cannot tell."},
                 }
@@ -69,7 +69,7 @@ def test_missed_goals_are_said_to_be_missed():
         "yes |",
         "no |",
     ]
-    assert any("| 0.75 s; `solver.dx` 0.06 | no |" in line for line in found)
+    assert any("| 0.75 s; 50 cells; `solver.dx` 0.06 | no |" in line for line in found)
     assert tables.blender([HEAD]) == ["Not measured yet."]
 
 

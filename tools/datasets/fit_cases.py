@@ -147,6 +147,7 @@ def truth_fields(pattern: FlagPattern, video: FitVideo) -> dict[str, Any]:
         "bending_stiffness": pattern.material().bending,
         "law": "linear",
         "stiffness_damping": SPRING_TIME,
+        "cells": pattern.cells,
         "held": f"the {pattern.pinned} edge, a line of points that is free to turn",
         "solver": "Blender's cloth; see docs/fit_data.md for what matches",
     }

@@ -164,7 +164,7 @@ def _blender(options: argparse.Namespace, result: Row, save: Callable[[Row], Non
                 continue
             key = f"{folder.name}, {name}"
             found = fit_row(replace(plan, **change), scratch / key, options.device, wanted)
-            rows[key] = found | {"known": known, "until_s": plan.until}
+            rows[key] = found | {"known": known, "until_s": plan.until, "cells": truth.get("cells")}
             print(f"{key}: {rows[key]}", flush=True)
             save(result)
 

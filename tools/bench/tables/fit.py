@@ -53,7 +53,13 @@ def blender(results: list[Row]) -> list[str]:
                 goal = _reached(row, ONE if "one camera" in name else TWO)
                 sharp = ["", ""] if "refused" in row else [_decibels(row.get("psnr_rest_db")), _sharp(row)]
                 found.append([_named(name, row), *cells(row), *sharp, _base(row), "" if free else goal])
-            head = [*HEAD, "splat at rest", "28 dB, or as at rest", "fitted; changes of scene.yaml", "goal reached"]
+            head = [
+                *HEAD,
+                "splat at rest",
+                "28 dB, or as at rest",
+                "fitted; mesh; changes of scene.yaml",
+                "goal reached",
+            ]
             lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
 
@@ -134,9 +140,10 @@ def _sharp(row: Row) -> str:
 
 
 def _base(row: Row) -> str:
-    """How much of the video was fitted, and what was changed in the configuration of the case."""
+    """How much of the video was fitted, the mesh of the reference, and what was changed in the case's configuration."""
+    cells = f"; {row['cells']} cells" if row.get("cells") else ""
     known = ", ".join(f"`{name}` {value}" for name, value in row.get("known", {}).items())
-    return (f"{row['until_s']:.3g} s" if "until_s" in row else "") + (f"; {known}" if known else "")
+    return (f"{row['until_s']:.3g} s" if "until_s" in row else "") + cells + (f"; {known}" if known else "")
 
 
 def _reached(row: Row, goal: tuple[float, float, float]) -> str:
