@@ -140,13 +140,21 @@ def test_a_splat_that_moves_as_the_reference_shows_the_video(tmp_path):
     (folder / "uncertainty").mkdir()
     _write_cloth(folder / "uncertainty/coarser.npz", simulation, {"wind.azimuth": truth["azimuth"] + 15})
     result, saved = {}, []
-    options = argparse.Namespace(device="cpu")
+    options = argparse.Namespace(device="cpu", law="paper", known="{}")
     fit_reference.measure(options, [folder], result, lambda found: saved.append(len(found["reference"])))
-    own, coarser = result["reference"].values()
-    assert list(result["reference"]) == ["flag, cloth", "flag, uncertainty/coarser"]
-    assert saved == [1, 2]
+    assert list(result["reference"]) == [
+        "flag, cloth",
+        "flag, uncertainty/coarser",
+        "flag, simulated as in `scene.yaml`",
+    ]
+    assert saved == [1, 2, 3]
+    own, coarser, simulated = result["reference"].values()
     assert own["psnr_predicted_db"] > 35
+    assert simulated["psnr_predicted_db"] > own["psnr_predicted_db"]
     assert coarser["psnr_predicted_db"] < own["psnr_predicted_db"] - 3
+    options.known = '{"solver.dx": 0.12}'
+    fit_reference.measure(options, [folder], result, lambda found: None)
+    assert list(result["reference"])[3:] == ["flag, simulated `dx` 0.12"]
     lines = tables.reference([HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/steps_doubled": coarser}}])
     assert any(line.startswith("| predicted frames | cloth | steps doubled |") for line in lines)
     assert any(

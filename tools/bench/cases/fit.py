@@ -70,7 +70,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--reference",
         action="store_true",
-        help="no fit of --data: the frames that a splat predicts which moves as the reference, and as its variants",
+        help="no fit of --data: the frames that a splat predicts which moves as the reference, as its variants, and "
+        "simulated with the true values",
     )
     command.add_argument("--search", type=int, help="simulations of the coarse search")
     command.add_argument(

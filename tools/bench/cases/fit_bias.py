@@ -16,7 +16,7 @@ from typing import Any
 import torch
 import yaml
 
-from bench.cases.fit_reference import OWN, read_motion
+from bench.cases.fit_reference import OWN, read_motion, true_values
 from gaussian_swaying.fitting.evidence import Evidence, TrackEvidence, scales_of
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.least_squares import normal_equations, sensitivities, step_from
@@ -71,7 +71,7 @@ def bias(folder: Path, changed: Row, until: float | None, device: str, motion: s
     settings.device, settings.camera, settings.cameras = device, None, None
     fit = Fit(Simulation.from_settings(parser, settings), read_videos(str(folder)), plan)
     evidence = _true_tracks(fit, folder / motion)
-    true = {"wind.speed": truth["speed"], "wind.azimuth": truth["azimuth"], "material.E": truth["E"]}
+    true = true_values(truth)
     place = torch.tensor([u.share(true[u.name]) for u in sought], dtype=torch.float64)
     blocks, steps = sensitivities(fit.residuals(evidence, fit.fitted), place)
     normal = normal_equations(blocks, scales_of(blocks, {"tracks": TrackEvidence.floor}), steps)

@@ -1,8 +1,8 @@
-"""``bench.py fit --reference``: how sharp the frames are that a splat predicts which moves as the reference.
+"""``bench.py fit --reference``: how sharp the frames are that a splat predicts without a fit.
 
-The splat is not simulated: it takes the true motion of the cloth, or that of the same cloth solved otherwise, from the
-folder ``uncertainty`` of a case. The first says what the splat can show at best, the others how far the reference is
-from itself.
+It takes the true motion of the cloth, or that of the same cloth solved otherwise, from the folder ``uncertainty`` of a
+case. The first says what the splat can show at best, the others how far the reference is from itself. And it is
+simulated with the true values, which says what the model can predict at best.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from bench.record import ROOT
+from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.fitting.plan import Plan, parse_base
 from gaussian_swaying.fitting.report import predictions
 from gaussian_swaying.fitting.videos import frame_times, read_videos
@@ -33,24 +34,37 @@ BESIDE = 0.01
 
 
 def measure(options: argparse.Namespace, folders: Sequence[Path], result: Row, save: Callable[[Row], None]) -> None:
-    """Fill ``result["reference"]``: a row for each case and motion."""
-    rows = result.setdefault("reference", {})
+    """Fill ``result["reference"]``: a row for each case and motion, and for the options of ``known``."""
+    rows, known = result.setdefault("reference", {}), json.loads(options.known)
     for folder in folders:
-        truth = json.loads((folder / "truth.json").read_text())
-        simulation = _simulation(folder, options.device)
-        for path in [folder / OWN, *sorted((folder / "uncertainty").glob("*.npz"))]:
-            begin, videos = time.process_time(), read_videos(str(folder))
-            times = frame_times(videos)
-            fitted = sum(moment <= truth["fit_until"] + 1e-6 for moment in times)
-            shown = predictions(simulation, videos, times, fitted, moved(simulation, path))
-            name = f"{folder.name}, {path.relative_to(folder).with_suffix('')}"
-            rows[name] = {
+        truth, videos = json.loads((folder / "truth.json").read_text()), read_videos(str(folder))
+        simulation, times = _simulation(folder, {"aero.law": options.law, **known}, options.device), frame_times(videos)
+        fitted = sum(moment <= truth["fit_until"] + 1e-6 for moment in times)
+        files = [] if known else [folder / OWN, *sorted((folder / "uncertainty").glob("*.npz"))]
+        motions = {str(path.relative_to(folder).with_suffix("")): moved(simulation, path) for path in files}
+        ours = ", ".join(f"`{name.split('.')[-1]}` {value}" for name, value in known.items()) or "as in `scene.yaml`"
+        motions[f"simulated {ours}"] = simulated(simulation, truth, times)
+        for name, motion in motions.items():
+            begin = time.process_time()
+            shown = predictions(simulation, videos, times, fitted, motion)
+            rows[f"{folder.name}, {name}"] = {
                 "psnr_fitted_db": min(one.fitted for one in shown),
                 "psnr_predicted_db": min(one.predicted for one in shown),
                 "processor_s": time.process_time() - begin,
             }
-            print(f"{name}: {rows[name]}", flush=True)
+            print(f"{folder.name}, {name}: {rows[f'{folder.name}, {name}']}", flush=True)
             save(result)
+
+
+def simulated(simulation: Simulation, truth: Row, times: Sequence[float]) -> Iterator[DeformedGaussians]:
+    """The Gaussians of a simulation with the true values, at each time."""
+    for (state,) in Ensemble(simulation).run([true_values(truth)], times, careful=False):
+        yield simulation.painter.deformed(state)
+
+
+def true_values(truth: Row) -> dict[str, float]:
+    """What is sought, as ``truth.json`` has it."""
+    return {"wind.speed": truth["speed"], "wind.azimuth": truth["azimuth"], "material.E": truth["E"]}
 
 
 def moved(simulation: Simulation, path: Path) -> Iterator[DeformedGaussians]:
@@ -82,11 +96,11 @@ def read_motion(path: Path) -> Any:
     return read_cloth(path)
 
 
-def _simulation(folder: Path, device: str) -> Simulation:
+def _simulation(folder: Path, known: Row, device: str) -> Simulation:
     parser = Simulation.parser()
-    settings = parse_base(Plan([str(folder / "scene.yaml")], [str(folder)], []), parser)
+    settings = parse_base(Plan([str(folder / "scene.yaml")], [str(folder)], [], known=known), parser)
     settings.device, settings.camera, settings.cameras = device, None, None
     return Simulation.from_settings(parser, settings)
 
 
-__all__ = ["OWN", "measure", "moved", "read_motion"]
+__all__ = ["OWN", "measure", "moved", "read_motion", "simulated", "true_values"]

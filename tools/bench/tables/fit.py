@@ -78,12 +78,11 @@ def bias(results: list[Row]) -> list[str]:
 
 @table("fit.md", "fit.reference", "fit_*", together=True)
 def reference(results: list[Row]) -> list[str]:
-    """What a splat predicts that moves as the reference, and as the reference solved otherwise, on each device."""
+    """What a splat predicts that is not fitted: moved as the reference, or simulated with the true values."""
     lines: list[str] = []
     for result in results:
         if rows := result.get("reference", {}):
-            cases = list(dict.fromkeys(name.split(", ")[0] for name in rows))
-            motions = list(dict.fromkeys(name.split(", ")[1] for name in rows))
+            cases, motions = (list(dict.fromkeys(n.split(", ", 1)[k] for n in sorted(rows))) for k in (0, 1))
             found = [
                 [case, *(_decibels(rows.get(f"{case}, {m}", {}).get("psnr_predicted_db")) for m in motions)]
                 for case in cases
