@@ -155,8 +155,8 @@ def test_a_splat_that_moves_as_the_reference_shows_the_video(tmp_path):
     options.known = '{"solver.dx": 0.12}'
     fit_reference.measure(options, [folder], result, lambda found: None)
     assert list(result["reference"])[3:] == ["flag, simulated `dx` 0.12"]
-    lines = tables.reference([HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/steps_doubled": coarser}}])
-    assert any(line.startswith("| predicted frames | cloth | steps doubled |") for line in lines)
+    lines = tables.reference([HEAD | {"reference": {"flag, cloth": own, "flag, uncertainty/coarser": coarser}}])
+    assert any(line.startswith("| predicted frames | cloth | coarser |") for line in lines)
     assert any(
         line == f"| flag | {own['psnr_predicted_db']:.1f} dB | {coarser['psnr_predicted_db']:.1f} dB |"
         for line in lines

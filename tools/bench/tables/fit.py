@@ -87,7 +87,7 @@ def reference(results: list[Row]) -> list[str]:
                 [case, *(_decibels(rows.get(f"{case}, {m}", {}).get("psnr_predicted_db")) for m in motions)]
                 for case in cases
             ]
-            head = ["predicted frames", *(m.split("/")[-1].replace("_", " ") for m in motions)]
+            head = ["predicted frames", *(m.removeprefix("uncertainty/") for m in motions)]
             lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
 
