@@ -314,6 +314,22 @@ def test_sampling_is_exact_on_every_mesh(reference, flag_difference, flag_motion
     assert found["corresponding"] < 1e-6
 
 
+def test_motions_on_two_meshes_lead_to_what_they_converge_to(reference, flag_motion, tmp_path):
+    """Errors that fall as the square of a cell are gone; all else is that of the finer motion."""
+    pattern = replace(reference.PATTERNS[2], frames=2)
+    for cells in (15, 20):
+        motion = _motion(
+            flag_motion, replace(pattern, cells=cells), lambda rest, frame, n=cells: rest * (1 + 3 * frame / n**2)
+        )
+        arrays = vars(motion) | {"settings": json.dumps(motion.settings | {"cells": cells}), "hash": str(cells)}
+        np.savez(tmp_path / f"{cells}.npz", **arrays)
+    flag_motion.extrapolate(tmp_path / "20.npz", tmp_path / "15.npz", tmp_path / "found.npz")
+    fine, found = (flag_motion.read_cloth(tmp_path / name) for name in ("20.npz", "found.npz"))
+    assert np.abs(fine.positions[1] - fine.positions[0]).max() > 0.005
+    np.testing.assert_allclose(found.positions[1], found.positions[0], atol=1e-6)
+    assert found.settings == fine.settings
+
+
 def test_chamfer_distance_of_shifted_lattices(flag_difference):
     """Across the sheet by d it is d; along it by less than half the spacing too; order does not matter."""
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(7.0), [0.0], indexing="ij"), -1).reshape(-1, 3)

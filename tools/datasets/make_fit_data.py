@@ -44,7 +44,7 @@ from fit_video import (
     ring_views,
     video_fields,
 )
-from flag_motion import read_cloth, settings_hash, solve_pattern
+from flag_motion import extrapolate, read_cloth, settings_hash, solve_pattern
 from flag_pictures import draw_texture
 from flag_reference import FlagPattern
 from make_flag_dataset import claim, make_uncertainty, missing_pictures
@@ -255,6 +255,8 @@ def _do_cloth(name: str, options: argparse.Namespace) -> None:
         found = make_uncertainty(pattern, options.out / name, list(UNCERTAINTY), print, every=1)
         for variant, row in found["variants"].items():
             print(f"{name}: {variant}: {100 * row['corresponding']:.2f} % of the longer side", flush=True)
+        other = options.out / name / "uncertainty"
+        extrapolate(options.out / name / "cloth.npz", other / "coarser.npz", other / "extrapolated.npz")
     else:
         make_case(name, pattern, options.out / name, video, options.law)
 
