@@ -193,13 +193,13 @@ class Fit:
         """Stage and horizon of every step: horizons grow up to the last matches, then all fitted frames are taken."""
         found: list[tuple[str, float]] = []
         for number, stage in enumerate(self.stages):
-            later = "matches" in self.stages[number + 1 :]
+            begun = HORIZONS if number == 0 else ()
             if stage == "matches":
-                shares: tuple[float, ...] = MATCHED
-            elif number == 0:
-                shares = HORIZONS if later else (*HORIZONS, 1.0)
+                shares = (*begun[:1], *MATCHED)
+            elif "matches" in self.stages[number + 1 :]:
+                shares = begun or HORIZONS[-1:]
             else:
-                shares = HORIZONS[-1:] if later else (1.0,)
+                shares = (*begun, 1.0)
             found += [(stage, share) for share in shares]
         return found
 

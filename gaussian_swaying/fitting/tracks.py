@@ -112,10 +112,12 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
         pair = np.stack([shown, video.images[k].numpy()])
         found, good = follow(pair, pixel.numpy())
         position[k], seen[k] = torch.from_numpy(found[1]), torch.from_numpy(good[1]) & there
-        beside = drawn_beside(painter, gaussians, camera, pixel)
-        if k == 0 and bool(seen[0].any()):
-            share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
-        position[k] += share * beside - shift
+        if k == 0 or share:
+            beside = drawn_beside(painter, gaussians, camera, pixel)
+            if k == 0 and bool(seen[0].any()):
+                share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
+            position[k] += share * beside
+        position[k] -= shift
     return Tracks(chosen, position, seen)
 
 

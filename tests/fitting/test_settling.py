@@ -110,6 +110,7 @@ def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everyth
     ("stages", "steps"),
     [
         (["tracks"], "tracks 0.25 0.5 1"),
+        (["matches"], "matches 0.25 0.5 0.5 0.75 1 1"),
         (["tracks", "matches"], "tracks 0.25 0.5 matches 0.5 0.5 0.75 1 1"),
         (["tracks", "matches", "pixels"], "tracks 0.25 0.5 matches 0.5 0.5 0.75 1 1 pixels 1"),
         (["tracks", "silhouettes", "matches"], "tracks 0.25 0.5 silhouettes 0.5 matches 0.5 0.5 0.75 1 1"),
