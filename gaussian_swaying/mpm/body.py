@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -55,6 +55,11 @@ class Body:
         self.points, self.boundaries, self.surface = points, tuple(boundaries), surface
         self.laws = LawDispatch(points)
         self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
+
+    def soften(self, particles: Tensor, factor: float) -> None:
+        """Multiply the stiffness of some particles, bool (..., P), with a factor; ``points`` stay as they are."""
+        E = self.points.youngs_modulus
+        self.laws = LawDispatch(replace(self.points, youngs_modulus=torch.where(particles, factor * E, E)))
 
     def mapped_surface(self, function: Callable[[Tensor], Tensor]) -> Surface | None:
         """The surface with a function applied to its tensors, if there is one."""

@@ -9,7 +9,7 @@ import torch
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Box, Everything, Region
-from gaussian_swaying.mpm import point_holds
+from gaussian_swaying.mpm import held_rows, point_holds
 from gaussian_swaying.mpm.boundaries.handle import Handle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
@@ -94,7 +94,8 @@ def test_held_points_stay_where_they_are(kind, dtype, most, layers):
     assert float(state.node_displacement.abs().max()) > 0.02
     assert float(moved[:, 0].abs().max()) < most
     slopes = moved[:, 1:].abs().amax((0, 2))  # along x, y, z
-    assert (float(slopes[1:].max()) < most / DX * 10) == (kind == "clamp")
+    # a clamp holds the section: it cannot turn about the line, up to rows that nearly depend on the others
+    assert (float(slopes[1]) < 0.05) == (kind == "clamp")
     for rows in (_own_places(holds), points.position[TOP.contains(points.position)]):
         assert len(rows) >= 4
 
@@ -127,12 +128,12 @@ def test_groups_are_joined_until_they_are_apart():
     place = torch.tensor([0.0, 0.1, 0.32, 0.9, 1.0, 2.0], dtype=torch.float64)
     position = torch.nn.functional.pad(place[:, None], (0, 2))
     mass, cell = torch.ones(6, dtype=torch.float64), torch.tensor([7, 7, 8, 9, 9, 12])
-    assert point_holds.groups(position, mass, cell, 0.2).tolist() == [0, 0, 1, 2, 2, 3]
-    assert point_holds.groups(position, mass, cell, 0.3).tolist() == [0, 0, 0, 1, 1, 2]
-    assert point_holds.groups(position, mass, cell, 0.9).tolist() == [0, 0, 0, 0, 0, 1]
-    assert point_holds.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
+    assert held_rows.groups(position, mass, cell, 0.2).tolist() == [0, 0, 1, 2, 2, 3]
+    assert held_rows.groups(position, mass, cell, 0.3).tolist() == [0, 0, 0, 1, 1, 2]
+    assert held_rows.groups(position, mass, cell, 0.9).tolist() == [0, 0, 0, 0, 0, 1]
+    assert held_rows.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
     heavy = torch.tensor([1.0, 1, 1, 1, 3, 1], dtype=torch.float64)
-    found = point_holds.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
+    found = held_rows.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
     torch.testing.assert_close(found[:, 0], torch.tensor([0.14, 0.975, 2.0], dtype=torch.float64))
 
 
@@ -195,7 +196,7 @@ def test_places_are_converted_from_scene_units():
 
 
 @pytest.mark.parametrize("patch", [1, 2, 8])
-@pytest.mark.parametrize(("kind", "most"), [("hinge", 50.0), ("clamp", 200.0)])
+@pytest.mark.parametrize(("kind", "most"), [("hinge", 50.0), ("clamp", 1000.0)])
 def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
     """Lines and patches, in one layer and in three. What is left out hardly moves: it depends on what is kept."""
     generator = torch.Generator().manual_seed(patch)
@@ -216,16 +217,19 @@ def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
 
 def test_a_line_along_the_grid_keeps_all_its_cells():
     points = _sheet(width=22, shift=(0.05, 0.02, 0.03))
-    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP.__class__([None, None, -0.001], [None] * 3), "clamp")])
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(Box([None, None, -0.001], [None] * 3), "hinge")])
+    solver.init_state(points)
+    line = _own_places(solver.bound.point_holds)
+    held = points.position[points.position[:, 2] > -0.001]
+    assert len(line) == len(torch.unique(torch.floor(held / DX - 0.5), dim=0))
+    solver = MPMSolver(DX, boundaries=[PinnedPoints(line.tolist(), "clamp")])
     solver.init_state(points)
     holds = solver.bound.point_holds
-    held = points.position[points.position[:, 2] > -0.001]
-    cells = torch.unique(torch.floor(held / DX - 0.5), dim=0)
-    own, slope = ~holds.slope[0, 0], holds.slope[0, 0]
-    assert int(own.sum()) == len(cells)
+    slope = holds.slope[0, 0]
+    assert int((~slope).sum()) == len(line)
     along = holds.place[0, 0][slope][:, 0] > 0
     assert int(along.sum()) <= 2  # the slope along the line depends on the values, except at its ends
-    assert int(slope.sum()) >= 2 * len(cells)
+    assert int(slope.sum()) >= 2 * len(line)
     assert holds.condition() < 200
 
 
@@ -241,9 +245,9 @@ def test_rows_come_in_the_order_of_their_release():
     product[0, 1] = product[1, 0] = 0.99  # nearly the same row
     everything = torch.ones(4, dtype=torch.bool)
     late = torch.tensor([False, True, False, True])
-    assert point_holds.independent_rows(product, [everything]).tolist() == [0, 2, 3]
-    assert point_holds.independent_rows(product, [late, ~late]).tolist() == [1, 3, 2]
-    assert point_holds.independent_rows(torch.zeros(2, 2, dtype=torch.float64), [everything[:2]]).tolist() == []
+    assert held_rows.independent_rows(product, [everything]).tolist() == [0, 2, 3]
+    assert held_rows.independent_rows(product, [late, ~late]).tolist() == [1, 3, 2]
+    assert held_rows.independent_rows(torch.zeros(2, 2, dtype=torch.float64), [everything[:2]]).tolist() == []
 
 
 def test_pins_in_the_same_cells_agree():
@@ -281,8 +285,9 @@ def test_a_handle_moves_its_points_exactly(kind):
         rows = _read(solver, rest, state.node_displacement, state)
         torch.testing.assert_close(rest + rows[:, 0], wanted, rtol=0, atol=1e-11)
         F = rows[:, 1:].mT + torch.eye(3, dtype=torch.float64)
-        # the slope along the line of points is theirs up to the bending of the line between them
-        error = (F - turn)[:, :, 1:].abs().max()
+        # the slope along the line of points is theirs up to the bending of the line between them, and that across the
+        # face is free; the section turns as the handle does
+        error = (F - turn)[:, :, 1].abs().max()
         assert (float(error) < 1e-9) == (kind == "clamp")
 
 

@@ -23,6 +23,9 @@ from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
 
+BY_BODY = "by body"
+"""The kind of a pin that holds a sheet by a hinge, and anything else by a clamp."""
+
 CLOCK = 1e-9  # round-off of a time after many additions of a substep [s]
 _Kind = TypeVar("_Kind", bound="Boundary")
 
@@ -96,6 +99,8 @@ class Boundary(Recordable, nn.Module, ABC):
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
         """What it acts on: ``nodes``, in :meth:`forward`; points, as a ``hinge`` or a ``clamp``; or the ``surface``.
+
+        It may also be :data:`BY_BODY`, which leaves the choice of hinge or clamp to the formulation.
 
         Args:
             neighbours_fixed: Whether the particles keep their neighbours, so that points can be held.

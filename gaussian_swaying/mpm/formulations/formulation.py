@@ -55,6 +55,7 @@ class Formulation(ABC):
         held: As in the body, with the parts that are constant on this grid.
         kinds: What each boundary acts on: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
             (``Boundary.hold_kind``).
+        on_nodes: Whether each boundary acts on nodes, by its ``forward``; a clamp may do so besides its points.
         needs_position: Whether a boundary uses the positions of nodes.
         needs_lattice: Whether a boundary uses the positions of lattice points.
     """
@@ -66,14 +67,23 @@ class Formulation(ABC):
     def __init__(self, body: Body, settings: Settings) -> None:
         self.body, self.settings = body, settings
         self.held: tuple[Held | None, ...] = body.held
-        self.kinds = tuple(boundary.hold_kind(self.neighbours_fixed) for boundary in body.boundaries)
-        on_nodes = [b for b, kind in zip(body.boundaries, self.kinds, strict=True) if kind == "nodes"]
-        self.needs_position = any(b.needs_position for b in on_nodes)
-        self.needs_lattice = any(b.needs_lattice for b in on_nodes)
+        self.kinds = tuple(self.hold_kind(k) for k in range(len(body.boundaries)))
+        self.on_nodes = tuple(self.acts_on_nodes(k) for k in range(len(body.boundaries)))
+        nodal = [b for b, acts in zip(body.boundaries, self.on_nodes, strict=True) if acts]
+        self.needs_position = any(b.needs_position for b in nodal)
+        self.needs_lattice = any(b.needs_lattice for b in nodal)
         device = body.points.position.device
         with torch.inference_mode(False):  # an ordinary tensor, which a gradient may need
             # float64 on the device: no copy in a step, full precision in a float64 run
             self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=device)
+
+    def hold_kind(self, k: int) -> str:
+        """What the ``k``-th boundary acts on."""
+        return self.body.boundaries[k].hold_kind(self.neighbours_fixed)
+
+    def acts_on_nodes(self, k: int) -> bool:
+        """Whether the ``k``-th boundary acts on nodes."""
+        return self.kinds[k] == "nodes"
 
     @classmethod
     def check_settings(cls, settings: Settings) -> None:
@@ -223,7 +233,7 @@ class Formulation(ABC):
             (..., B, 3), float64.
         """
         taken = list(self.no_impulse().unbind(-2))
-        acting = [k for k, kind in enumerate(self.kinds) if kind == "nodes"]
+        acting = [k for k, acts in enumerate(self.on_nodes) if acts]
         # impulses come before conditions that hold nodes, in whatever order they were given
         for k in sorted(acting, key=lambda k: not isinstance(self.body.boundaries[k], Impulse)):
             boundary, held, before = self.body.boundaries[k], self.held[k], velocity

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -10,10 +12,13 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.body import Body, Held
+from gaussian_swaying.mpm.boundaries.boundary import BY_BODY, Boundary
+from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.contact.stage import ContactStage
 from gaussian_swaying.mpm.contact.surface import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings, held_share, safe_inverse
+from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness
 from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
@@ -67,12 +72,71 @@ class Total(Formulation):
             first_moment = scatter(self.stencil, (points.mass[..., None] * position)[..., None, :])
             self.node_rest = first_moment * self.node_inverse_mass[..., None]
         self.held = tuple(
-            held if held is None or self.kinds[k] != "nodes" else self._on_nodes(k, held)
+            held if held is None or not self.on_nodes[k] else self._on_nodes(k, held)
             for k, held in enumerate(body.held)
         )
+        self._soften()
         self._windows = self._point_windows()
         self._point_holds = self._hold_points()
         self.contact = self._contact()
+
+    def hold_kind(self, k: int) -> str:
+        """What a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
+
+        Warns if a hinge or a clamped place is to hold a part of several cells in thickness, which it cannot.
+        """
+        boundary, kind = self.body.boundaries[k], super().hold_kind(k)
+        given = isinstance(boundary, PinnedPoints)
+        if kind == BY_BODY or (kind == "hinge" and not given) or (kind == "clamp" and given):
+            thick, sheet = self._thickness(k)
+            if kind == BY_BODY:
+                held = self.body.held[k]
+                return "hinge" if sheet or (held is not None and held.release is not None) else "clamp"
+            if thick > SHEET * self.settings.dx:
+                remedy = "use a PinnedRegion" if given else "set `kind` to clamp, or to null"
+                warnings.warn(
+                    f"`kind: {kind}` of the {type(boundary).__name__} is to hold a part that is "
+                    f"{thick / self.settings.dx:.2g} cells thick, which still turns: {remedy}.",
+                    UserWarning,
+                    stacklevel=2,
+                )
+        return kind
+
+    def _thickness(self, k: int) -> tuple[float, bool]:
+        """The largest thickness of the body where a boundary holds it [m], and whether all scenes are sheets there."""
+        points, held = self.body.points, self.body.held[k]
+        count = points.position.shape[-2]
+        position, mass = (
+            points.position.detach().reshape(-1, count, 3).cpu(),
+            points.mass.detach().reshape(-1, count).cpu(),
+        )
+        found = []
+        for s, (place, weight) in enumerate(zip(position, mass, strict=True)):
+            if held is None:
+                where = self.body.boundaries[k].at.detach().cpu().to(place)
+            else:
+                where = place[held.mass.detach().reshape(-1, count)[s].cpu() > 0]
+            found.append(thickness(place, weight, where, self.settings.dx))
+        return max(thick for thick, _ in found), all(sheet for _, sheet in found)
+
+    def acts_on_nodes(self, k: int) -> bool:
+        """Whether a boundary acts on nodes: also a clamp, on those that carry held material alone."""
+        return super().acts_on_nodes(k) or self.has_face(k)
+
+    def has_face(self, k: int) -> bool:
+        """Whether a boundary clamps a region whose particles are all released together."""
+        held = self.body.held[k]
+        return self.kinds[k] == "clamp" and held is not None and held.release is None
+
+    def _soften(self) -> None:
+        """Take most of the stiffness from what clamps hold all the time, see ``held_faces.SOFTENED``."""
+        masks = [
+            held.mass > 0
+            for k, (held, boundary) in enumerate(zip(self.body.held, self.body.boundaries, strict=True))
+            if held is not None and self.has_face(k) and _always(boundary)
+        ]
+        if masks:
+            self.body.soften(torch.stack(masks).any(0), SOFTENED)
 
     @property
     def point_holds(self) -> PointHolds | None:
@@ -90,7 +154,15 @@ class Total(Formulation):
     def _hold_points(self) -> PointHolds | None:
         if not any(kind in POINTS for kind in self.kinds):
             return None
-        return PointHolds(self.body, self.kinds, self.stencil.first, self.grid, self.node_inverse_mass)
+        faces = [k for k in range(len(self.kinds)) if self.has_face(k)]
+        still = torch.zeros_like(self.node_mass, dtype=torch.bool)
+        for k in faces:
+            held = self.held[k]
+            assert held is not None
+            assert held.share is not None
+            still |= held.share > held.threshold
+        holds = PointHolds(self.body, self.kinds, faces, still, self.stencil.first, self.grid, self.node_inverse_mass)
+        return holds if holds.rows else None  # a clamp that holds everything has no face
 
     def _contact(self) -> ContactStage | None:
         body, surface = self.body, self.body.surface
@@ -111,10 +183,10 @@ class Total(Formulation):
 
     def _on_nodes(self, k: int, held: Held) -> Held:
         """What the ``k``-th boundary holds, with its constant share of each node."""
-        boundary = self.body.boundaries[k]
+        boundary, face = self.body.boundaries[k], self.has_face(k)
         share = scatter(self.stencil, held.mass[..., None, None])[..., 0] * self.node_inverse_mass
-        threshold = boundary.held_share
-        if threshold is not None and not bool((share > threshold).any()):
+        threshold = HELD_ALONE if face else boundary.held_share
+        if threshold is not None and not face and not bool((share > threshold).any()):
             count = int((held.mass > 0).sum())
             raise ValueError(
                 f"The pin {k} holds {count} particles but no grid node: they do not have more than "
@@ -247,3 +319,7 @@ class Total(Formulation):
         momentum = self.node_mass[..., None] * state.node_velocity
         place = state.grid.node_positions(momentum) + state.node_displacement
         return momentum.sum(-2), torch.linalg.cross(place, momentum, dim=-1).sum(-2)
+
+
+def _always(boundary: Boundary) -> bool:
+    return boundary.holds_from <= 0 and boundary.end == math.inf

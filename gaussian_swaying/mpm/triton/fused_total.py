@@ -119,7 +119,7 @@ class FusedTotal(Fused):
         owner = torch.full((self.bound.node_mass.numel(),), -1, device=self.device)
         for k in reversed(range(len(bound.held)) if self.plain else ()):  # the first pin takes the momentum
             pin = bound.held[k]
-            if bound.kinds[k] == "nodes":
+            if bound.on_nodes[k]:
                 assert pin is not None
                 assert pin.share is not None
                 owner = torch.where((pin.share > pin.threshold).reshape(-1), k, owner)
@@ -234,7 +234,7 @@ class FusedTotal(Fused):
             pieces, partial = partial, self.sums(self.cells, width)
             self.join_pieces(pieces, partial, width)
         block = 64
-        nodes, held = len(self.active), self.plain and "nodes" in self.bound.kinds
+        nodes, held = len(self.active), self.plain and any(self.bound.on_nodes)
         moves = self.plain and self.touching is None
         kernels.total_nodes[(-(-nodes // block),)](
             self.active, self.source, len(self.source), self.inverse_mass, self.held, nodes, partial,
@@ -272,7 +272,7 @@ class FusedTotal(Fused):
     def _impulse(self) -> Tensor:
         """Momentum that each boundary took in this part of the rollout, shape of ``impulse``; in a fixed order."""
         total = self.impulse.reshape(self.scenes, -1, 3).clone()
-        if "nodes" in self.bound.kinds and self.plain:
+        if any(self.bound.on_nodes) and self.plain:
             for k, nodes in enumerate(self.own_nodes):
                 total[:, k] += self.taken[nodes, :3].sum(1, dtype=torch.float64)
         if self.touching is not None:

@@ -312,7 +312,7 @@ class TotalAdjoint:
             fused.active, fused.source, len(fused.source), fused.inverse_mass, fused.held, self.nodes, asked.partial,
             fused.fields, self.force_bar, self.history, self.bars, self.mass_bar,
             fused.schedule, fused.first_step, offset, self.last, *fused.gravity,
-            **stages, VELOCITY=asked.width == 8, HELD="nodes" in fused.bound.kinds, MASS=asked.flags["MASS"],
+            **stages, VELOCITY=asked.width == 8, HELD=any(fused.bound.on_nodes), MASS=asked.flags["MASS"],
             WIDTH=asked.width, BLOCK=block, SOURCES=triton.next_power_of_2(len(fused.source)), num_warps=4,
         )  # fmt: skip
 
