@@ -44,7 +44,8 @@ def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Nam
         options.device = device.type
         if name in ("gallery", "previews"):
             options.preset = options.preset or ("preview" if device.type == "cpu" else None)
-        record.go_on(options, f"{name}_{device.type}", result, measure)
+        made = "_made" if name == "flags" and options.splats == "made" else ""
+        record.go_on(options, f"{name}{made}_{device.type}", result, measure)
 
     return run
 
