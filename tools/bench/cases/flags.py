@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,17 @@ def _given(pattern: Flag, part: str) -> Row:
 _BUILD = threading.Lock()
 
 
+@cache
+def body_of(arguments: tuple[str, ...]) -> dict[str, float]:
+    """Mass [kg], Young's modulus [Pa] and density [kg/m³] of a flag, from the options of tools/sim.py."""
+    from gaussian_swaying.simulation.simulation import Simulation
+
+    parser = Simulation.parser()
+    settings = parser.parse_args([*arguments, "--device=cpu"])
+    points = Simulation.from_settings(parser, settings).scene.points
+    return {"mass": float(points.mass.double().sum()), "E": settings.material.E, "density": settings.material.density}
+
+
 def of_equal_mass(arguments: Sequence[str], ours: Sequence[str]) -> tuple[list[str], float]:
     """Options that give a row the mass of ``ours``: all its volumes times one factor.
 
@@ -187,14 +199,10 @@ def of_equal_mass(arguments: Sequence[str], ours: Sequence[str]) -> tuple[list[s
     Returns:
         The further options, and the factor.
     """
-    from gaussian_swaying.simulation.simulation import Simulation
-
-    parser = Simulation.parser()
     with _BUILD:  # rows run in several threads
-        settings = [parser.parse_args([*given, "--device=cpu"]) for given in (arguments, ours)]
-        own, wanted = (Simulation.from_settings(parser, given).scene.points.mass.double().sum() for given in settings)
-    factor = float(wanted / own)
-    return [f"--material.{name}={factor * settings[0].material[name]!r}" for name in ("E", "density")], factor
+        own, wanted = (body_of(tuple(given)) for given in (arguments, ours))
+    factor = wanted["mass"] / own["mass"]
+    return [f"--material.{name}={factor * own[name]!r}" for name in ("E", "density")], factor
 
 
 def train(pattern: Flag, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
