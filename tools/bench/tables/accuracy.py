@@ -9,7 +9,7 @@ from typing import Any
 from bench.cases.accuracy import SINGLE, VARIANTS
 from bench.slots import table, value
 from bench.tables.accuracy_goals import GATES
-from bench.tables.markdown import grid, stack
+from bench.tables.markdown import grid, measured, stack
 from bench.tables.rows import Row, order, select
 
 PAGE = "validation.md"
@@ -35,10 +35,11 @@ def rows_table(name: str) -> Callable[[Callable[[list[Row]], list[str]]], Any]:
 @table(PAGE, "accuracy.devices", "accuracy_*", together=True)
 def devices(results: list[Row]) -> list[str]:
     """Which problems were measured where."""
-    return [
-        f"- {', '.join(sorted({row['problem'] for row in result['rows']}))}: {result['device']}; {stack(result)}."
-        for result in results
-    ]
+    lines = []
+    for result in results:
+        problems = ", ".join(sorted({row["problem"] for row in result["rows"]}))
+        lines.append(f"- {problems}: {result['device']}; {stack(result)}.{measured(result)}")
+    return lines
 
 
 @rows_table("accuracy.goals")

@@ -7,7 +7,7 @@ from typing import Any
 
 from bench.cases.pareto import DEFAULT, PROBLEMS, PROVEN_CFL, is_default, on_front, proven
 from bench.slots import table, value
-from bench.tables.markdown import grid, stack, yes_no
+from bench.tables.markdown import grid, measured, stack, yes_no
 
 Row = dict[str, Any]
 PAGE = "validation.md"
@@ -22,7 +22,7 @@ def proven_cfl(_: Row) -> str:
 @table(PAGE, "pareto.device", "pareto_*")
 def device(result: Row) -> list[str]:
     """The device of the sweep, and what else ran at the time."""
-    lines = [f"{result['device']}; {stack(result)}; {result['threads']} thread(s)."]
+    lines = [f"{result['device']}; {stack(result)}; {result['threads']} thread(s).{measured(result)}"]
     return [*lines, "", f"Recorded with {result['concurrent']}."] if "concurrent" in result else lines
 
 
