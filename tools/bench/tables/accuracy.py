@@ -8,7 +8,7 @@ from typing import Any
 
 from bench.cases.accuracy import SINGLE, VARIANTS
 from bench.slots import table, value
-from bench.tables.accuracy_goals import GATES
+from bench.tables.accuracy_goals import GOALS
 from bench.tables.markdown import grid, measured, stack
 from bench.tables.rows import Row, order, select
 
@@ -45,9 +45,9 @@ def devices(results: list[Row]) -> list[str]:
 @rows_table("accuracy.goals")
 def goals(rows: list[Row]) -> list[str]:
     """The goals, and the measurements that failed."""
-    found = [(name, wanted, judge(rows)) for name, wanted, judge in GATES]
-    reached = [[name, wanted, one[0], "yes" if one[1] else "**no**"] for name, wanted, one in found if one]
-    lines = grid(["goal", "wanted", "measured", "reached"], reached)
+    found = [(goal, goal.judge(rows)) for goal in GOALS]
+    told = [[goal.name, goal.wanted, goal.why, one[0], "yes" if one[1] else "**no**"] for goal, one in found if one]
+    lines = grid(["goal", "wanted", "where this comes from", "measured", "reached"], told)
     failed = [row for row in rows if "failed" in row["result"]]
     told = [f"- failed: {row['problem']} {row['parameters']}: {row['result']['failed']}" for row in failed]
     return [*lines, "", *told] if told else lines

@@ -36,7 +36,26 @@ def minutes(found: Row) -> list[str]:
         ]
         for run in runs
     ]
-    return [f"{runs[0]['device']}; {stack(runs[0])}.{measured(found)} {MADE}", "", *grid(head, rows)]
+    told = [f"{runs[0]['device']}; {stack(runs[0])}.{measured(found)} {MADE}", "", *grid(head, rows)]
+    return [*told, "", *grid(["goal", "wanted", "where this comes from", "measured", "reached"], goals(runs))]
+
+
+def goals(runs: list[Row]) -> list[list[str]]:
+    """Energies of the tenth minute against the second, in standard errors of the difference."""
+    lines = []
+    for run in runs:
+        for name, told in (
+            ("kinetic_of_particles", "kinetic energy of the particles"),
+            ("mechanical", "mechanical energy"),
+        ):
+            energy, error = (run[f"{part}_per_minute_J"][name] for part in ("energy", "standard_error"))
+            rise = (energy[9] - energy[1]) / math.hypot(error[9], error[1])
+            goal = f"damping {run['damping_per_s']:g} 1/s: {told} in the tenth minute no higher than in the second"
+            why = "gusts are stationary; one of 30,000 such differences is larger by chance"
+            lines.append(
+                [goal, "rise of at most 4 standard errors", why, f"{rise:+.1f}", "yes" if rise <= 4 else "**no**"]
+            )
+    return lines
 
 
 @value("long_flag.growth", "long_flag")
