@@ -15,7 +15,7 @@ from bench.tables import pareto as sweep
 from bench.tables.accuracy_goals import GOALS
 from bench.tables.goals import of_runs
 from bench.tables.rows import order
-from bench.tables.runs import whole
+from bench.tables.runs import seconds, whole
 
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.simulation.simulation import Simulation
@@ -128,6 +128,17 @@ def test_the_front():
     good = [pareto.on_front(r, rows) for r in rows if r["error"]]
     # the dearer of two equals is within the noise of the clock
     assert good == [True, True, False, True, True]
+
+
+def test_claims_of_the_pages_are_those_of_the_records():
+    """Substeps are counted, as times depend on what else ran; a run takes its whole process."""
+    flag = {"problem": "flag", "size": 0.08, "wall_per_simulated_s": 9.0} | pareto.DEFAULT
+    rows = [flag | {"error": 0.02, "substeps": 300.0}]
+    rows.append(flag | {"cfl": None, "substep": 1e-4, "error": 0.021, "substeps": 6000.0})
+    assert sweep.adaptive({"rows": rows})[2] == "| 0.08 | 300 | 6,000 | 20.0 | 0.0200 | 0.0210 | 0.00100 |"
+    runs = [{"name": "flag", "process_wall_s": 1.0, "simulated_s": 3.0}]
+    runs.append({"name": "guitar, 1920x1080", "process_wall_s": 8.57, "simulated_s": 9.96})
+    assert seconds({"runs": runs}, "guitar") == "8.6 s for 10 simulated seconds"
 
 
 def test_the_observed_order():

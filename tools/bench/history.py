@@ -2,12 +2,15 @@
 
 ``PYTHONPATH=.:tools python -m bench.history`` gives each row without a stamp the date, the versions and the sources of
 the commit in which it first appears. It was measured then or earlier.
+
+``... bench.history dropped RECORD COMMIT`` first adds to a record of flags the rows that it lacks and the commit has.
 """
 
 from __future__ import annotations
 
 import json
 import subprocess
+import sys
 from functools import cache
 from typing import Any
 
@@ -16,6 +19,8 @@ from bench import record, stamps
 Row = dict[str, Any]
 FORMER = {"flags_made_cpu": "flags_cpu"}
 """Records that had another name."""
+ROWS = {"particle": "own_volumes"}
+"""Rows of flags that had another name."""
 
 
 def git(*arguments: str) -> str:
@@ -60,8 +65,23 @@ def stamp(name: str, result: Row) -> Row:
     return found
 
 
+def dropped(name: str, commit: str) -> None:
+    """Add the rows of a commit that a record of flags lacks, and what ``ours`` was then, as ``dropped``."""
+    path = record.RESULTS / f"{name}.json"
+    result = json.loads(path.read_text())
+    old = json.loads(git("show", f"{commit}:docs/results/{FORMER.get(name, name)}.json"))["rows"]
+    old = {ROWS.get(row, row): found for row, found in old.items()}
+    result["dropped"] = {"ours": old["ours"]}
+    for row, found in old.items():
+        if left := {pattern: one for pattern, one in found.items() if pattern not in result["rows"].get(row, {})}:
+            result["dropped"][row] = left
+    path.write_text(json.dumps(result, indent=2) + "\n")
+
+
 def main() -> None:
     """Give all records their stamps."""
+    if sys.argv[1:2] == ["dropped"]:
+        dropped(*sys.argv[2:])
     for path in sorted(record.RESULTS.glob("*.json")):
         if path.name != record.AGES:
             result = json.loads(path.read_text())

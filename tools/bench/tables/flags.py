@@ -214,9 +214,26 @@ def made(results: list[Row]) -> list[str]:
     """All of the above for splats made in code."""
     lines = []
     for result in results:
-        for part in (device, rows_table, goal_table, changes, costs):
+        for part in (device, rows_table, goal_table, changes, costs, dropped):
             lines += ["", *part(result)]
     return lines or ["Not recorded yet."]
+
+
+def dropped(result: Row) -> list[str]:
+    """Rows that were recorded once and are not measured again, beside ours of that time."""
+    rows = result.get("dropped", {})
+    found = [
+        [VARIANTS[name].title, named(flag), chamfer(rows[name].get(str(flag))), chamfer(rows["ours"].get(str(flag)))]
+        for name in VARIANTS
+        for flag in REFERENCES
+        if name != "ours" and str(flag) in rows.get(name, {})
+    ]
+    head = ["dropped", "flag", "distance then", "ours then"]
+    why = (
+        "These rows were recorded once, with edges held by grid nodes. Hinges hold them now, ours was measured again "
+        "and these were not, so they cannot be compared with the rows above:"
+    )
+    return [why, "", *grid(head, found)] if found else []
 
 
 @table(PAGE, "flags.costs", "flags_c*")
