@@ -40,7 +40,8 @@ class Material:
         density: Density [kg/m³].
         thickness: Thickness of the surface [m]; a patch has volume = area x thickness.
         volume: ``patch`` (area x thickness, and the volume of the solid where ``scene.filling`` finds one) or ``cell``
-            (PhysGaussian's rule for solids: cell volume / particles in it).
+            (PhysGaussian's rule for solids: cell volume / particles in it; with ``scene.layers`` 3 the layers share it,
+            and ``thickness`` only says how far apart they lie).
         law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
             elasticity if null. Plastic laws need ``solver.formulation: updated``.
         regions: Parts with a different material; later entries win.

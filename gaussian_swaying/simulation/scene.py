@@ -289,8 +289,6 @@ class SimulatedScene(nn.Module):
         area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
         facing = self.frame.direction_to_sim(normals[simulated[source]].double())
         samples, laws = sample_object(position, facing, body_area, area, filling, material, self.frame, dx)
-        if scene.layers == 3 and material.volume != "patch":
-            raise ValueError('Expected `material.volume` "patch" with `scene.layers` 3: layers share a thickness.')
         owner = torch.arange(len(samples.position))
         chosen_samples = samples
         feels = samples.area > 0

@@ -431,16 +431,27 @@ def test_three_layers_are_a_plate(make_cloud):
 
 
 @pytest.mark.parametrize(
-    ("scene", "material", "words"),
+    ("scene", "words"),
     [
-        ({"layers": 2}, {}, "`scene.layers` to be 1 or 3"),
-        ({"layers": 3, "filling": InteriorFilling()}, {}, "`scene.filling`"),
-        ({"layers": 3}, {"volume": "cell"}, "`material.volume`"),
+        ({"layers": 2}, "`scene.layers` to be 1 or 3"),
+        ({"layers": 3, "filling": InteriorFilling()}, "`scene.filling`"),
     ],
 )
-def test_layers_that_do_not_fit(make_cloud, scene, material, words):
+def test_layers_that_do_not_fit(make_cloud, scene, words):
     with pytest.raises(ValueError, match=words):
-        SimulatedScene(Scene(points="gaussian", generator=_Given(make_cloud()), **scene), Material(**material), 0.25)
+        SimulatedScene(Scene(points="gaussian", generator=_Given(make_cloud()), **scene), Material(), 0.25)
+
+
+def test_layers_share_the_volume_of_a_cell(make_scene):
+    """By Simpson's rule: four parts in the middle, one at each face, half a thickness away."""
+    material = Material(volume="cell", thickness=0.03)
+    one, three = (make_scene(material=material, layers=layers, dx=0.25).points for layers in (1, 3))
+    middle, upper, lower = three.volume.view(3, -1)
+    torch.testing.assert_close(middle, one.volume * 4 / 6)
+    torch.testing.assert_close(upper, lower)
+    torch.testing.assert_close(middle + upper + lower, one.volume)
+    apart = (three.position.view(3, -1, 3)[1] - one.position).norm(dim=-1)
+    torch.testing.assert_close(apart, torch.full_like(apart, 0.015))
 
 
 def test_normals_from_neighbours(make_cloud, make_scene):

@@ -73,6 +73,16 @@ def test_missed_goals_are_said_to_be_missed():
     assert tables.blender([HEAD]) == ["Not measured yet."]
 
 
+def test_a_claim_about_all_cases_counts_them():
+    """Ablations have no goal, and sharp frames are a goal of their own."""
+    wrong, dull = ROW | {"direction_error_deg": 4.0}, ROW | {"psnr_predicted_db": 25.0}
+    rows = {"a, two cameras": ROW, "b, two cameras": wrong, "b, one camera": wrong, "c, one camera": dull}
+    rows |= {"a, tracks alone": wrong, "d, one camera": {"refused": "x"}}
+    result = HEAD | {"blender": rows}
+    assert tables.within(result) == "3 of 5"
+    assert tables.sharp(result) == "3 of 5"
+
+
 def test_rows_of_a_case_of_blender():
     truth = {"flow": [3.0, -4.0, 0.0], "speed": 5.0, "C_D": 1.0}
     rows = case.blender_rows({"aero.law": "linear", "solver.dx": 0.1}, truth)

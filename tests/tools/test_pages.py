@@ -47,7 +47,7 @@ def test_pages_are_filled_in_place_and_their_plots_drawn(bench, tmp_path):
     begin = "<!-- begin: accuracy.goals -->\n"
     before, _, after = text.partition(begin)
     emptied.write_text(before + begin + after[after.index("<!-- end -->") :])
-    bench("pages", "--results", docs / "results")
+    bench("pages", "--keep_ages", "--results", docs / "results")
     for name in NAMES:
         assert (docs / name).read_text() == (DOCS / name).read_text(), name
     for picture in ("convergence.png", "pareto_cpu.png", "pareto_cuda.png", "speed_cpu.png", "speed_cuda.png"):

@@ -32,6 +32,10 @@ def test_goals_are_judged_from_the_medians():
     variants = {"mcmc": _row(psnr_db=25.4), "absgrad": {"failed": "x"}, "surface": _row(psnr_db=24.0)}
     best = tables.goals(_result(pair=pair, variants=variants))[4]
     assert best[1:] == ("+0.40 dB (MCMC, 300,000 Gaussians)", True)
+    variants["degree_1"] = _row(psnr_db=29.0, runs_per_device=2)  # under other conditions
+    assert tables.goals(_result(pair=pair, variants=variants))[4][1:] == best[1:]
+    pair["bare"].append(_row(psnr_db=24.5))  # the runs of the bare loop differ by more than that
+    assert not tables.goals(_result(pair=pair, variants=variants))[4][2]
 
 
 def test_the_page_shows_every_row_that_did_not_fail():

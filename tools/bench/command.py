@@ -44,14 +44,20 @@ def _going_on(name: str, measure: Callable[..., None]) -> Callable[[argparse.Nam
         options.device = device.type
         if name in ("gallery", "previews"):
             options.preset = options.preset or ("preview" if device.type == "cpu" else None)
-        record.go_on(options, f"{name}_{device.type}", result, measure)
+        made = "_made" if name == "flags" and options.splats == "made" else ""
+        record.go_on(options, f"{name}{made}_{device.type}", result, measure)
 
     return run
 
 
 def fill_pages(options: argparse.Namespace) -> None:
     """Fill the slots of the pages next to the results."""
-    pages.refill(Path(options.results))
+    pages.refill(Path(options.results), age=not options.keep_ages)
+
+
+def add_pages_arguments(command: argparse.ArgumentParser) -> None:
+    """Options of ``bench.py pages``."""
+    command.add_argument("--keep_ages", action="store_true", help="leave what is known of rows older than the code")
 
 
 @dataclass(frozen=True)
@@ -116,7 +122,8 @@ COMMANDS = {
                       _going_on("sweeps", sweeps.measure), sweeps.add_arguments, page="many.md"),
     "winds": Command("Measure substeps in winds that differ from place to place, and a box of turbulence.",
                      _going_on("winds", winds.measure), winds.add_arguments, page="wind.md"),
-    "pages": Command("Fill the slots of the pages next to the results.", fill_pages, device=False),
+    "pages": Command("Fill the slots of the pages next to the results, and find which rows are older than the code.",
+                     fill_pages, add_pages_arguments, device=False),
     "pictures": Command("A strip of frames of a finished run.",
                         show.pictures, show.add_pictures_arguments, device=False),
     "film": Command("An animated WebP of finished runs side by side.",

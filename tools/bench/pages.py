@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from fnmatch import fnmatch
 from pathlib import Path
 
-from bench import record, slots
+from bench import record, slots, stamps
 from bench.cases import gallery  # noqa: F401  registers its slots
 from bench.tables import (  # noqa: F401  each registers its slots
     accuracy,
@@ -21,6 +22,7 @@ from bench.tables import (  # noqa: F401  each registers its slots
     gradients,
     live,
     long_flag,
+    measured,
     pareto,
     pareto_plot,
     peers,
@@ -72,11 +74,17 @@ def fill(docs: Path, records: slots.Records, only: str | None = None) -> dict[Pa
     return {path: slots.fill(path.name, text, records) for path, text in texts.items() if slots.used(text)}
 
 
-def refill(results: Path, only: str | None = None) -> None:
-    """Fill the pages next to a folder of results and draw their plots; with ``only``, one page if it exists."""
+def refill(results: Path, only: str | None = None, age: bool = False) -> None:
+    """Fill the pages next to a folder of results and draw their plots; with ``only``, one page if it exists.
+
+    With ``age``, what has changed since each row was measured is found anew first. Otherwise the pages say what was
+    found last, so that they depend on the files in the folder and not on the code.
+    """
     docs = results.parent
     if only is not None and not (docs / only).exists():
         return
+    if age:
+        write_text(results / record.AGES, json.dumps(stamps.ages(record.read(results)), indent=2) + "\n")
     records = record.read(results)
     for path, text in fill(docs, records, only).items():
         write_text(path, text)

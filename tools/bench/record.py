@@ -1,4 +1,4 @@
-"""The recorded JSON: how a record is started, written and read."""
+"""The recorded JSON: how a record is started, written and read. Each row gets the stamp of when it was measured."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from filelock import FileLock
 
+from bench import stamps
 from gaussian_swaying._files import write_text
 from gaussian_swaying._provenance import describe_device, versions
 
@@ -32,20 +33,36 @@ def write(folder: Path, name: str, result: Row, quiet: bool = False) -> None:
     """Write a record into the folder of the results, without paths of this machine."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    write_text(path, json.dumps(result, indent=2).replace(str(ROOT) + "/", "") + "\n")
+    result = json.loads(json.dumps(result).replace(str(ROOT) + "/", ""))
+    write_text(path, json.dumps(stamps.stamped(name, result), indent=2) + "\n")
     if not quiet:
         print(f"wrote {path}")
 
 
+AGES = "ages.json"
+"""File beside the records: which stamps are older than the code, as ``bench.py pages`` found."""
+
+
 def read(folder: Path) -> dict[str, Row]:
-    """All records of a folder, by the name of their file without its ending."""
-    return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
+    """All records of a folder, by the name of their file without its ending.
+
+    Each of their stamps has the name of the ``record``, and under ``older`` the parts of the package that have changed
+    since, as far as the file of ages says.
+    """
+    found = {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json")) if path.name != AGES}
+    ages = json.loads((folder / AGES).read_text()) if (folder / AGES).exists() else {}
+    for name, result in found.items():
+        for key, stamp in result.get("measured", {}).items():
+            stamp |= {"record": name, "older": ages.get(name, {}).get(key, [])}
+    return found
 
 
-def kept_rows(folder: Path, name: str, keep: Callable[[Row], bool]) -> list[Row]:
-    """The rows of an earlier record to keep; none if there is no such record."""
+def keep_rows(result: Row, folder: Path, name: str, keep: Callable[[Row], bool]) -> None:
+    """Begin the rows of a record with those of an earlier one that are to be kept, which keep their stamps."""
     path = folder / f"{name}.json"
-    return [row for row in json.loads(path.read_text())["rows"] if keep(row)] if path.exists() else []
+    old = json.loads(path.read_text()) if path.exists() else {"rows": []}
+    result["rows"] = [row for row in old["rows"] if keep(row)]
+    result["measured"] = stamps.kept(old, {"rows": result["rows"]})
 
 
 def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable[..., None]) -> None:
@@ -67,7 +84,9 @@ def go_on(options: argparse.Namespace, name: str, result: Row, measure: Callable
         with FileLock(path.with_suffix(".lock")):
             there = json.loads(path.read_text()) if path.exists() else {}
             same = there.get("device") == now["device"]
-            write(folder, name, merged(there, changed(before, now)) if same else now, quiet=True)
+            new = merged(there, changed(before, now)) if same else dict(now)
+            new["measured"] = stamps.kept(there, new) if same else {}
+            write(folder, name, new, quiet=True)
 
     measure(options, result, save)
     path.with_suffix(".lock").unlink(missing_ok=True)

@@ -166,6 +166,6 @@ def run(options: argparse.Namespace) -> None:
     device, result = record.start(options.device)
     folder, name = Path(options.results), f"accuracy_{device.type}"
     only = options.only
-    result["rows"] = record.kept_rows(folder, name, lambda row: only not in row["problem"]) if only else []
+    record.keep_rows(result, folder, name, lambda row: bool(only) and only not in row["problem"])
     result["rows"] += measure(device.type, options.thorough, only)
     record.write(folder, name, result)

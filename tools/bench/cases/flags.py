@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -52,14 +53,16 @@ class Variant:
         patterns: The flags for which it differs from ``ours``.
         training: Other options of tools/train.py; a variant with such options has its own splat.
         true_normals: Whether the Gaussians are turned to the reference's normals at rest.
+        matched: Whether all volumes are scaled by one factor, so that the flag has the mass of ``ours``.
     """
 
     title: str
     overlays: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
-    patterns: tuple[int, ...] = PATTERNS
+    patterns: tuple[Flag, ...] = tuple(REFERENCES)
     training: tuple[str, ...] = ()
     true_normals: bool = False
+    matched: bool = False
 
 
 def grid_options(dx: float) -> tuple[str, ...]:
@@ -68,17 +71,25 @@ def grid_options(dx: float) -> tuple[str, ...]:
 
 
 _NEIGHBOURS = ("--scene.normals=neighbours",)
+_IN_AIR = tuple(flag for flag in REFERENCES if flag != 1)  # pattern 1 falls in a vacuum
+_CHANGES = ("--material.volume=cell", "--scene.layers=1", "--material.law=FixedCorotated", "--scene.area=equal")
 
 VARIANTS: dict[str, Variant] = {
     "ours": Variant("ours (`total`, three layers)"),
-    "particle": Variant("PhysGaussian's way", ("particle",)),
-    "no_surface": Variant("no surface modelling", ("no_surface",), patterns=(2, 3)),
+    "to_volume": Variant("ours with volumes of grid cells", options=_CHANGES[:1], matched=True),
+    "to_layer": Variant("... and one layer", options=_CHANGES[:2], matched=True),
+    "to_law": Variant("... and fixed corotated", options=_CHANGES[:3], matched=True),
+    "to_area": Variant("... and equal areas", options=_CHANGES, patterns=_IN_AIR, matched=True),
+    "to_wind": Variant("... and wind without normals", ("no_normals",), _CHANGES, _IN_AIR, matched=True),
+    "particle": Variant("... and no shading: PhysGaussian's way", ("particle",), matched=True),
+    "own_volumes": Variant("PhysGaussian's way with its own volumes", ("particle",)),
+    "no_surface": Variant("no surface modelling", ("no_surface",), patterns=_IN_AIR),
     "no_shading": Variant("no shading", ("no_shading",)),
-    "gusts": Variant("flow randomised", ("gusts",), patterns=(2, 3)),
-    "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=(2, 3)),
+    "gusts": Variant("flow randomised", ("gusts",), patterns=_IN_AIR),
+    "paper_law": Variant("the paper's law and coefficients", ("paper_law",), patterns=_IN_AIR),
     "paper_area": Variant("patch areas π s1 s2", ("paper_area",)),
     "membrane": Variant("one layer (no bending stiffness)", options=("--scene.layers=1",)),
-    "true_normals": Variant("with the reference's normals at rest", patterns=(2, 3), true_normals=True),
+    "true_normals": Variant("with the reference's normals at rest", patterns=_IN_AIR, true_normals=True),
     "neighbours": Variant("normals of neighbouring centres", options=_NEIGHBOURS),
     "two_views": Variant("trained with two views, normals of neighbouring centres", (), _NEIGHBOURS, training=GENTLE),
     "one_point": Variant("one point per Gaussian", options=("--scene.particle_spacing=null",)),
@@ -90,11 +101,11 @@ VARIANTS: dict[str, Variant] = {
     "updated_03": Variant("`updated`, dx = 0.03 m", ("updated",), grid_options(0.03)),
     "updated_02": Variant("`updated`, dx = 0.02 m", ("updated",), grid_options(0.02)),
     "undamped": Variant("without the reference's damping", options=("--solver.damping=0",)),
-    "linear": Variant("pressure linear in the cloth's speed", options=("--aero.law=linear",), patterns=(2, 3)),
+    "linear": Variant("pressure linear in the cloth's speed", options=("--aero.law=linear",), patterns=_IN_AIR),
     "stiffness_damping": Variant("stiffness damping, 2.2 ms", options=("--solver.stiffness_damping=0.0022",)),
     "fixed_corotated": Variant("fixed corotated", options=("--material.law=FixedCorotated",)),
     "neo_hookean": Variant("neo-Hookean", options=("--material.law=NeoHookean",)),
-    "thin": Variant("half the thickness, double E and density", options=("--material.thickness=0.005",)),
+    "thin": Variant("half the thickness, double E and density", ("thin",)),
     **{
         f"b_{b:g}": Variant(
             f"size loss b = {b:g}, no late split",
@@ -108,8 +119,6 @@ VARIANTS: dict[str, Variant] = {
     },
 }
 """All rows, by name."""
-
-_TWICE = {1: (1.0e4, 100.0), 2: (6.0e3, 60.0), 3: (6.0e3, 40.0)}  # E and density of the sheet of half the thickness
 
 
 def folder_of(pattern: Flag) -> str:
@@ -148,16 +157,55 @@ def sim_arguments(pattern: Flag, variant: Variant, dataset: Path, splat: Path | 
         described = json.loads(camera.read_text())
         arguments += [f"--camera.width={described['w']}", f"--camera.height={described['h']}"]
     arguments += list(variant.options)
-    if {"particle", "no_surface"} & set(variant.overlays):  # friction equals drag; no air in pattern 1
-        matched = yaml.safe_load((BENCH / f"flag{pattern}.yaml").read_text())
-        arguments += [f"--aero.C_F={matched.get('aero', {}).get('C_D', 0.0)}"]
-    if variant is VARIANTS["thin"]:
-        modulus, density = _TWICE[pattern]
-        arguments += [f"--material.E={modulus}", f"--material.density={density}"]
+    if {"particle", "no_surface", "no_normals"} & set(variant.overlays):  # friction equals drag
+        arguments += [f"--aero.C_F={_given(pattern, 'aero')['C_D']}"]
+    if "thin" in variant.overlays:
+        arguments += [f"--material.{name}={2 * _given(pattern, 'material')[name]}" for name in ("E", "density")]
     return arguments
 
 
-def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
+def _given(pattern: Flag, part: str) -> Row:
+    """What the configuration files of a flag say in one of their parts."""
+    found: Row = {}
+    for path in matched_configs(pattern):
+        found |= yaml.safe_load(path.read_text()).get(part, {})
+    return found
+
+
+_BUILD = threading.Lock()
+
+
+@cache
+def body_of(arguments: tuple[str, ...]) -> dict[str, float]:
+    """Mass [kg], Young's modulus [Pa] and density [kg/m³] of a flag, from the options of tools/sim.py."""
+    from gaussian_swaying.simulation.simulation import Simulation
+
+    parser = Simulation.parser()
+    settings = parser.parse_args([*arguments, "--device=cpu"])
+    points = Simulation.from_settings(parser, settings).scene.points
+    return {"mass": float(points.mass.double().sum()), "E": settings.material.E, "density": settings.material.density}
+
+
+def of_equal_mass(arguments: Sequence[str], ours: Sequence[str]) -> tuple[list[str], float]:
+    """Options that give a row the mass of ``ours``: all its volumes times one factor.
+
+    Its density and Young's modulus are multiplied instead, which is the same: a point then has the weight and the
+    elastic energy of a volume that many times as large.
+
+    Args:
+        arguments: Options of tools/sim.py for the row.
+        ours: Those of ``ours``.
+
+    Returns:
+        The further options, and the factor.
+    """
+    with _BUILD:  # rows run in several threads
+        own, wanted = (body_of(tuple(given)) for given in (arguments, ours))
+    factor = wanted["mass"] / own["mass"]
+    return [f"--material.{name}={factor * own[name]!r}" for name in ("E", "density")], factor
+
+
+def train(pattern: Flag, variant: Variant, dataset: Path, target: Path, steps: int) -> Row:
     """Train a splat of a flag from its photos, unless it exists; the time it took is saved next to it."""
     account = target / "training.json"
     if (target / "point_cloud.ply").exists():
@@ -166,7 +214,7 @@ def train(pattern: int, variant: Variant, dataset: Path, target: Path, steps: in
     command += [f"--config={ROOT}/configs/train/default.yaml", f"--config={BENCH}/train.yaml"]
     command += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={steps}"]
     command += [f"--checkpoint.every_n_train_steps={steps}", "--trainer.enable_progress_bar=false"]
-    command += [f"--data.init_args.path={dataset / f'pattern{pattern}' / 'train'}"]
+    command += [f"--data.init_args.path={dataset / folder_of(pattern) / 'train'}"]
     command += [f"--trainer.default_root_dir={target}", *filled(variant.training, steps)]
     begin = time.perf_counter()
     with (target.parent / f"{target.name}.log").open("w") as log:
@@ -216,11 +264,16 @@ def run_row(
     """Simulate a row into the folder ``output`` and compare it with the reference, with ``pictures`` if it has all."""
     dataset = Path(options.dataset)
     reference = dataset / folder_of(pattern)
+    more = options.more.split() if options.more else []
     command = [sys.executable, str(ROOT / "tools" / "sim.py")]
-    command += sim_arguments(pattern, variant, dataset, splat)
+    command += (own := sim_arguments(pattern, variant, dataset, splat) + more)
+    matched: Row = {}
+    if variant.matched:
+        ours = sim_arguments(pattern, VARIANTS["ours"], dataset, splat) + more
+        scaled, matched["volume_factor"] = of_equal_mass(own, ours)
+        command += scaled
     command += ["--device", options.device, "--output", str(output)]
     command += [f"--frames={options.frames}"] if options.frames else []
-    command += options.more.split() if options.more else []
     if not pictures or len(list((reference / "video" / "frames").glob("*.png"))) != 250:  # they may not be finished yet
         bare = output.parent / f"surface_{pattern}"
         bare.mkdir(parents=True, exist_ok=True)
@@ -243,6 +296,7 @@ def run_row(
         "torn_particles": summary["torn_particles"],
         "stretch_max": summary["stretch_max"],
         "mass_kg": summary["mass_kg"],
+        **matched,
     }
     row["ms_per_frame"] /= max(summary["frames"], 1)
     on = "cuda" if summary["peak_memory_bytes"]["device"] is not None else "cpu"  # the device of the run
@@ -258,7 +312,7 @@ def run_row(
 _TIMES = (0.05, 0.2, 0.4, 0.6, 0.95)  # times of a figure, as shares of the run
 
 
-def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -> bool:
+def figure(reference: Path, runs: dict[str, Path], target: Path) -> bool:
     """Draw reference, ours, PhysGaussian's way and our error at five times; False if pictures are missing."""
     import matplotlib
 
@@ -288,7 +342,7 @@ def figure(pattern: int, reference: Path, runs: dict[str, Path], target: Path) -
             axis.set_xticks([])
             axis.set_yticks([])
             if column == 0:
-                axis.set_ylabel(VARIANTS["particle"].title if name == "particle" else name)
+                axis.set_ylabel("PhysGaussian's way" if name == "particle" else name)
             if row == 0:
                 axis.set_title(f"{0.04 * frame:.2f} s")
     drawn.tight_layout()
@@ -314,16 +368,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--note", help="a sentence for the page about how the rows were measured")
 
 
-def splat_folder(options: argparse.Namespace, name: str, pattern: int) -> Path:
+def splat_folder(options: argparse.Namespace, name: str, pattern: Flag) -> Path:
     """Folder of the splat of a row; rows without a training of their own share one."""
-    return Path(options.splats) / f"pattern{pattern}" / (name if VARIANTS[name].training else "all_losses")
+    return Path(options.splats) / folder_of(pattern) / (name if VARIANTS[name].training else "all_losses")
 
 
-def train_all(jobs: list[tuple[str, int]], options: argparse.Namespace) -> dict[Path, Row]:
+def train_all(jobs: list[tuple[str, Flag]], options: argparse.Namespace) -> dict[Path, Row]:
     """Train the splats that rows need, several at the same time, and return their accounts by folder."""
     wanted = {splat_folder(options, name, pattern): (name, pattern) for name, pattern in jobs}
 
-    def one(item: tuple[Path, tuple[str, int]]) -> tuple[Path, Row]:
+    def one(item: tuple[Path, tuple[str, Flag]]) -> tuple[Path, Row]:
         target, (name, pattern) = item
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -356,7 +410,9 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     names = options.rows.split(",")
     if unknown := set(names) - set(VARIANTS):
         raise SystemExit(f"--rows takes {', '.join(VARIANTS)}, not {', '.join(sorted(unknown))}")
-    patterns = [int(p) for p in options.patterns.split(",")]
+    patterns = flags_named(options.patterns)
+    if options.splats != "made" and (other := [p for p in patterns if p not in PATTERNS]):
+        raise SystemExit(f"{other[0]} has no photos to train a splat from: add `--splats made`")
     open_dataset(Path(options.dataset), patterns, result)
     result["splats"] = "made in code" if options.splats == "made" else f"trained, {options.train_steps} images"
     result |= {"more": options.more or ""} | ({"note": options.note} if options.note else {})
@@ -369,7 +425,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     lock = threading.Lock()
     with tempfile.TemporaryDirectory() as scratch:
 
-        def simulate(job: tuple[str, int]) -> None:
+        def simulate(job: tuple[str, Flag]) -> None:
             name, pattern = job
             variant, splat = VARIANTS[name], None
             row: Row = {}
@@ -377,7 +433,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
                 target = splat_folder(options, name, pattern)
                 row["training"] = trained[target]
                 splat = target / "point_cloud.ply"
-                cloth = Path(options.dataset) / f"pattern{pattern}" / "cloth.npz"
+                cloth = Path(options.dataset) / folder_of(pattern) / "cloth.npz"
                 if splat.exists() and variant.true_normals:
                     own, splat = splat, Path(scratch) / f"{name}_{pattern}.ply"
                     turn_to_reference(own, cloth, splat)
@@ -399,7 +455,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
             list(pool.map(simulate, jobs))
         for pattern in patterns:
             runs = {n: Path(scratch) / f"{n}_{pattern}" for n in names if (Path(scratch) / f"{n}_{pattern}").is_dir()}
-            target = Path(options.pictures) / f"flags_pattern{pattern}.png"
-            if figure(pattern, Path(options.dataset) / f"pattern{pattern}", runs, target):
-                result.setdefault("figures", {})[str(pattern)] = target.name
+            target = Path(options.pictures) / f"flags_{folder_of(pattern)}.png"
+            if figure(Path(options.dataset) / folder_of(pattern), runs, target):
+                result.setdefault("figures", {})[str(pattern)] = {"file": target.name, "way": "particle"}
                 save(result)

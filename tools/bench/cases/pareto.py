@@ -142,6 +142,6 @@ def run(options: argparse.Namespace) -> None:
     result["kind"], result["threads"] = device.type, torch.get_num_threads()
     folder, name = Path(options.results), f"pareto_{device.type}"
     wanted = options.only.split(",") if options.only else None
-    result["rows"] = record.kept_rows(folder, name, lambda row: row["problem"] not in wanted) if wanted else []
+    record.keep_rows(result, folder, name, lambda row: bool(wanted) and row["problem"] not in wanted)
     result["rows"] += measure(device.type, wanted)
     record.write(folder, name, result)

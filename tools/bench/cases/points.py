@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> None:
     device, result = record.start(options.device)
     wanted = options.only.split(",") if options.only else list(SCENES)
     folder, name = Path(options.results), f"points_{device.type}"
-    result["rows"] = record.kept_rows(folder, name, lambda row: row["scene"] not in wanted)
+    record.keep_rows(result, folder, name, lambda row: row["scene"] not in wanted)
     for scene in wanted:
         if scene == "guitar" and options.ply is None:
             continue

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bench import record
+from bench import record, stamps
 from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
 from bench.problems import CUBE, block, cube, fewest_bytes, nodes_in_reach, sheet, spin, waves, wind, wind_load
 from gaussian_swaying.aero.wind_batch import WindBatch
@@ -391,7 +391,8 @@ def run(options: argparse.Namespace) -> None:
     if only and path.exists():
         kept = json.loads(path.read_text())
         if kept["device"] == result["device"]:
-            result |= {section: kept[section] for section in SECTIONS if section in kept}
+            result |= {section: kept[section] for section in SECTIONS if section in kept and section not in only}
+            result["measured"] = stamps.kept(kept, result)
     plan = plan_for(device.type, options.counts, options.quick)
     measure(plan, device, result, lambda now: record.write(folder, name, now, quiet=True), only)
     print(f"wrote {path}")

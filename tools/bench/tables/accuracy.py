@@ -8,8 +8,8 @@ from typing import Any
 
 from bench.cases.accuracy import SINGLE, VARIANTS
 from bench.slots import table, value
-from bench.tables.accuracy_goals import GATES
-from bench.tables.markdown import grid, stack
+from bench.tables.accuracy_goals import GOALS
+from bench.tables.markdown import grid, measured, stack
 from bench.tables.rows import Row, order, select
 
 PAGE = "validation.md"
@@ -35,18 +35,19 @@ def rows_table(name: str) -> Callable[[Callable[[list[Row]], list[str]]], Any]:
 @table(PAGE, "accuracy.devices", "accuracy_*", together=True)
 def devices(results: list[Row]) -> list[str]:
     """Which problems were measured where."""
-    return [
-        f"- {', '.join(sorted({row['problem'] for row in result['rows']}))}: {result['device']}; {stack(result)}."
-        for result in results
-    ]
+    lines = []
+    for result in results:
+        problems = ", ".join(sorted({row["problem"] for row in result["rows"]}))
+        lines.append(f"- {problems}: {result['device']}; {stack(result)}.{measured(result)}")
+    return lines
 
 
 @rows_table("accuracy.goals")
 def goals(rows: list[Row]) -> list[str]:
     """The goals, and the measurements that failed."""
-    found = [(name, wanted, judge(rows)) for name, wanted, judge in GATES]
-    reached = [[name, wanted, one[0], "yes" if one[1] else "**no**"] for name, wanted, one in found if one]
-    lines = grid(["goal", "wanted", "measured", "reached"], reached)
+    found = [(goal, goal.judge(rows)) for goal in GOALS]
+    told = [[goal.name, goal.wanted, goal.why, one[0], "yes" if one[1] else "**no**"] for goal, one in found if one]
+    lines = grid(["goal", "wanted", "where this comes from", "measured", "reached"], told)
     failed = [row for row in rows if "failed" in row["result"]]
     told = [f"- failed: {row['problem']} {row['parameters']}: {row['result']['failed']}" for row in failed]
     return [*lines, "", *told] if told else lines

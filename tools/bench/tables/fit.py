@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from bench.slots import table
+from bench.slots import table, value
 from bench.tables.markdown import grid, source, yes_no
 from gaussian_swaying.fitting.report import ASTRAY
 
@@ -62,6 +62,25 @@ def blender(results: list[Row]) -> list[str]:
             ]
             lines += ["", source(result), "", *grid(head, found)]
     return lines[1:] or ["Not measured yet."]
+
+
+@value("fit.within", "fit_*")
+def within(result: Row) -> str:
+    """How many fits of Blender's cloth are within the goals of speed, direction and E."""
+    reached = [_reached(row, ONE if "one camera" in name else TWO) for name, row in _with_goals(result).items()]
+    return f"{reached.count('yes')} of {len(reached)}"
+
+
+@value("fit.sharp", "fit_*")
+def sharp(result: Row) -> str:
+    """How many of them predict frames as sharp as wanted."""
+    reached = ["no" if "refused" in row else _sharp(row) for row in _with_goals(result).values()]
+    return f"{reached.count('yes')} of {len(reached)}"
+
+
+def _with_goals(result: Row) -> Row:
+    rows = result.get("blender", {})
+    return {name: row for name, row in rows.items() if name.split(", ")[-1] not in ABLATIONS}
 
 
 @table("fit.md", "fit.bias", "fit_*", together=True)

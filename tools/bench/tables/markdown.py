@@ -17,9 +17,25 @@ def stack(result: dict[str, Any]) -> str:
 
 
 def source(result: dict[str, Any]) -> str:
-    """One line: the device, the versions and the seed of a record."""
+    """One line: the device, the versions and the seed of a record, and when it was measured."""
     seed = f"; seed {result['seed']}" if "seed" in result else ""
-    return f"{result['device']}; {stack(result)}{seed}."
+    return f"{result['device']}; {stack(result)}{seed}.{measured(result)}"
+
+
+def measured(result: dict[str, Any]) -> str:
+    """A sentence: the days on which the rows were measured, and how many are older than the code that they measure."""
+    stamps = [stamp for stamp in result.get("measured", {}).values() if stamp["date"]]
+    if not stamps:
+        return ""
+    days = sorted({stamp["date"][:10] for stamp in stamps})
+    told = f" Measured {days[0] if len(days) == 1 else f'from {days[0]} to {days[-1]}'}"
+    old = [stamp for stamp in stamps if stamp.get("older")]
+    if not old:
+        return f"{told}."
+    count, of = (sum(len(stamp["rows"]) for stamp in part) for part in (old, stamps))
+    parts = ", ".join(sorted({part for stamp in old for part in stamp["older"]}))
+    which = "" if count == of else f"{count} of {of} rows "
+    return f"{told}, {which}[before the last change](benchmarks.md#when-it-was-measured) of {parts}."
 
 
 def yes_no(reached: bool | None) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from bench.cases.pareto import DEFAULT, PROBLEMS, PROVEN_CFL, is_default, on_front, proven
 from bench.slots import table, value
-from bench.tables.markdown import grid, stack, yes_no
+from bench.tables.markdown import grid, measured, stack, yes_no
 
 Row = dict[str, Any]
 PAGE = "validation.md"
@@ -22,7 +22,7 @@ def proven_cfl(_: Row) -> str:
 @table(PAGE, "pareto.device", "pareto_*")
 def device(result: Row) -> list[str]:
     """The device of the sweep, and what else ran at the time."""
-    lines = [f"{result['device']}; {stack(result)}; {result['threads']} thread(s)."]
+    lines = [f"{result['device']}; {stack(result)}; {result['threads']} thread(s).{measured(result)}"]
     return [*lines, "", f"Recorded with {result['concurrent']}."] if "concurrent" in result else lines
 
 
@@ -78,21 +78,20 @@ def time_at(result: Row, cfl: str) -> str:
 
 @table(PAGE, "pareto.adaptive", "pareto_*")
 def adaptive(result: Row) -> list[str]:
-    """The adaptive substep compared with PhysGaussian's fixed one, on the flag."""
-    head = ["flag, dx [m]", "adaptive, CFL 0.4 [s/s]", "fixed 1e-4 s [s/s]", "speedup", "error"]
+    """The adaptive substep compared with PhysGaussian's fixed one, on the flag, by their numbers."""
+    head = ["flag, dx [m]", "substeps, adaptive, CFL 0.4", "substeps of 1e-4 s", "times as many", "error"]
     head += ["error of the fixed substep", "difference (share of the longer side)"]
     flag = [row for row in result["rows"] if row["problem"] == "flag"]
     flag = [row for row in flag if row["variant"] == "total" and row["dtype"] == "float32"]
     rows = []
     for row in (r for r in flag if is_default(r)):
         for fixed in (r for r in flag if r["substep"] and r["size"] == row["size"] and r["error"] and row["error"]):
-            times = [r["wall_per_simulated_s"] for r in (row, fixed)]
-            errors = [r["error"] for r in (row, fixed)]
+            counts, errors = ([r[name] for r in (row, fixed)] for name in ("substeps", "error"))
             rows.append(
                 [
                     str(row["size"]),
-                    *(f"{time:.3g}" for time in times),
-                    f"{times[1] / times[0]:.1f}",
+                    *(f"{count:,.0f}" for count in counts),
+                    f"{counts[1] / counts[0]:.1f}",
                     *(f"{error:.4f}" for error in errors),
                     f"{abs(errors[0] - errors[1]):.5f}",
                 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from bench.slots import table
-from bench.tables.markdown import grid
+from bench.tables.markdown import grid, source
 
 Row = dict[str, Any]
 PAGE = "benchmarks.md"
@@ -18,4 +18,5 @@ def rows(result: Row) -> list[str]:
     for row in result["rows"]:
         found.setdefault((row["case"], row["solver"]), []).append(f"{row['points']:,}: {row['ms']:g}")
     shown = [[case, solver, "; ".join(times)] for (case, solver), times in sorted(found.items())]
-    return [result["note"], "", *grid(["what", "solver", "points: time of a substep [ms]"], shown)]
+    lines = [result["note"], "", f"{source(result)} {result['made']}", ""]
+    return [*lines, *grid(["what", "solver", "points: time of a substep [ms]"], shown)]

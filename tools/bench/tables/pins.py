@@ -19,15 +19,7 @@ _SHARES: dict[Flag, float] = {4: 0.015, 5: 0.015, "curtain": 0.02, "light": 0.02
 
 
 def _name(pattern: Flag) -> str:
-    return _NAMES.get(pattern, f"pattern {pattern}" if isinstance(pattern, int) else pattern)
-
-
-def _uncertainty(results: list[Row]) -> Row:
-    """That of all references, from the first record that has it."""
-    found: Row = {}
-    for result in results:
-        found = result.get("uncertainty", {}) | found
-    return found
+    return _NAMES.get(pattern, flags.named(pattern))
 
 
 def goals(results: list[Row]) -> list[tuple[str, str, bool | None]]:
@@ -39,7 +31,7 @@ def goals(results: list[Row]) -> list[tuple[str, str, bool | None]]:
     for name in ROWS:
         for one in results:
             rows[name] = one["rows"].get(name, {}) | rows.get(name, {})
-    known = {"uncertainty": _uncertainty(results)}
+    known = {"uncertainty": flags.uncertainty(results)}
     found: list[tuple[str, str, bool | None]] = []
     for pattern in PATTERNS:
         hinge = flags.complete(rows, "hinge_04", pattern)
@@ -112,5 +104,5 @@ def costs(result: Row) -> list[str]:
 @table(PAGE, "pins.reference", "pins_*", together=True)
 def reference(results: list[Row]) -> list[str]:
     """Uncertainty of the references that only these rows use."""
-    found = _uncertainty(results)
+    found = flags.uncertainty(results)
     return flags.uncertainty_lines({p: v for p, v in found.items() if p not in map(str, PAPER)})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bench.slots import table
+from bench.slots import table, value
 from bench.tables.markdown import gib, grid, source
 
 Row = dict[str, Any]
@@ -69,3 +69,10 @@ def whole(result: Row) -> list[str]:
             f"{one['process_wall_s']:.1f} s of process time, without a video."
         )
     return [source(result), "", *grid(head, rows), "", *told]
+
+
+@value("runs.seconds", "sim_*")
+def seconds(result: Row, name: str) -> str:
+    """The whole process of a run, with start-up and files, and the seconds that it simulates; the name's first word."""
+    run = next(run for run in result["runs"] if run["name"].split(",")[0] == name)
+    return f"{run['process_wall_s']:.1f} s for {run['simulated_s']:.0f} simulated seconds"

@@ -17,6 +17,12 @@ def _median(rows: list[Row], key: str) -> float:
     return statistics.median(row[key] for row in rows)
 
 
+def _alike(result: Row) -> Row:
+    """The variants that ran alone, as the pairs did; others come from another session and slower code."""
+    variants = result.get("variants", {})
+    return {n: row for n, row in variants.items() if "failed" not in row and row.get("runs_per_device", 1) == 1}
+
+
 def goals(result: Row) -> list[tuple[str, str, bool]]:
     """The goals, the measured values, and whether each goal is reached."""
     found: list[tuple[str, str, bool]] = []
@@ -31,11 +37,12 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
             ("capture: faster than the bare loop", f"{ratio:.2f} times", ratio < 1),
             ("capture: GPU memory within 1 GiB", f"{memory:.2f} GiB", memory <= 1.0),
         ]
-        variants = {n: row["psnr_db"] for n, row in result.get("variants", {}).items() if "failed" not in row}
-        if variants:
+        if variants := {name: row["psnr_db"] for name, row in _alike(result).items()}:
             name = max(variants, key=lambda n: variants[n])
             better = f"{variants[name] - bare:+.2f} dB ({FOX_VARIANTS[name][0]})"
-            found.append(("capture: higher PSNR than the bare loop", better, variants[name] > bare))
+            each = [row["psnr_db"] for row in pair["bare"]]
+            goal = "capture: a variant measured in the same way is above the bare loop by more than its runs differ"
+            found.append((goal, better, variants[name] - bare > max(each) - min(each)))
     row = result.get("flag", {}).get("flag:settled", result.get("flag", {}).get("flag:size"))
     if row and "failed" not in row:
         found += [
@@ -87,12 +94,10 @@ def spread(result: Row, name: str) -> str:
 
 @table(PAGE, "training.gains", "train_*")
 def gains(result: Row) -> list[str]:
-    """The variants, sorted by their gain over the mean of the bare loop's runs."""
+    """The variants measured as the bare loop was, sorted by their gain over the mean of its runs."""
     bare = [row["psnr_db"] for row in result.get("pair", {}).get("bare", [])]
     found = {
-        FOX_VARIANTS[name][0]: row["psnr_db"] - statistics.mean(bare)
-        for name, row in result.get("variants", {}).items()
-        if bare and "failed" not in row
+        FOX_VARIANTS[name][0]: row["psnr_db"] - statistics.mean(bare) for name, row in _alike(result).items() if bare
     }
     return [f"- {found[name]:+.2f} dB {name}" for name in sorted(found, key=lambda name: -found[name])]
 
