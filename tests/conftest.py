@@ -1,6 +1,8 @@
 """Fixtures and the rule for GPU tests."""
 
+import importlib.util
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -25,6 +27,17 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
         if "slow" in item.keywords and "slow" not in marks:
             item.add_marker(pytest.mark.skip(reason="slow: run with -m slow"))
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """Path of a Chromium that playwright can drive. Without one a test is skipped, or fails where CI is set."""
+    found = [shutil.which(name) for name in ("chromium", "chromium-browser", "google-chrome")]
+    path = next((path for path in found if path), None)
+    missing = "an installed Chromium" if path is None else "playwright"
+    if path is None or importlib.util.find_spec("playwright") is None:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)(f"needs {missing}")
+    return path
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.gaussians.ply_table import read_header
+from gaussian_swaying._ply_table import read_header
 
 
 @dataclass(frozen=True, slots=True, eq=False)

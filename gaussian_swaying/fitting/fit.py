@@ -40,7 +40,7 @@ from gaussian_swaying.fitting.least_squares import (
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.report import Result, predictions, write_results
 from gaussian_swaying.fitting.settling import unsettled
-from gaussian_swaying.fitting.tracks import Tracks, match, track
+from gaussian_swaying.fitting.tracks import Tracks, match, opencv, track
 from gaussian_swaying.fitting.unknowns import check_unknowns
 from gaussian_swaying.fitting.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import MPMState
@@ -350,11 +350,14 @@ def run_fit(
         The result.
 
     Raises:
+        ImportError: If a stage follows points and OpenCV is not installed.
         ValueError: If something does not fit together, the video cannot tell the unknowns apart, or the folder cannot
             be used.
     """
     folder, parser = Path(output), Simulation.parser()
     settings = parse_base(plan, parser)
+    if {"tracks", "matches"} & set(plan.stages):
+        opencv()  # before anything that takes time
     settings.device = device
     own = settings.clone()
     own.camera = own.cameras = None  # the videos have their own

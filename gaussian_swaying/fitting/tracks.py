@@ -179,7 +179,7 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
     """
     import numpy as np
 
-    cv2 = _opencv()
+    cv2 = opencv()
     options = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS}
     options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
     count, (height, width) = len(start), images.shape[1:3]
@@ -214,7 +214,7 @@ def _chosen(simulation: Simulation, video: Footage, grey: Any, most: int) -> tup
     place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
     column, row = pixel[place].long().unbind(-1)
     width, height = video.size
-    texture = torch.from_numpy(np.asarray(_opencv().cornerMinEigenVal(grey, 7)))
+    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(grey, 7)))
     score = texture[row, column]
     good = score > QUALITY * texture.max()
     place, score, column, row = (part[good] for part in (place, score, column, row))
@@ -260,14 +260,20 @@ def _grey(images: Tensor) -> Any:
     return (images.float() @ weights).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
-def _opencv() -> Any:
+def opencv() -> Any:
+    """The module ``cv2``, which follows points.
+
+    Raises:
+        ImportError: If OpenCV is not installed.
+    """
     try:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "Tracks need OpenCV: pip install 'gaussian-swaying[fit]', or leave `tracks` out of `stages`.", name="cv2"
+            "Tracks and matches need OpenCV: pip install 'gaussian-swaying[fit]', or leave them out of `stages`.",
+            name="cv2",
         ) from error
     return cv2
 
 
-__all__ = ["Tracks", "drawn_beside", "follow", "match", "track"]
+__all__ = ["Tracks", "drawn_beside", "follow", "match", "opencv", "track"]

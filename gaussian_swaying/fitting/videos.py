@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,19 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.captures.images import load_image, read_image
+from gaussian_swaying.captures.images import PosedImage, load_image, read_image
 from gaussian_swaying.captures.transforms import read_transforms, transforms_files
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms, read_number
 
-MOST_FRAMES = 100_000
+MOST_FRAMES = 10_000
+"""Most frames of all videos of a fit."""
+
+MOST_BYTES = 2 << 30
+"""Most bytes of their decoded pixels: 345 frames of 1920 x 1080. Reading takes up to twice as much memory."""
+
+MOST_PIXELS = 40_000_000
+"""Most pixels of a frame of a film; 8K has 33 million. ffmpeg itself refuses larger ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +64,49 @@ class _Shot:
     mask: Tensor | None
 
 
+class _Room:
+    """What the videos of a fit may still decode."""
+
+    def __init__(self) -> None:
+        self.frames, self.bytes = MOST_FRAMES, MOST_BYTES
+
+    def holds(self, width: int, height: int) -> int:
+        """How many more frames of this size fit."""
+        return min(self.frames, self.bytes // (3 * width * height))
+
+    def check(self, path: Path, width: int, height: int, frames: int = 1) -> None:
+        """Raise ValueError if some frames of a file do not fit any more."""
+        if frames > self.holds(width, height):
+            raise ValueError(
+                f"The videos have more than {MOST_FRAMES:,} frames or {MOST_BYTES / 2**30:g} GiB of pixels together "
+                f"({path}, {width} x {height}): cut them to the motion that is fitted and predicted, make them "
+                "smaller, or choose `cameras`."
+            )
+
+    def take(self, path: Path, width: int, height: int) -> None:
+        """Make room for one frame of a file.
+
+        Raises:
+            ValueError: If it does not fit any more.
+        """
+        self.check(path, width, height)
+        self.frames -= 1
+        self.bytes -= 3 * width * height
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Frames of one camera that are not decoded yet.
+
+    Attributes:
+        begin: Time of the first one [s].
+        read: Decodes them.
+    """
+
+    begin: float
+    read: Callable[[_Room], list[_Shot]]
+
+
 def read_videos(
     paths: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], cameras: Sequence[str] | None = None
 ) -> list[Footage]:
@@ -63,7 +115,8 @@ def read_videos(
     Each folder has a ``transforms.json`` as of Nerfstudio. A frame has ``file_path``, ``transform_matrix``, ``time``
     [s] and, with several cameras, ``camera``, a name or a number; a transparent image or ``mask_path`` gives the
     silhouette. An entry with ``video_path`` instead of ``file_path`` is a whole video of a camera that stands still:
-    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file.
+    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file. Cameras that are not
+    wanted are not decoded; the others together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
 
     Args:
         paths: A folder or a transforms.json, or several. Their times belong to the same clock.
@@ -79,16 +132,20 @@ def read_videos(
     several = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not several:
         raise ValueError("Expected `videos` to name a folder with transforms.json.")
-    shots: dict[str, list[_Shot]] = {}
+    parts: dict[str, list[_Part]] = {}
     for number, path in enumerate(map(Path, several)):
         found = _read(path)
         for name, own in found.items():
-            shots.setdefault(name if len(several) == 1 or name not in shots else f"{number}-{name}", []).extend(own)
-    begin = min(shot.time for own in shots.values() for shot in own)
+            parts.setdefault(name if len(several) == 1 or name not in parts else f"{number}-{name}", []).extend(own)
+    begin = min(part.begin for own in parts.values() for part in own)
     for name in cameras or ():
-        if name not in shots:
-            raise ValueError(f"There is no camera {name!r} in `videos`: `cameras` may be {', '.join(sorted(shots))}.")
-    return [_footage(name, shots[name], begin) for name in sorted(cameras or shots)]
+        if name not in parts:
+            raise ValueError(f"There is no camera {name!r} in `videos`: `cameras` may be {', '.join(sorted(parts))}.")
+    room = _Room()
+    return [
+        _footage(name, [shot for part in parts[name] for shot in part.read(room)], begin)
+        for name in sorted(cameras or parts)
+    ]
 
 
 def frame_times(videos: Sequence[Footage]) -> list[float]:
@@ -120,19 +177,21 @@ def _footage(name: str, shots: list[_Shot], begin: float) -> Footage:
     return Footage(name, tuple(times), tuple(shot.camera for shot in shots), images, known)
 
 
-def _read(path: Path) -> dict[str, list[_Shot]]:
+def _read(path: Path) -> dict[str, list[_Part]]:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: set `videos` to a folder with transforms.json.")
     files = transforms_files(path)
     if not files:
         raise ValueError(f"{path} has no transforms.json: write one with the cameras and times of the frames.")
-    shots: dict[str, list[_Shot]] = {}
+    parts: dict[str, list[_Part]] = {}
     for file, _ in files:
         data, where = load_transforms(file), f"`{file}`"
         frames = data["frames"]
         films = [k for k, frame in enumerate(frames) if "video_path" in frame]
         for k in films:
-            shots.setdefault(_camera_name(frames[k]), []).extend(_film(file, where, data, k))
+            begin = read_number(where, frames[k], "time") or 0.0
+            part = _Part(begin, partial(_film, file, where, data, k, begin))
+            parts.setdefault(_camera_name(frames[k]), []).append(part)
         if len(films) == len(frames):
             continue
         posed = {item.name: item for item in read_transforms(file)[0]}
@@ -140,46 +199,73 @@ def _read(path: Path) -> dict[str, list[_Shot]]:
             name = str(frame.get("file_path", "")).replace("\\", "/").removeprefix("./")
             if "video_path" in frame or name not in posed:
                 continue
-            item = posed[name]
             time = read_number(where, frame, "time")
             if time is None:
                 raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
-            lens = item.lens.undistorted()
-            camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height)
-            pixels = load_image(item.path, item.lens)
-            mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
-            if isinstance(frame.get("mask_path"), str):
-                mask = read_image(file.parent / frame["mask_path"])[..., 0].clone()
-                if mask.shape != pixels.shape[:2]:
-                    raise ValueError(f"The mask {frame['mask_path']} of {where} is not as large as its frame.")
-            shots.setdefault(_camera_name(frame), []).append(_Shot(time, camera, pixels[..., :3].contiguous(), mask))
-    if not shots:
+            mask = frame.get("mask_path")
+            cover = file.parent / mask if isinstance(mask, str) else None
+            part = _Part(time, partial(_picture, posed[name], cover, time))
+            parts.setdefault(_camera_name(frame), []).append(part)
+    if not parts:
         raise ValueError(f"{path} has no frames on disk: put the images of its transforms.json beside it.")
-    return shots
+    return parts
 
 
 def _camera_name(frame: dict[str, Any]) -> str:
     return str(frame.get("camera", frame.get("camera_name", "0")))
 
 
-def _film(file: Path, where: str, data: dict[str, Any], index: int) -> list[_Shot]:
-    """The frames of a video file."""
-    import imageio.v3 as iio
+def _picture(item: PosedImage, cover: Path | None, time: float, room: _Room) -> list[_Shot]:
+    """One frame, from an image and perhaps a mask."""
+    room.take(item.path, item.lens.width, item.lens.height)
+    lens = item.lens.undistorted()
+    camera = Camera(item.world_to_camera.float(), lens.intrinsics().float(), lens.width, lens.height)
+    pixels = load_image(item.path, item.lens)
+    mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
+    if cover is not None:
+        mask = read_image(cover)[..., 0].clone()
+        if mask.shape != pixels.shape[:2]:
+            raise ValueError(f"The mask {cover} is not as large as its frame {item.path}.")
+    return [_Shot(time, camera, pixels[..., :3].contiguous(), mask)]
+
+
+def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[_Shot]:
+    """The frames of a video file, decoded one by one as long as there is room."""
+    from imageio_ffmpeg import read_frames
 
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     camera = camera_of_transforms(file, data, index)
-    fps, begin = read_number(where, entry, "fps"), read_number(where, entry, "time") or 0.0
+    size, fps = (camera.width, camera.height), read_number(where, entry, "fps")
+    if fps is not None and not fps > 0:
+        raise ValueError(f"The field `frames[{index}].fps` of the camera file {where} is {fps:g}: set it above 0.")
+    shots: list[_Shot] = []
+    limits = ["-max_pixels", str(MOST_PIXELS)], ["-frames:v", str(room.holds(*size) + 1)]
+    with closing(read_frames(path, input_params=limits[0], output_params=limits[1])) as film:
+        head = _next(film, path)
+        if head is None or tuple(head["size"]) != size:
+            raise ValueError(f"The video {path} is not {size[0]} x {size[1]} as its camera in {where} says.")
+        rate = fps or float(head["fps"])
+        if not rate > 0:
+            raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
+        room.check(path, *size, frames=int(head["fps"] * head["duration"]))  # what it says; it may have more
+        while (frame := _next(film, path)) is not None:
+            room.take(path, *size)
+            picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
+            shots.append(_Shot(begin + len(shots) / rate, camera, picture, None))
+    return shots
+
+
+def _next(film: Any, path: Path) -> Any:
+    """What ffmpeg tells or decodes next; None at the end."""
     try:
-        rate = fps or float(iio.immeta(path, plugin="FFMPEG")["fps"])
-        pictures = [torch.from_numpy(picture[..., :3].copy()) for picture in iio.imiter(path, plugin="FFMPEG")]
+        return next(film, None)
     except Exception as error:  # ffmpeg's errors are of many kinds
+        if "max pixel count" in str(error):
+            raise ValueError(f"The video {path} has more than {MOST_PIXELS:,} pixels: make it smaller.") from None
         raise ValueError(
             f"The video {path} cannot be read ({str(error).splitlines()[0]}): convert it to mp4."
         ) from error
-    if not pictures or tuple(pictures[0].shape[:2]) != (camera.height, camera.width):
-        raise ValueError(f"The video {path} is not {camera.width} x {camera.height} as its camera in {where} says.")
-    return [_Shot(begin + k / rate, camera, picture, None) for k, picture in enumerate(pictures[:MOST_FRAMES])]
 
 
 __all__ = ["Footage", "frame_times", "read_videos"]

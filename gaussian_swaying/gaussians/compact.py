@@ -11,10 +11,10 @@ import torch
 from einops import rearrange
 
 from gaussian_swaying._inputs import check_regular
+from gaussian_swaying._ply_table import read_element, read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import check_sizes_and_rotations, read_binary_header, read_ply
-from gaussian_swaying.gaussians.ply_table import read_element, read_header
 
 CHUNK = 256  # number of Gaussians with a common range of values in a compressed .ply
 _SPLAT = np.dtype([("means", "<f4", 3), ("sizes", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])

@@ -12,8 +12,8 @@ import torch
 from einops import rearrange
 
 from gaussian_swaying._files import atomic
+from gaussian_swaying._ply_table import PlyHeader, read_element, read_header
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.ply_table import PlyHeader, read_element, read_header
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 _MEANS = ("x", "y", "z")
@@ -143,7 +143,7 @@ def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray)
 
 
 def read_binary_header(path: Path) -> PlyHeader:
-    """The header from :func:`~gaussian_swaying.gaussians.ply_table.read_header`; ValueError if the file is text."""
+    """The header from :func:`~gaussian_swaying._ply_table.read_header`; ValueError if the file is text."""
     header = read_header(path)
     if header.order == "":
         raise ValueError(f"{path} is an ASCII .ply (format ascii); export as binary.")

@@ -59,7 +59,7 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
 
     Raises:
         ValueError: If ``spacing`` is not above zero, a tensor does not have the shape above, or there would be more
-            than 5 million candidate points.
+            than 5 million candidate points, and more than nine for each large Gaussian.
     """
     check_positive("spacing", spacing)
     count = len(means)
@@ -75,7 +75,8 @@ def subdivide(means: Tensor, quats: Tensor, log_scales: Tensor, opacity: Tensor,
     # an odd number along each axis, so that the centre is among them
     pieces = (2 * (half / spacing - 0.5).ceil().clamp_min(0) + 1).clamp_max(_MOST).long()
     large = (pieces > 1).any(-1).nonzero()[:, 0]
-    if float(pieces[large].double().prod(-1).sum()) > _MOST:
+    most = max(_MOST, 9 * len(large))  # three along each axis is the least that a large one has
+    if float(pieces[large].double().prod(-1).sum()) > most:
         widest = float(half.amax() / spacing)
         raise ValueError(
             f"Some Gaussians extend over {widest:.3g} spacings of {spacing:.3g}, which is too many points: raise the "

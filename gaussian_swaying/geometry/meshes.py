@@ -9,11 +9,19 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying._ply_table import read_header
 from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 MOST_NODES = 4_000_000
 """Most nodes of a distance grid."""
+
+LARGEST_MESH = 1 << 28
+"""Largest file of a mesh [bytes]; some three million vertices as .obj."""
+
+MOST_SQUARES = 10_000_000
+"""Most squares of a cell of the distance grid under all triangles of a mesh, each as a square of its longest side."""
 
 _DISAGREE = 0.02
 """Share of the nodes next to which the rays along the three axes may disagree; more of them mean a hole."""
@@ -31,52 +39,76 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
         Vertices, shape (V, 3), float64, and triangles, shape (T, 3), int64.
 
     Raises:
-        ValueError: If the file is neither, is damaged, or has no faces.
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is neither, is not a regular file, is larger than :data:`LARGEST_MESH`, is damaged, has
+            no faces, or has vertices on one line.
     """
     file = Path(path)
     readers = {".ply": _read_ply, ".obj": _read_obj}
     if file.suffix.lower() not in readers:
         raise ValueError(f"Expected a mesh as .ply or .obj, but got {file}.")
+    check_regular(file, "the mesh", LARGEST_MESH)
+    if file.suffix.lower() == ".ply":
+        read_header(file)  # its sentences name the file
     try:
         vertices, polygons = readers[file.suffix.lower()](file)
-    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
+        triangles = torch.tensor([(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)]).long()
+    except Exception as error:  # plyfile and numbers that are too large raise many kinds of errors
+        told = str(error).strip() or type(error).__name__
         raise ValueError(
-            f"The mesh {file} cannot be read ({error}): export it again as .obj with triangles."
+            f"The mesh {file} cannot be read ({told:.200}): export it again as .obj with triangles."
         ) from error
-    faces = [(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)]
-    if not faces:
+    if not len(triangles):
         raise ValueError(f"The mesh {file} has no faces: a point cloud or a splat is no mesh.")
-    triangles = torch.tensor(faces, dtype=torch.long)
     if int(triangles.min()) < 0 or int(triangles.max()) >= len(vertices) or not bool(torch.isfinite(vertices).all()):
         raise ValueError(f"The mesh {file} has faces without vertices, or vertices that are NaN or infinite.")
+    if _on_a_line(vertices[triangles.unique()]):
+        raise ValueError(f"The mesh {file} has all its vertices on one line, so it has no surface: export it again.")
     return vertices, triangles
 
 
-def _read_ply(file: Path) -> tuple[Tensor, list[list[int]]]:
-    from plyfile import PlyData, PlyParseError
+def _on_a_line(places: Tensor) -> bool:
+    """Whether places (V, 3) are on one line but for rounding to float32, as files have it.
 
-    try:
-        data = PlyData.read(str(file))
-    except PlyParseError as error:
-        raise ValueError(str(error)) from error
+    Rounding moves a coordinate c by at most c / 2^24, so a place by sqrt(3) times that of the largest coordinate. The
+    second singular value is the root of the sum of the squared distances from the line that fits best.
+    """
+    largest = float(places.abs().max())
+    scaled = places / largest if largest > 0 else places
+    spread = torch.linalg.svdvals(scaled - scaled.mean(0))
+    return len(spread) < 2 or float(spread[1]) <= (3 * len(places)) ** 0.5 / 2**24
+
+
+def _read_ply(file: Path) -> tuple[Tensor, list[list[int]]]:
+    from plyfile import PlyData
+
+    data = PlyData.read(str(file))
+    if "vertex" not in data:
+        raise ValueError("it has no element `vertex`")
     vertex = data["vertex"]
     vertices = torch.stack([torch.tensor(vertex[axis].astype("float64")) for axis in "xyz"], dim=-1)
     if "face" not in data:
         return vertices, []
     face = data["face"]
-    name = next(p.name for p in face.properties if p.name in ("vertex_indices", "vertex_index"))
+    name = next((p.name for p in face.properties if p.name in ("vertex_indices", "vertex_index")), None)
+    if name is None:
+        raise ValueError("its faces have no `vertex_indices`")
     return vertices, [[int(k) for k in polygon] for polygon in face[name]]
 
 
 def _read_obj(file: Path) -> tuple[Tensor, list[list[int]]]:
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for line in file.read_text().splitlines():
+    for number, line in enumerate(file.read_text().splitlines(), start=1):
         words = line.split()
         if words[:1] == ["v"]:
+            if len(words) < 4:
+                raise ValueError(f"line {number} has a vertex of fewer than three numbers")
             vertices.append([float(word) for word in words[1:4]])
         elif words[:1] == ["f"]:
             numbers = [int(word.split("/")[0]) for word in words[1:]]
+            if 0 in numbers:
+                raise ValueError(f"line {number} has a face with the vertex 0, but they count from 1")
             polygons.append([k - 1 if k > 0 else len(vertices) + k for k in numbers])
     return torch.tensor(vertices, dtype=torch.float64).reshape(-1, 3), polygons
 
@@ -96,22 +128,23 @@ def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceG
         The distances, on a grid that reaches three cells beyond the mesh.
 
     Raises:
-        ValueError: If the mesh has no extent, is not closed, or the grid is too large.
+        ValueError: If the mesh has no extent, is not closed, encloses none of the nodes, has far too many
+            triangles, or the grid is too large.
     """
     check_shape("vertices", vertices, None, 3, batches=False)
     corners = vertices.detach().double().cpu()[faces.cpu()]  # (T, 3 corners, 3)
     low, high = corners.flatten(0, 1).amin(0), corners.flatten(0, 1).amax(0)
     spacing = float((high - low).amax()) / cells
-    if not spacing > 0:
-        raise ValueError("The mesh has no extent: export it again.")
+    if not 0 < spacing < float("inf"):
+        raise ValueError("The mesh has no extent, or an infinite one: export it again.")
     size = ((high - low) / spacing).ceil().long() + 7
     if int(size.prod()) > MOST_NODES:
         raise ValueError(f"A distance grid of {size.tolist()} nodes is too large: lower `cells`.")
     origin = low - 3 * spacing
     axes = [origin[k] + spacing * torch.arange(int(size[k]), dtype=torch.float64) for k in range(3)]
     nodes = torch.cartesian_prod(*axes)
-    distance = _nearest_distance(nodes, corners, spacing)
     shape = tuple(size.tolist())
+    distance = _nearest_distance(nodes, corners, spacing).reshape(shape)
     votes = torch.stack([_inside(corners, origin, spacing, shape, axis) for axis in range(3)]).sum(0)
     unsure = ((votes == 1) | (votes == 2)).double().mean()
     if float(unsure) > _DISAGREE:
@@ -119,14 +152,22 @@ def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceG
             f"The mesh is not closed: rays along the three axes disagree about {100 * float(unsure):.0f} % of the "
             "space around it; close its holes, or give it a thickness."
         )
+    if not bool(((votes >= 2) & (distance > 1e-6 * spacing)).any()):  # those on the surface are neither
+        raise ValueError(
+            f"The mesh encloses none of the nodes of its grid, {spacing:.3g} apart: give it a thickness, or raise "
+            "`cells`."
+        )
     sign = torch.where(votes >= 2, -1.0, 1.0).double()
-    return DistanceGrid(sign * distance.reshape(shape), origin, spacing)
+    return DistanceGrid(sign * distance, origin, spacing)
 
 
 def _nearest_distance(nodes: Tensor, corners: Tensor, spacing: float) -> Tensor:
     """Distance of places (N, 3) from triangles (T, 3, 3)."""
     longest = (corners - corners.roll(1, dims=1)).norm(dim=-1).amax(-1)
-    per_side = (longest / spacing).ceil().long().clamp(1, 64)
+    per_side = (longest / spacing).ceil().clamp(min=1)
+    if float(per_side.square().sum()) > MOST_SQUARES:
+        raise ValueError(f"The mesh has {len(corners):,} triangles, too many, or too many large ones: simplify it.")
+    per_side = per_side.long().clamp(max=64)
     samples, owner = [], []
     for count in per_side.unique().tolist():
         own = (per_side == count).nonzero()[:, 0]

@@ -478,6 +478,7 @@ def check_state(solver: MPMSolver, state: MPMState) -> None:
     _raise_if_bad(solver, verdict, time)
 
 
+FARTHEST = 1000  # a run ends when a particle is so many sizes of the object away from where it started
 _FAR, _LOST, _NOT_FINITE = 1, 2, 3  # what is wrong with a particle; the last is the worst
 
 
@@ -490,7 +491,7 @@ def _verdict(solver: MPMSolver, state: MPMState, moved: Tensor) -> Tensor:
     size = (high - low).amax().clamp(min=solver.dx)
     values = torch.cat([state.position, state.velocity, state.F_elastic.flatten(-2)], dim=-1)
     finite = torch.linalg.vector_norm(values, math.inf, dim=-1) < math.inf  # not for NaN either
-    wrong = torch.where(state.lost, _LOST, (moved > 1000 * size).int())
+    wrong = torch.where(state.lost, _LOST, (moved > FARTHEST * size).int())
     wrong = torch.where(finite, wrong, _NOT_FINITE).reshape(-1)
     first = (wrong > 0).int().argmax(0, keepdim=True)
     found = torch.cat([wrong.index_select(0, first), first, state.lost.sum()[None]])
@@ -513,6 +514,6 @@ def _raise_if_bad(solver: MPMSolver, verdict: list[float], time: float) -> None:
         cause = f"it left the grid ({lost} particles did)"
         remedy = "enclose the scene with an EnclosingBox or a Plane, or lower the speeds that carry it away"
     else:
-        cause = f"it is more than 1000 object sizes ({verdict[3]:.3g} m) away from where it started"
+        cause = f"it is more than {FARTHEST} object sizes ({verdict[3]:.3g} m) away from where it started"
         remedy = "pin or enclose the object, or lower `solver.cfl`"
     raise SimulationDiverged(time, particle, cause, remedy)

@@ -7,6 +7,7 @@ import platform
 import sys
 import threading
 from functools import cache
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -21,6 +22,12 @@ if TYPE_CHECKING:
 
 LOCAL = "local"
 STOP_S = 300.0  # how long tasks may take to end their runs when the sweep is stopped
+
+
+def check_ray() -> None:
+    """Raise ValueError if Ray is missing."""
+    if find_spec("ray") is None:
+        raise ValueError("`--ray` needs Ray: install gaussian-swaying[ray], or leave it out.")
 
 
 class RayBackend:
@@ -49,10 +56,9 @@ class RayBackend:
         on_gpu: bool = False,
         per_gpu: int | None = 1,
     ) -> None:
-        try:
-            import ray
-        except ImportError as error:
-            raise ValueError("`--ray` needs Ray: install gaussian-swaying[ray], or leave it out.") from error
+        check_ray()
+        import ray
+
         self._ray: Any = ray
         self._ours = not ray.is_initialized()
         if self._ours:
@@ -145,4 +151,4 @@ def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]
     return done
 
 
-__all__ = ["LOCAL", "RayBackend"]
+__all__ = ["LOCAL", "RayBackend", "check_ray"]

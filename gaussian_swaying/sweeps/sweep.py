@@ -21,7 +21,7 @@ from gaussian_swaying.sweeps.contact_sheet import PICTURES, write_contact_sheets
 from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import Plan
 from gaussian_swaying.sweeps.pool import Pool
-from gaussian_swaying.sweeps.ray_backend import LOCAL, RayBackend
+from gaussian_swaying.sweeps.ray_backend import LOCAL, RayBackend, check_ray
 from gaussian_swaying.sweeps.record import (
     check_parquet,
     open_folder,
@@ -117,6 +117,8 @@ def run_sweep(
     check_choice("device", device, ("auto", "cpu", "cuda"))
     if parquet:
         check_parquet()
+    if ray is not None:
+        check_ray()
     lock = open_folder(folder, plan, resume, together, part)
     try:
         started()

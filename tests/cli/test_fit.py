@@ -40,6 +40,17 @@ def test_bad_input(fields, words, tmp_path, monkeypatch, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["fit.yaml"]
 
 
+@pytest.mark.parametrize("stage", ["tracks", "matches"])
+def test_without_opencv(stage, tmp_path, monkeypatch, capsys):
+    """Before the videos are read; the other stages need no extra."""
+    monkeypatch.setitem(__import__("sys").modules, "cv2", None)
+    for stages, words in (([stage], "pip install 'gaussian-swaying[fit]'"), (["pixels"], "video does not exist")):
+        assert main(["--config", _file(tmp_path / "fit.yaml", stages=stages)]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1, error
+        assert words in error
+
+
 def test_the_shipped_fit_is_a_plan():
     from gaussian_swaying.fitting.plan import read_plan
 

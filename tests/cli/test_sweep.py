@@ -46,6 +46,13 @@ def test_a_shipped_sweep_by_name(tmp_path, monkeypatch, capsys):
     _refused(["flag_wind"], tmp_path, capsys, "'flag_wind' (did you mean flag_winds?)")
 
 
+@pytest.mark.parametrize(("extra", "module"), [("parquet", "record"), ("ray", "ray_backend")])
+def test_a_missing_extra_leaves_nothing_behind(extra, module, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(f"gaussian_swaying.sweeps.{module}.find_spec", lambda name: None)
+    file = _file(tmp_path / "a.yaml", axes={"material.E": [1e3, 2e3]})
+    _refused([file, f"--{extra}", "--output", str(tmp_path / "out")], tmp_path, capsys, f"gaussian-swaying[{extra}]")
+
+
 def test_bad_input(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     flow = {"wind.flow": [[4, 0, 0]]}

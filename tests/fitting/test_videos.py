@@ -2,12 +2,15 @@
 
 import json
 import shutil
+import subprocess
 
 import imageio.v3 as iio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 
+from gaussian_swaying.fitting import videos
 from gaussian_swaying.fitting.videos import frame_times, read_videos
 
 from .conftest import FRAMES, cameras
@@ -56,3 +59,102 @@ def test_bad_videos(own, tmp_path):
         file.write_text(json.dumps(other))
         with pytest.raises(ValueError, match=words):
             read_videos(tmp_path / "video")
+
+
+def _film(folder, size, frames, *, says=None, **fields):
+    """A grey film of some hundred bytes a second, and its transforms.json; ``says`` replaces its size there."""
+    width, height = size
+    source = f"color=c=gray:s={width}x{height}:r=30:d={frames / 30}"
+    words = ["-y", "-v", "error", "-f", "lavfi", "-i", source, "-c:v", "libx264", "-preset", "ultrafast"]
+    path = folder / f"film{len(list(folder.glob('*.mp4')))}.mp4"
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words, "-pix_fmt", "yuv420p", str(path)], check=True)
+    width, height = says or size
+    entry = {"video_path": path.name, "w": width, "h": height, "fl_x": 50.0, "transform_matrix": np.eye(4).tolist()}
+    file = folder / "transforms.json"
+    given = json.loads(file.read_text())["frames"] if file.exists() else []
+    file.write_text(json.dumps({"frames": [*given, entry | fields]}))
+    return path
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """How many bytes of pixels ffmpeg delivered, for each film."""
+    counted = {}
+    read = imageio_ffmpeg.read_frames
+
+    def counting(path, **settings):
+        for item in read(path, **settings):
+            counted[path.name] = counted.get(path.name, 0) + (0 if isinstance(item, dict) else len(item))
+            yield item
+
+    monkeypatch.setattr(imageio_ffmpeg, "read_frames", counting)
+    return counted
+
+
+@pytest.mark.parametrize("name", ["MOST_FRAMES", "MOST_BYTES"])
+def test_a_film_that_says_it_is_too_long_is_not_decoded(tmp_path, monkeypatch, decoded, name):
+    path = _film(tmp_path, (64, 64), 300)
+    monkeypatch.setattr(videos, name, 300 if name == "MOST_FRAMES" else 300 * 3 * 64 * 64)
+    (film,) = read_videos(tmp_path)
+    assert len(film.times) == 300
+    assert decoded.pop(path.name) == film.images.numel()
+    monkeypatch.setattr(videos, name, getattr(videos, name) - 1)
+    with pytest.raises(ValueError, match=r"film0.mp4, 64 x 64.*cut them"):
+        read_videos(tmp_path)
+    assert decoded == {path.name: 0}
+
+
+def test_a_film_that_is_longer_than_it_says(tmp_path, monkeypatch, decoded):
+    """An attacker writes the header."""
+    read = imageio_ffmpeg.read_frames
+
+    def lying(path, **settings):
+        for item in read(path, **settings):
+            yield item | {"duration": 0.0} if isinstance(item, dict) else item
+
+    monkeypatch.setattr(imageio_ffmpeg, "read_frames", lying)
+    monkeypatch.setattr(videos, "MOST_FRAMES", 100)
+    path = _film(tmp_path, (64, 64), 3000)
+    with pytest.raises(ValueError, match="more than 100 frames"):
+        read_videos(tmp_path)
+    assert decoded[path.name] == 101 * 3 * 64 * 64
+
+
+def test_frames_that_are_too_large(tmp_path, monkeypatch, decoded):
+    """ffmpeg refuses to decode them; those of another size than their camera's go no further than the header."""
+    huge = _film(tmp_path, (64, 64), 3)
+    read_videos(tmp_path)
+    decoded.clear()
+    with monkeypatch.context() as smaller:
+        smaller.setattr(videos, "MOST_PIXELS", 64 * 64 - 1)
+        with pytest.raises(ValueError, match=r"film0.mp4 has more than 4,095 pixels: make it smaller\.$"):
+            read_videos(tmp_path)
+    assert decoded == {}
+    huge.unlink()
+    (tmp_path / "transforms.json").unlink()
+    _film(tmp_path, (64, 64), 30, says=(64, 32))
+    with pytest.raises(ValueError, match="is not 64 x 32"):
+        read_videos(tmp_path)
+    assert decoded == {"film0.mp4": 0}
+
+
+def test_a_camera_that_is_not_wanted_is_not_decoded(tmp_path, decoded):
+    _film(tmp_path, (64, 64), 30, camera="left", time=1.0)
+    _film(tmp_path, (64, 64), 30, camera="right", time=0.5)
+    (film,) = read_videos(tmp_path, ["left"])
+    assert decoded == {"film0.mp4": film.images.numel()}
+    assert film.times[0] == 0.5  # the clock of all cameras begins with the earliest frame
+
+
+def test_pictures_share_the_room_of_the_films(own, monkeypatch):
+    monkeypatch.setattr(videos, "MOST_FRAMES", 2 * FRAMES - 1)
+    assert len(read_videos(own / "video", ["left"])[0].times) == FRAMES
+    with pytest.raises(ValueError, match="more than 25 frames"):
+        read_videos(own / "video")
+
+
+@pytest.mark.parametrize("rate", [0, -24])
+def test_a_frame_rate_that_is_none(tmp_path, rate):
+    _film(tmp_path, (64, 64), 3, fps=rate)
+    with pytest.raises(ValueError, match=rf"frames\[0\].fps.*is {rate}: set it above 0"):
+        read_videos(tmp_path)

@@ -1,8 +1,11 @@
 """Signed distances of solids, against brute force and exact values."""
 
+import os
+
 import pytest
 import torch
 
+from gaussian_swaying.geometry import meshes
 from gaussian_swaying.geometry.distance import (
     DistanceGrid,
     ball_distance,
@@ -126,6 +129,17 @@ def test_an_open_mesh_is_refused(tmp_path):
         mesh_distance(*read_mesh(file), cells=16)
 
 
+def _ply(element, *properties, rows=""):
+    """A .ply file as text."""
+    lines = ["ply", "format ascii 1.0", element, *(f"property float {name}" for name in properties), "end_header"]
+    return "\n".join(lines) + "\n" + rows
+
+
+CORNER = _ply("element vertex 3", *"xyz").removesuffix("end_header\n")
+FACE = "element face 1\nproperty list {}\nend_header\n"
+ROWS = "0 0 0\n1 0 0\n0 1 0\n"
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -133,13 +147,71 @@ def test_an_open_mesh_is_refused(tmp_path):
         ("a.obj", "v 0 0 0\n", "no faces"),
         ("a.obj", "v 0 0 zero\nf 1 1 1", "cannot be read"),
         ("a.obj", "v 0 0 0\nf 1 2 3", "without vertices"),
-        ("a.ply", "splat", "cannot be read"),
+        ("a.ply", "splat", r"a.ply is not a \.ply file"),
+        ("a.obj", "v 0 0\nv 1 1\nv 0 1\nf 1 2 3", "line 1 has a vertex of fewer"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nf 0 1 2\nv 0 1 0", "line 3 has a face with the vertex 0"),
+        ("a.obj", "v 0 0 0\nf 1 1 99999999999999999999", "cannot be read"),
+        ("a.obj", "v 0 0 0\nv 1 2 3\nv 0.1 0.2 0.3\nv 9 9 0\nf 1 2 3", "on one line"),  # no face has the fourth
+        ("a.obj", "v 5 5 5\nf 1 1 1", "on one line"),
+        ("a.obj", "v 0 0 0\nf 1 1 1 \udcff", "cannot be read"),
+        ("a.ply", _ply("element vertex 2000000000", *"xyz"), "is truncated: its header announces 2,000,000,000"),
+        ("a.ply", _ply("element face 1", "x", rows="0\n"), "it has no element `vertex`"),
+        ("a.ply", _ply("element vertex 1", *"xyz", rows="0 0 0\n"), "no faces"),
+        ("a.ply", _ply("element vertex 1", "x", rows="0\n"), "cannot be read"),
+        ("a.ply", CORNER + FACE.format("uchar int corners") + ROWS + "3 0 1 2\n", "faces have no `vertex_indices`"),
+        ("a.ply", CORNER + FACE.format("uchar float vertex_index") + ROWS + "3 0 1 inf\n", "cannot be read"),
+        ("a.ply", CORNER + FACE.format("uint int vertex_index") + ROWS + "4000000000 0 1\n", "cannot be read"),
     ],
 )
 def test_a_bad_mesh_is_refused_by_name(tmp_path, name, text, message):
-    (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match=message):
+    (tmp_path / name).write_text(text, errors="surrogateescape")
+    with pytest.raises(ValueError, match=message) as refused:
         read_mesh(tmp_path / name)
+    assert str(tmp_path / name) in str(refused.value)
+
+
+def test_a_list_that_claims_four_billion_corners(tmp_path):
+    """A binary list is as long as its first number says."""
+    head = _ply("element vertex 1", *"xyz").replace("ascii", "binary_little_endian").removesuffix("end_header\n")
+    file = tmp_path / "a.ply"
+    file.write_bytes((head + FACE.format("uint double vertex_indices")).encode() + bytes(12) + b"\xff" * 4)
+    with pytest.raises(ValueError, match="cannot be read"):
+        read_mesh(file)
+
+
+@pytest.mark.parametrize("name", ["pipe.ply", "pipe.obj"])
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_no_mesh(tmp_path, name):
+    """Reading one waits for ever."""
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(ValueError, match="not a regular file but a named pipe"):
+        read_mesh(tmp_path / name)
+
+
+def test_a_mesh_that_is_far_too_large(tmp_path, monkeypatch):
+    file = _cube(tmp_path)
+    monkeypatch.setattr(meshes, "LARGEST_MESH", file.stat().st_size)
+    vertices, faces = read_mesh(file)
+    monkeypatch.setattr(meshes, "LARGEST_MESH", file.stat().st_size - 1)
+    with pytest.raises(ValueError, match=r"more than the .* that the mesh may have"):
+        read_mesh(file)
+    sides = 12 * 23**2  # sqrt(2) 16 cells
+    monkeypatch.setattr(meshes, "MOST_SQUARES", sides)
+    mesh_distance(vertices, faces, cells=16)
+    monkeypatch.setattr(meshes, "MOST_SQUARES", sides - 1)
+    with pytest.raises(ValueError, match="12 triangles, too many"):
+        mesh_distance(vertices, faces, cells=16)
+
+
+def test_a_mesh_without_an_inside_is_refused(tmp_path):
+    """Without a node inside, the material would pass through."""
+    vertices, faces = read_mesh(_cube(tmp_path))
+    thin = torch.tensor([1.0, 1.0, 1e-3], dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"encloses none of the nodes of its grid, 0\.125 apart"):
+        mesh_distance(thin * vertices, faces, cells=16)
+    for size, word in ((0.0, "no extent"), (1e308, "infinite")):
+        with pytest.raises(ValueError, match=word):
+            mesh_distance(size * vertices, faces, cells=16)
 
 
 def test_distances_of_triangles_agree_with_samples():

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -79,13 +80,26 @@ def test_gpu_tests_skip_without_a_gpu_and_fail_if_one_is_required():
     assert _python(*command, GS_REQUIRE_GPU="1").returncode == 1
 
 
+def test_pages_are_skipped_without_a_browser_and_fail_where_ci_is_set(tmp_path):
+    """A gate that cannot try the pages says so."""
+    command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/tools/test_web_bench.py"]
+    skipped = _python(*command, CI="", PATH=str(tmp_path))
+    assert (skipped.returncode, "1 skipped" in skipped.stdout) == (0, True), skipped.stdout
+    failed = _python(*command, CI="true", PATH=str(tmp_path))
+    assert failed.returncode == 1
+    assert "Failed: needs an installed Chromium" in failed.stdout
+
+
 def test_every_dependency_is_pinned():
-    """constraints.txt pins all that pyproject.toml names, at versions that it allows."""
+    """constraints.txt pins all that the README's test command installs, at versions that pyproject.toml allows."""
     tomllib = pytest.importorskip("tomllib", reason="needs Python 3.11")
     from packaging.requirements import Requirement
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    needed = [Requirement(line) for line in [*project["dependencies"], *project["optional-dependencies"]["dev"]]]
+    extras = re.search(r'-e "\.\[(.+)\]" && pytest$', (ROOT / "README.md").read_text(), re.MULTILINE)[1].split(",")
+    named = [line for extra in extras for line in project["optional-dependencies"][extra]]
+    assert extras == ["dev", "netcdf", "parquet", "usd", "webdataset"]  # the light ones, so that their tests run
+    needed = [Requirement(line) for line in [*project["dependencies"], *named]]
     pins = [Requirement(line) for line in (ROOT / "constraints.txt").read_text().splitlines() if line[:1].isalnum()]
     assert all(len(pin.specifier) == 1 and str(pin.specifier).startswith("==") for pin in pins)
     valid = {pin.name: str(pin.specifier) for pin in pins if pin.marker is None or pin.marker.evaluate()}

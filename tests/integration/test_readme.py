@@ -40,7 +40,7 @@ def test_example_prints_what_the_readme_shows(example, output, capsys):
 def test_first_two_commands():
     commands = re.findall(r"```bash\n(.*?)\n```", README, flags=re.DOTALL)
     assert commands[0] == "pip install -c constraints.txt -e . && python tools/sim.py --config configs/sim/flag.yaml"
-    assert 'pip install -c constraints.txt -e ".[dev]" && pytest' in commands
+    assert 'pip install -c constraints.txt -e ".[dev,netcdf,parquet,usd,webdataset]" && pytest' in commands
 
 
 def test_every_file_that_the_readme_names_exists():

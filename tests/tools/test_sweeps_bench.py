@@ -22,15 +22,24 @@ def test_the_small_flags_have_4096_points_each(tmp_path):
     assert row["per_s"] > 0
 
 
+def test_a_sheet_of_more_gaussians_than_candidates_are_allowed(monkeypatch):
+    """As one million at full size: each Gaussian reaches nearly a spacing, to where its neighbours are."""
+    monkeypatch.setattr("gaussian_swaying.gaussians.subdivision._MOST", 4096)
+    row = sweeps.one_sheet(argparse.Namespace(flags=1, device="cpu"), frames=6)
+    assert row["particles"] == 4096
+
+
 def test_photos_are_enlarged(tmp_path):
     (tmp_path / "small/images").mkdir(parents=True)
     Image.new("RGB", (6, 4), (200, 10, 10)).save(tmp_path / "small/images/a.png")
     known = {"fl_x": 5.0, "fl_y": 5.0, "cx": 3.0, "cy": 2.0, "w": 6, "h": 4, "k1": 0.1}
-    known["frames"] = [{"file_path": "images/a.png"}]
+    known["frames"] = [{"file_path": name} for name in ("./images/a.png", "images/missing.png", "images/a")]
     (tmp_path / "small/transforms.json").write_text(json.dumps(known))
     made = sweeps.enlarged(tmp_path / "small", tmp_path / "large", 2)
     found = json.loads((made / "transforms.json").read_text())
     assert (found["fl_x"], found["cx"], found["w"], found["h"], found["k1"]) == (10.0, 6.0, 12, 8, 0.1)
+    assert [frame["file_path"] for frame in found["frames"]] == ["./images/a.png", "images/a"]
+    assert [path.name for path in (made / "images").iterdir()] == ["a.png"]
     with Image.open(made / "images/a.png") as image:
         assert image.size == (12, 8)
 

@@ -1,7 +1,5 @@
 """``bench.py web`` measures films in a browser."""
 
-import shutil
-
 import pytest
 import yaml
 from bench.cases import web
@@ -9,12 +7,9 @@ from bench.tables.web import films
 
 from gaussian_swaying.simulation.simulation import Simulation
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
-
-@pytest.mark.skipif(CHROMIUM is None, reason="needs an installed Chromium")
+@pytest.mark.usefixtures("chromium")
 def test_size_error_and_speed_of_a_film(tmp_path):
-    pytest.importorskip("playwright", reason="needs playwright, which drives the browser")
     scene = {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.1}}}
     settings = {"scene": scene, "solver": {"dx": 0.2}, "recorder": {"images": False, "video": False}}
     (tmp_path / "flag.yaml").write_text(yaml.safe_dump(settings))

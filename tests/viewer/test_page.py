@@ -1,6 +1,5 @@
 """The live page, in a real browser where there is one."""
 
-import shutil
 import threading
 import time
 import urllib.error
@@ -18,7 +17,6 @@ from gaussian_swaying.viewer import page as page_module
 from gaussian_swaying.viewer.page import Page, allowed, check_address
 from gaussian_swaying.viewer.pictures import draw
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = [
     "--no-sandbox",
     "--disable-quic",
@@ -44,12 +42,11 @@ def page(parser, settings):
 
 
 @pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("there is no Chromium, so the page is not tried in a browser")
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
-    with playwright.sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+def browser(chromium):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
         yield started
         started.close()
 

@@ -1,7 +1,9 @@
 """A simulation that goes on in a thread, and is changed there."""
 
+import dataclasses
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ import yaml
 from gaussian_swaying.simulation.config import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.pictures import draw
-from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.session import WINDOW, Session
 
 
 def _position(session):
@@ -211,12 +213,29 @@ def test_a_pull_moves_what_it_holds_and_lets_go(session, until):
     assert len(session.simulation.custom_forces) == 0
 
 
-def test_slow_motion_is_slower(session, until):
-    session.pace(0.2)
-    session.start()
-    until(lambda: session.snapshot.health.time > 0.25)
-    assert 0.1 < session.rates().real_time < 0.35
-    assert session.rates().steps > 0
+@pytest.mark.parametrize(("speed", "step", "expected"), [(0.2, 0.03, 0.2), (1.0, 0.03, 1.0), (1.0, 0.08, 0.5)])
+def test_slow_motion_is_slower(session, monkeypatch, speed, step, expected):
+    """On a clock of its own, which a step moves on by ``step`` seconds, and a wait by what it was asked to be."""
+    now = [0.0]
+
+    def takes_time(state):
+        now[0] += step
+        before = session.snapshot.health
+        return state, dataclasses.replace(before, time=before.time + session.simulation.frame_dt)
+
+    def waits(condition, seconds):
+        now[0] += seconds
+
+    clock = SimpleNamespace(perf_counter=lambda: now[0], monotonic=lambda: now[0])
+    monkeypatch.setattr("gaussian_swaying.viewer.session.time", clock)
+    monkeypatch.setattr(session.simulation, "advance", takes_time)
+    monkeypatch.setattr(session._wake, "wait_for", waits)
+    session.pace(speed)
+    while now[0] < 1.5 * WINDOW:  # the first steps, before which nothing was waited for, are forgotten
+        session._advance(single=False)
+    assert session.simulation.frame_dt == pytest.approx(0.04)
+    assert session.rates().real_time == pytest.approx(expected)
+    assert session.rates().steps == pytest.approx(expected / 0.04)
 
 
 def test_close_ends_the_thread(session):

@@ -58,7 +58,7 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
         path: ``nodes.npz`` of a run of ``total``.
 
     Raises:
-        ValueError: If a frame is missing, or the frames differ in their nodes.
+        ValueError: If a frame is missing, the frames differ in their nodes, or a number is NaN or infinite.
     """
     with np.load(check_archive(path, "the run")) as arrays:
         count = len(arrays.files) // len(NODES)
@@ -66,7 +66,24 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
         if not count or names != set(arrays.files):
             raise ValueError(f"{path} lacks frames: run the simulation again, without --resume.")
         try:
-            frames = [join_far(arrays[f"displacement_{k:05d}"], arrays[f"far_{k:05d}"]) for k in range(count)]
-            return torch.from_numpy(np.stack(frames))
+            frames = [_joined(arrays[f"displacement_{k:05d}"], arrays[f"far_{k:05d}"]) for k in range(count)]
+            found = torch.from_numpy(np.stack(frames))
         except (IndexError, ValueError) as error:
             raise ValueError(f"{path} is damaged ({error}): run the simulation again, without --resume.") from error
+    bad = (~torch.isfinite(found)).flatten(1).any(1).nonzero()
+    if len(bad):
+        raise ValueError(
+            f"{path} is damaged (frame {int(bad[0])} has a displacement that is NaN or infinite): run the simulation "
+            "again, without --resume."
+        )
+    return found
+
+
+def _joined(near: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """:func:`join_far` of arrays from a file."""
+    for array, (shape, kind, _) in zip((near, far), NODES.values(), strict=True):
+        if array.dtype != kind or array.shape[1:] != shape:
+            raise ValueError(f"an array of {array.dtype} has the shape {array.shape}")
+    if len(far) and int(far[:, 0].min()) < 0:
+        raise ValueError(f"there is no node {int(far[:, 0].min())}")
+    return join_far(near, far)

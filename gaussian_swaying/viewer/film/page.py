@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 import zlib
 from pathlib import Path
 from typing import Any
@@ -57,9 +58,7 @@ def page(film: Film) -> str:
         "parts": "\n".join(parts),
     }
     text = (PAGE / "film.html").read_text(encoding="utf-8")
-    for name, word in words.items():
-        text = text.replace("{{" + name + "}}", word)
-    return text
+    return re.sub(r"{{(\w+)}}", lambda slot: words[slot[1]], text)  # once: what is put in may have braces of its own
 
 
 def pack(film: Film) -> dict[str, bytes]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,12 @@ from torch import Tensor
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
 from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.transfer import gather
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.runs.seal import sha256
 from gaussian_swaying.simulation.config import parse_file
+from gaussian_swaying.simulation.diagnostics import FARTHEST
+from gaussian_swaying.simulation.followers import follower_stencil
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.recording.nodes import load_nodes
 from gaussian_swaying.simulation.scene import SimulatedScene
@@ -64,8 +68,8 @@ def read_film(run: Path) -> Film:
         run: The output folder of ``gaussian-swaying sim``.
 
     Raises:
-        ValueError: If the folder is not of a run, the run is of ``updated`` or has no recorded nodes, or its splat has
-            moved or changed.
+        ValueError: If the folder is not of a run, the run is of ``updated`` or has no recorded nodes, these are damaged
+            or move a Gaussian farther than any run does, or its splat has moved or changed.
     """
     summary = _summary(run)
     simulation, name = _rebuild(run, summary)
@@ -78,7 +82,27 @@ def read_film(run: Path) -> Film:
             f"{len(nodes):,}: export with the version of this program that made the run, or run it again."
         )
     with torch.inference_mode():
+        _check_near(run / "nodes.npz", scene, grid, nodes, displacement)
         return _film(simulation, grid, nodes, displacement, name)
+
+
+def _check_near(path: Path, scene: SimulatedScene, grid: GridSpec, nodes: Tensor, displacement: Tensor) -> None:
+    """Raise ValueError if a place of the material is moved farther than any run lets it go.
+
+    A node with almost no mass may swing farther. As the weights of a place are positive and add up to one, no place is
+    moved farther than the farthest node, so only frames with such a node are looked at closely.
+    """
+    most = FARTHEST * scene.size * scene.frame.metres_per_unit
+    stencil = follower_stencil(scene.follow.places.double(), grid)
+    for k in (displacement.norm(dim=-1) > most).any(1).nonzero()[:, 0].tolist():
+        field = torch.zeros(math.prod(grid.resolution), 3, dtype=torch.float64)
+        field[nodes] = displacement[k].double()
+        farthest = float(gather(field, stencil)[..., 0, :].norm(dim=-1).max())
+        if not farthest <= most:
+            raise ValueError(
+                f"{path} moves a Gaussian by {farthest:.3g} m in frame {k}, but a run ends at {most:.3g} m: it is "
+                "damaged, so run the simulation again, without --resume."
+            )
 
 
 def _summary(run: Path) -> dict[str, Any]:

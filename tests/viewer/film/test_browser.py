@@ -1,6 +1,5 @@
-"""A film in a real browser. Skipped without Chromium or its client."""
+"""A film in a real browser."""
 
-import shutil
 import time
 
 import numpy as np
@@ -8,10 +7,6 @@ import pytest
 import torch
 
 from gaussian_swaying.viewer.film.page import write_film
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-client = pytest.importorskip("playwright.sync_api", reason="needs playwright, which drives the browser")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs an installed Chromium")
 
 SOFTWARE = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 SOFTWARE += ["--disable-component-update", "--disable-sync"]
@@ -37,13 +32,15 @@ def film(run, tmp_path_factory):
 
 
 @pytest.fixture
-def show():
+def show(chromium):
     """Opens a page of a size; what it tells and asks for is kept in ``page.told`` and ``page.asked``."""
-    with client.sync_playwright() as driver:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
         opened = []
 
         def show(path, width=320, height=180, arguments=DRAWN):
-            browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE + arguments)
+            browser = driver.chromium.launch(executable_path=chromium, args=SOFTWARE + arguments)
             opened.append(browser)
             page = browser.new_page(viewport={"width": width, "height": height})
             page.told, page.asked = [], []

@@ -227,6 +227,53 @@ def test_another_grid_is_refused(run, tmp_path, capsys):
     )
 
 
+def _with_nodes(run, folder, change):
+    """A copy of a run with other nodes; ``change`` gets the displacement and the far rows of the third frame."""
+    shutil.copytree(run, folder)
+    arrays = dict(np.load(run / "nodes.npz"))
+    arrays["displacement_00002"], arrays["far_00002"] = change(arrays["displacement_00002"], arrays["far_00002"])
+    np.savez(folder / "nodes.npz", **arrays)
+    return str(folder)
+
+
+def _set(value):
+    """The first node has another displacement, in float32."""
+
+    def change(near, far):
+        moved = join_far(near, far)
+        moved[0] = value
+        return split_far(moved, 0.5)
+
+    return change
+
+
+def test_nodes_that_cannot_be_shown_are_refused(run, tmp_path, capsys):
+    """A damaged or made up nodes.npz would be a page without a picture."""
+    assert main(["--web", _with_nodes(run, tmp_path / "same", lambda near, far: (near, far))]) == 0
+    for k, (change, words) in enumerate(
+        (
+            (_set(np.nan), r"frame 2 has a displacement that is NaN or infinite"),
+            (_set(np.inf), r"frame 2 has a displacement that is NaN or infinite"),
+            (_set(1e30), r"moves a Gaussian by \S+ m in frame 2, but a run ends at 1\.15e\+03 m"),
+            (lambda near, far: (near.astype("f8"), far), r"an array of float64 has the shape"),
+            (lambda near, far: (near[:, :2], far), r"an array of float16 has the shape \(\d+, 2\)"),
+            (lambda near, far: (near, np.full((1, 4), -1, np.int32)), r"there is no node -1"),
+        )
+    ):
+        told = _refusal([_with_nodes(run, tmp_path / str(k), change)], capsys)
+        assert re.search(rf"nodes\.npz .*{words}.*run the simulation again", told), told
+        assert not (tmp_path / str(k) / "film.html").exists()
+
+
+def test_braces_in_a_name_are_text(run):
+    """The name of the splat is in the title."""
+    film = read_film(run)
+    film.head["title"] = "{{parts}} {{background}} <b>"
+    text = page(film)
+    assert "<title>{{parts}} {{background}} &lt;b&gt;</title>" in text
+    assert text.count('id="film-frames"') == 1
+
+
 def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
     splat, folder = tmp_path / "flag.ply", tmp_path / "run"
     cloud = FlagScene(spacing=0.1).generate()

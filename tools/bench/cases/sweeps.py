@@ -24,6 +24,7 @@ from lightning.pytorch.callbacks import Callback
 
 from bench.cases.training import evaluate
 from bench.clock import guarded
+from gaussian_swaying.captures.transforms import find_image
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.training.data.datamodule import CaptureDataModule
@@ -216,17 +217,23 @@ def one_sheet(options: argparse.Namespace, frames: int = 60) -> Row:
 
 
 def enlarged(capture: Path, folder: Path, factor: int) -> Path:
-    """A capture with photos that are larger by a factor along each side."""
+    """A capture with photos that are larger by a factor along each side; photos that are missing are left out."""
     from PIL import Image
 
     read = json.loads((capture / "transforms.json").read_text())
     for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
         read[name] = read[name] * factor
-    (folder / "images").mkdir(parents=True)
-    for frame in read["frames"]:
-        with Image.open(capture / frame["file_path"]) as image:
+    frames, read["frames"] = read["frames"], []
+    for frame in frames:
+        photo = find_image(capture, frame["file_path"])  # as the reader does
+        if photo is None:
+            continue
+        target = folder / photo.relative_to(capture)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with Image.open(photo) as image:
             size = (image.width * factor, image.height * factor)
-            image.resize(size, Image.Resampling.LANCZOS).save(folder / frame["file_path"], quality=97)
+            image.resize(size, Image.Resampling.LANCZOS).save(target, quality=97)
+        read["frames"].append(frame)
     (folder / "transforms.json").write_text(json.dumps(read))
     return folder
 
