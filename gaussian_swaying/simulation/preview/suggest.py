@@ -282,6 +282,16 @@ def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
     return (-speed * math.sin(angle), speed * math.cos(angle), 0.0)
 
 
+def azimuth_beside(flow: Sequence[float]) -> float | None:
+    """Azimuth from which a flow [m/s, z up] goes to the right of the picture [degrees]; None if it is not horizontal.
+
+    The inverse of :func:`_across_picture`.
+    """
+    x, y, z = flow
+    level = math.hypot(x, y)
+    return math.degrees(math.atan2(-x, y)) if level > abs(z) else None
+
+
 # ---- what is simulated
 
 
