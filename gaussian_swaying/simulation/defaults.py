@@ -93,7 +93,8 @@ def as_solver(solver: MPMSolver | None, hold: HoldLike | None, scene: Scene, clo
     """
     if solver is None:
         pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []
-        chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
+        opacity = torch.sigmoid(cloud.opacities)
+        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold, scene.up)
         means = cloud.means[chosen]
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
