@@ -224,10 +224,15 @@ def test_options_replace_guesses(splat, tmp_path, capsys):
     assert found["longest_side_m"] == 2
     starter = yaml.safe_load((tmp_path / "a/starter.yaml").read_text())
     assert starter["scene"]["up"] == [0, -1, 0]
-    assert "given" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "given" in said
     assert preview(splat, tmp_path / "b", "--up", "0", "-1", "0.5", "--region", "0", "-1", "0", "0.6", "1", "1") == 0
     other = json.loads((tmp_path / "b/preview.json").read_text())
     assert other["suggestion"]["up"]["direction"][2] == pytest.approx(0.2**0.5)
+    flow = starter["wind"]["flow"]  # with z up; in scene axes as regions are, where y points down
+    there = f"([{flow[0]:.3g}, 0, {flow[1]:.3g}] in scene axes)"
+    assert there in (tmp_path / "a/starter.yaml").read_text()
+    assert there in said
     assert other["run"]["simulated"] == 80  # 8 of 15 columns of 10
 
 
@@ -247,6 +252,7 @@ def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
     assert data["run"]["simulated"] == 15 * 6
     assert data["run"]["held"] == 6
     assert data["run"]["flow"] == [1, 2, 0]
+    assert "wind            [1, 2, 0] m/s, z up, before modulations" in report
     assert data["cost"]["frames"] == 7
     assert data["cost"]["picture_seconds"] is None
     assert "PinnedRegion: 6 particles" in report

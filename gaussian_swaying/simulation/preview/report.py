@@ -10,6 +10,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.simulation.preview.cost import Cost
 from gaussian_swaying.simulation.preview.starter import region_dict
 from gaussian_swaying.simulation.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
+from gaussian_swaying.simulation.preview.up import wind_words
 from gaussian_swaying.simulation.progress import duration
 
 
@@ -54,7 +55,7 @@ def suggestion_lines(found: Suggestion, further: int) -> list[str]:
         f"{found.spacing:.3g} m",
         "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
         f"material        {_material(found)}",
-        f"wind            {_numbers(found.flow)} m/s, z up",
+        f"wind            {wind_words(found.flow, found.up.direction)}",
     ]
     return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
 
@@ -78,7 +79,7 @@ def run_lines(run: dict[str, Any]) -> list[str]:
         *(f"                  {region}" for region in run["regions"]),
         f"  frame           {run['frame']}",
         f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
-        f"  wind            {_numbers(run['flow'])} m/s, z up, before modulations",
+        f"  wind            {wind_words(run['flow'], run['up'])}, before modulations",
     ]
 
 
