@@ -52,9 +52,10 @@ def common_help(parser: ArgumentParser) -> str:
     for title, names in COMMON.items():
         groups.append(_ArgumentGroup(parser, title))
         groups[-1]._group_actions = [known[name] for name in names]
-    before = parser._action_groups, parser.usage, parser.epilog
+    whole: Any = parser  # its groups are exchanged meanwhile
+    before = whole._action_groups, whole.usage, whole.epilog
     try:
-        parser._action_groups, parser.usage, parser.epilog = groups, "%(prog)s --config FILE [options]", _MORE
+        whole._action_groups, whole.usage, whole.epilog = groups, "%(prog)s --config FILE [options]", _MORE
         return parser.format_help()
     finally:
-        parser._action_groups, parser.usage, parser.epilog = before
+        whole._action_groups, whole.usage, whole.epilog = before
