@@ -22,7 +22,7 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
-_OPAQUE_LOGIT = 16.0  # its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
+OPAQUE_LOGIT = 16.0  # of an opacity of 1: its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 
 
 def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
@@ -31,7 +31,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     The layout is that of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering"). Properties
     may be in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to 3.
     Normals that are all zero, as most tools write them, are ignored. An opacity of exactly 0 or 1, stored as an
-    infinite logit, becomes a logit of -16 or 16 with a warning.
+    infinite logit, becomes a logit of -16 or 16; the preview says how many there are.
 
     Args:
         path: File to read.
@@ -44,7 +44,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
         ValueError: If the file is not a usable 3DGS file; the message names the file, the field and the remedy.
 
     Warns:
-        UserWarning: Once, naming the properties that were ignored; once, if infinite opacity logits were replaced.
+        UserWarning: Once, naming the properties that were ignored.
     """
     path = Path(path)
     data = read_element(path, read_binary_header(path), "vertex")
@@ -171,14 +171,7 @@ def _read_opacities(path: Path, data: np.ndarray) -> np.ndarray:
         logits = np.array(data["opacity"], dtype=np.float32)
     _reject(path, np.isnan(logits), "property `opacity` is NaN", "remove them or train again")
     infinite = np.isinf(logits)
-    if infinite.any():
-        logits[infinite] = np.copysign(np.float32(_OPAQUE_LOGIT), logits[infinite])
-        warnings.warn(
-            f"{path}: property `opacity` is infinite for {int(infinite.sum())} of {len(data)} Gaussians (an opacity of "
-            f"exactly 0 or 1), first at index {int(infinite.argmax())}; read as logits of ±{_OPAQUE_LOGIT:g}.",
-            UserWarning,
-            stacklevel=3,
-        )
+    logits[infinite] = np.copysign(np.float32(OPAQUE_LOGIT), logits[infinite])
     return logits
 
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
-from gaussian_swaying.geometry.regions import Everything, Region
+from gaussian_swaying.geometry.regions import Everything, Region, whereabouts
+from gaussian_swaying.geometry.rotations import rotation_from_z
 
 
 def select_simulated(
-    means: Tensor, opacities: Tensor, region: Region | None = None, opacity_threshold: float = 0.1
+    means: Tensor,
+    opacities: Tensor,
+    region: Region | None = None,
+    opacity_threshold: float = 0.1,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Tensor:
     """Choose the Gaussians to simulate: those in a region that are opaque enough.
 
@@ -18,6 +25,7 @@ def select_simulated(
         opacities: Opacities from 0 to 1, after the sigmoid, shape (N,).
         region: Part of space to simulate; None for all of it.
         opacity_threshold: Smallest opacity to simulate, 0 to 1.
+        up: Direction that points up in the scene, for the message if a region was given with z up.
 
     Returns:
         Booleans, shape (N,).
@@ -35,11 +43,14 @@ def select_simulated(
     inside = region.contains(means)
     selected = inside & (opacities >= opacity_threshold)
     if not bool(selected.any()):
-        low, high = region.bounds(means)
+        between, hint = whereabouts(region, means, rotation_from_z(up).T)
+        if not hint or bool(inside.any()):
+            hint = (
+                "move the region into these bounds or lower the threshold (the largest opacity is "
+                f"{float(opacities.max()):.3g})"
+            )
         raise ValueError(
-            f"No Gaussian is selected: the {means.shape[0]} centres span {low} to {high}{region.axes}, "
-            f"{int(inside.sum())} are in "
-            f"{region!r}, and none of these reaches the opacity threshold {opacity_threshold}; move the region into "
-            f"these bounds or lower the threshold (the largest opacity is {float(opacities.max()):.3g})."
+            f"No Gaussian is selected: the {means.shape[0]} centres lie {between}, {int(inside.sum())} are in "
+            f"{region!r}, and none of these reaches the opacity threshold {opacity_threshold}; {hint}."
         )
     return selected

@@ -240,6 +240,34 @@ def _check_region(name: str, region: Region) -> None:
         raise TypeError(f"Expected `{name}` to be a Region, but got {region!r}.")
 
 
+def whereabouts(region: Region, points: Tensor, rotation: Tensor) -> tuple[str, str]:
+    """Where points lie, and a remedy if only the axes of a region are wrong; for an error about one without points.
+
+    Winds and other velocities have z up, but regions are in the axes of the scene, in which up may be another axis.
+
+    Args:
+        region: The region.
+        points: Points as :meth:`Region.contains` takes them, shape (..., 3).
+        rotation: Scene axes to axes with z up, shape (3, 3).
+
+    Returns:
+        The corners of their box, also with z up where that differs; and what to change if the region would contain some
+        of them with z up, otherwise nothing.
+    """
+    between = "between {} and {}".format(*region.bounds(points)) + region.axes
+    rotation = rotation.to(points.device, torch.float64)
+    if region.axes or torch.equal(rotation, torch.eye(3).to(rotation)):
+        return between, ""
+    turned = (points.double() @ rotation.T).to(points.dtype)
+    between += " (with z up, as for `wind.flow`: between {} and {})".format(*region.bounds(turned))
+    inside = int(region.contains(turned).sum())
+    up = [round(v, 3) + 0.0 for v in rotation[2].tolist()]
+    hint = (
+        f"with z up it would hold {inside:,} of them, but regions are in scene axes, where up is {up}: turn the region"
+    )
+    return between, hint if inside else ""
+
+
 class RegionInFrame(Region):
     """A region given in axes and units of its own, asked about points in others: metres with z up, or scene units."""
 

@@ -18,6 +18,7 @@ from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
+from gaussian_swaying.simulation.common_help import CommonHelp
 from gaussian_swaying.simulation.description import describe
 from gaussian_swaying.simulation.physgaussian.convert import convert, read_config
 from gaussian_swaying.simulation.physgaussian.yaml_file import to_yaml
@@ -88,9 +89,12 @@ def build_parser(schema: type) -> ArgumentParser:
     parser = ArgumentParser(
         prog=program.name("sim"),
         exit_on_error=False,
+        add_help=False,
         description="Move a 3D Gaussian scene in the wind: splat in, video out. Positions and regions are in scene "
         "units and axes; velocities, gravity and light are in metres, z up.",
     )
+    parser.add_argument("-h", "--help", action=CommonHelp, help="Show the options that people use, and exit.")
+    parser.add_argument("--help-all", action="help", help="Show all options, and exit.")
     parser.add_argument("--config", action="config", help="YAML file; options given after it override it.")
     parser.add_argument(
         "--physgaussian",
@@ -187,7 +191,7 @@ def check_settings(schema: type, settings: Namespace) -> None:
     for name in _groups(schema):
         if not isinstance(settings[name], Namespace):
             raise ValueError(
-                f"Expected `{name}` to contain fields, such as those that --help lists, but got {settings[name]!r}."
+                f"Expected `{name}` to contain fields, such as those that --help-all lists, but got {settings[name]!r}."
             )
     if settings.frames < 1:
         raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")

@@ -11,6 +11,7 @@ import torch
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
@@ -20,14 +21,15 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.physgaussian.space import Normalisation
-from gaussian_swaying.simulation.preview.suggest import particle_spacing, suggest_spacing
+from gaussian_swaying.simulation.preview.photos import captured_from, photo_azimuth
+from gaussian_swaying.simulation.preview.suggest import azimuth_beside, particle_spacing, suggest_spacing
 from gaussian_swaying.simulation.recording.recorder import Recorder
-from gaussian_swaying.simulation.scene import Material, Scene
+from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
@@ -91,7 +93,8 @@ def as_solver(solver: MPMSolver | None, hold: HoldLike | None, scene: Scene, clo
     """
     if solver is None:
         pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []
-        chosen = select_simulated(cloud.means, torch.sigmoid(cloud.opacities), scene.region, scene.opacity_threshold)
+        opacity = torch.sigmoid(cloud.opacities)
+        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold, scene.up)
         means = cloud.means[chosen]
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
@@ -115,6 +118,29 @@ def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
     if isinstance(wind, SpatialWind):
         return wind
     return WindField([0.0, 0.0, 0.0] if wind is None else list(check_vector("wind", wind)))
+
+
+def as_camera(
+    camera: CameraPath | None,
+    cameras: Mapping[str, CameraPath] | None,
+    wind: WindField | SpatialWind,
+    scene: SimulatedScene,
+) -> CameraPath:
+    """Return the given camera, or an orbit camera that looks at the front of the object or from beside the wind.
+
+    The front is the side from which photos were taken; they are known if one of ``cameras`` is that of a capture.
+    Beside a wind, its strongest flow goes to the right of the picture. If photos are from all around, and the wind is
+    not horizontal or differs from place to place, the azimuth is that of an :class:`OrbitCamera` by default.
+    """
+    if camera is not None:
+        return camera
+    captured = next((path for path in (cameras or {}).values() if isinstance(path, CaptureCamera)), None)
+    azimuth = None
+    if captured is not None:
+        azimuth = photo_azimuth(captured_from(captured.path), scene.center.cpu(), scene.frame.rotation)
+    if azimuth is None and isinstance(wind, WindField):
+        azimuth = azimuth_beside(wind.flows[int(wind.flows.norm(dim=-1).argmax())].tolist())
+    return OrbitCamera() if azimuth is None else OrbitCamera(azimuth=azimuth)
 
 
 def check_types(given: Mapping[str, Any]) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_poisson_ratio, check_positive, check_vector
 from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.scene import SimulatedScene
@@ -186,8 +186,12 @@ class SceneEditor:
             (edit.of_material, particles, "simulated Gaussian"),
             (edit.color is not None, gaussians, "Gaussian"),
         ):
-            if wanted and not bool(found.any()):
-                raise ValueError(f"The region {region!r} of `edits` at {edit.time:g} s holds no {what}.")
+            if region is not None and wanted and not bool(found.any()):
+                between, hint = whereabouts(region, means[scene.moving], scene.frame.rotation)
+                raise ValueError(
+                    f"The region {region!r} of `edits` at {edit.time:g} s holds no {what}: those that move lie "
+                    f"{between}; {hint or 'move or enlarge it'}."
+                )
         return particles, gaussians
 
     def reset(self) -> None:

@@ -13,7 +13,7 @@ from gaussian_swaying.gaussians.filling import Filling
 from gaussian_swaying.gaussians.grouping import grid_groups
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.groups import equal_rows, sums
-from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -125,10 +125,10 @@ def sample_object(
     for entry in material.regions:
         inside_region = entry.region.contains(where)
         if not bool(inside_region.any()):
-            low, high = entry.region.bounds(where)
+            between, hint = whereabouts(entry.region, where, frame.rotation)
             raise ValueError(
-                f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie between "
-                f"{low} and {high}{entry.region.axes}; move or enlarge it."
+                f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie {between}; "
+                f"{hint or 'move or enlarge it'}."
             )
         for name in _PROPERTIES:
             if getattr(entry, name) is not None:

@@ -236,7 +236,7 @@ class SimulatedScene(nn.Module):
                 "`scene.points` to gaussian."
             )
         opacity = torch.sigmoid(cloud.opacities)
-        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold)
+        chosen = select_simulated(cloud.means, opacity, scene.region, scene.opacity_threshold, scene.up)
         faint = scene.region.contains(cloud.means) & ~chosen
         if scene.faint == "drop" and bool(faint.any()):
             cloud, chosen, faint = cloud.select(~faint), chosen[~faint], faint[~faint]

@@ -38,6 +38,7 @@ from gaussian_swaying.simulation.defaults import (
     HoldLike,
     SceneLike,
     WindLike,
+    as_camera,
     as_scene,
     as_solver,
     as_wind,
@@ -76,7 +77,8 @@ class Simulation(Stepping):
         contact: How the material touches itself; null if it does not. Obstacles are boundaries of the solver.
         forces: Custom forces besides gravity and wind, each given by its class path.
         shader: Shading; null keeps the splat's colours.
-        camera: Camera path; an orbit camera if null.
+        camera: Camera path; if null, an orbit camera on the side of the photos, if one of ``cameras`` is that of a
+            capture, or else one that sees the wind blow to the right.
         cameras: Additional cameras by name; their pictures and videos go to the folders cameras/NAME.
         edits: Changes to parts of the object. Each has a `region` (at rest, in scene units; null for everything that
             moves), a `time` [s] from which it applies, any of `E` [Pa], `nu`, `density` [kg/m³] and `law`, and a
@@ -156,10 +158,12 @@ class Simulation(Stepping):
             )
         obstacles = [part for part in solver.boundaries if isinstance(part, Obstacle)]
         model.take_contact(contact, obstacles)
+        blowing = as_wind(wind, model.frame)
+        camera = as_camera(camera, cameras, blowing, model)
         self.painter = Painter(model, shader, camera, cameras, colour, frame_dt, renderer)
         self.material = material
         self.solver, self.aero, self.frame_dt = solver, aero or AeroForce(), float(frame_dt)
-        self.wind = as_wind(wind, model.frame)
+        self.wind = blowing
         self.custom_forces = nn.ModuleList(force.in_frame(model.frame) for force in as_forces(forces))
         self.to(target)
         self.editor = SceneEditor(model, edits)

@@ -224,10 +224,15 @@ def test_options_replace_guesses(splat, tmp_path, capsys):
     assert found["longest_side_m"] == 2
     starter = yaml.safe_load((tmp_path / "a/starter.yaml").read_text())
     assert starter["scene"]["up"] == [0, -1, 0]
-    assert "given" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "given" in said
     assert preview(splat, tmp_path / "b", "--up", "0", "-1", "0.5", "--region", "0", "-1", "0", "0.6", "1", "1") == 0
     other = json.loads((tmp_path / "b/preview.json").read_text())
     assert other["suggestion"]["up"]["direction"][2] == pytest.approx(0.2**0.5)
+    flow = starter["wind"]["flow"]  # with z up; in scene axes as regions are, where y points down
+    there = f"([{flow[0]:.3g}, 0, {flow[1]:.3g}] in scene axes)"
+    assert there in (tmp_path / "a/starter.yaml").read_text()
+    assert there in said
     assert other["run"]["simulated"] == 80  # 8 of 15 columns of 10
 
 
@@ -247,6 +252,7 @@ def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
     assert data["run"]["simulated"] == 15 * 6
     assert data["run"]["held"] == 6
     assert data["run"]["flow"] == [1, 2, 0]
+    assert "wind            [1, 2, 0] m/s, z up, before modulations" in report
     assert data["cost"]["frames"] == 7
     assert data["cost"]["picture_seconds"] is None
     assert "PinnedRegion: 6 particles" in report
@@ -330,8 +336,8 @@ def test_script_answers_help():
     assert "--up" in done.stdout
 
 
-def test_a_warning_about_the_splat_is_given_once(tmp_path):
-    """The draft and the starter read the same file again, by its whole path."""
+def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path):
+    """Once, though the draft and the starter read the same file again; a run of the splat does not repeat it."""
     cloud = FlagScene(spacing=0.1).generate()
     write_ply(tmp_path / "flag.ply", dataclasses.replace(cloud, opacities=torch.full_like(cloud.opacities, 400.0)))
     content = (tmp_path / "flag.ply").read_bytes()
@@ -339,4 +345,11 @@ def test_a_warning_about_the_splat_is_given_once(tmp_path):
     command = [sys.executable, str(ROOT / "tools/preview.py"), "flag.ply", "--output", "out", "--device", "cpu"]
     done = subprocess.run([*command, "--height", "96", "--frames", "2"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0
-    assert done.stderr.count("`opacity` is infinite") == 1, done.stderr
+    note = f"note: the opacity of {len(cloud)} is exactly 0 or 1, an infinite logit, which is read as ±16\n"
+    assert done.stdout.count(note) == 1
+    assert "opacity" not in done.stderr
+    command = [sys.executable, str(ROOT / "tools/sim.py"), "--config", "out/draft.yaml", "--frames", "1"]
+    small = ["--camera.init_args.width=16", "--camera.init_args.height=9", "--device=cpu", "--output=run"]
+    done = subprocess.run([*command, *small], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert "infinite" not in done.stdout + done.stderr

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -235,9 +236,41 @@ def test_print_config_parses_back(tmp_path, capsys):
     assert second.frames == 2
 
 
+def _help(capsys, option):
+    """What an option of help prints, and the options that it lists."""
+    capsys.readouterr()
+    assert _code([option]) == 0
+    text = capsys.readouterr().out
+    return text, re.findall(r"^ +(?:-h, )?(--[\w.-]+)(?=[ ,\n])", text, flags=re.MULTILINE)
+
+
+def test_help_shows_the_options_that_people_use(capsys):
+    """Twenty of them, in the words of the help on all; the rest is in that one."""
+    (text, common), (whole, every) = _help(capsys, "--help"), _help(capsys, "--help-all")
+    assert _help(capsys, "-h") == (text, common)
+    assert common[:2] == ["--help", "--help-all"]
+    assert len(common) == len(set(common)) == 2 + 20
+    assert {"--config", "--output", "--frames", "--scene.ply", "--material.E", "--wind.flow", "--camera"} < set(common)
+    assert set(common) < set(every)
+    assert len(every) > 4 * len(common)
+    assert "--recorder.checkpoint_every" not in text
+    assert len(text.splitlines()) < 0.25 * len(whole.splitlines())
+    assert "--help-all lists all fields" in " ".join(text.split())
+    for field in ("scene.max_stretch", "wind.seed", "recorder.checkpoint_every", "dtype"):
+        assert f"--{field}" in every, field
+
+
+def test_help_changes_nothing_of_the_parser(capsys):
+    """A page or a program may go on with the parser after it printed help."""
+    parser = Simulation.parser()
+    whole = parser.format_help()
+    with pytest.raises(SystemExit):
+        parser.parse_args(["--help"])
+    assert parser.format_help() == whole
+
+
 def test_help_shows_the_units(capsys):
-    assert _code(["--help"]) == 0
-    text = " ".join(capsys.readouterr().out.split())
+    text = " ".join(_help(capsys, "--help-all")[0].split())
     for words in (
         "Young's modulus [Pa]",
         "Grid spacing [m]",

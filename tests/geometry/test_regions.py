@@ -169,7 +169,7 @@ def test_empty_selection_says_what_to_change():
     means = torch.tensor([[0.0, 1, 2], [3, 4, 5]])
     with pytest.raises(ValueError, match="No Gaussian is selected") as error:
         select_simulated(means, torch.tensor([0.5, 0.6]), Sphere([9, 9, 9], 1), 0.1)
-    for part in ("[0.0, 1.0, 2.0] to [3.0, 4.0, 5.0]", "0 are in Sphere(center=[9.0, 9.0, 9.0], radius=1.0)", "move"):
+    for part in ("[0.0, 1.0, 2.0] and [3.0, 4.0, 5.0]", "0 are in Sphere(center=[9.0, 9.0, 9.0], radius=1.0)", "move"):
         assert part in str(error.value)
     with pytest.raises(
         ValueError, match=r"2 are in Everything.*threshold 0\.9; .*lower the threshold .*opacity is 0\.6"

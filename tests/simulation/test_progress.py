@@ -15,7 +15,7 @@ from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.run import MAX_LOOKS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
-SMALL = ["--config", str(FLAG), "--device", "cpu", "--scene.generator.init_args.spacing", "0.1"]
+SMALL = ["--config", str(FLAG), "--device", "cpu", "--scene.generator.init_args.spacing", "0.1", "--material.E", "9e3"]
 SMALL += ["--solver.dx", "0.2", "--camera.init_args.width", "32", "--camera.init_args.height", "18"]
 SMALL += ["--solver.boundaries", "[]", "--frames", "3"]
 

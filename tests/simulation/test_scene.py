@@ -10,11 +10,13 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_from_z, rotation_to_quat
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, ProceduralScene
+from gaussian_swaying.simulation.edits import Edit
 from gaussian_swaying.simulation.sampling import cell_volume
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
 
@@ -307,6 +309,34 @@ def test_material_regions(make_cloud, make_scene):
     assert torch.equal(points.poisson_ratio, field(0.2, 0.4, 0.4))
     torch.testing.assert_close(points.mass / points.volume, field(100.0, 50.0, 50.0))
     torch.testing.assert_close(points.volume / scene.patches.area, field(0.01, 0.03, 0.03))
+
+
+TOP = Box([None, None, 0.55], [None, None, 0.75])  # of a flag with z up
+
+
+@pytest.mark.parametrize("what", ["scene", "boundary", "material", "edits"])
+@pytest.mark.parametrize("far", [False, True])
+def test_a_region_in_the_axes_of_the_wind_says_so(what, far, make_simulation):
+    """Regions are in scene axes, `wind.flow` has z up: the message has both, and says what is only turned."""
+    cloud, up = FlagScene(spacing=0.1).generate(), [0.0, -1.0, 0.0]
+    means = cloud.means @ rotation_from_z(up).T.to(cloud.means)
+    region = Box([5.0, 5.0, 5.0], [6.0, 6.0, 6.0]) if far else TOP
+    parts = {
+        "scene": {"scene": {"up": up, "region": region}},
+        "boundary": {"boundaries": [PinnedRegion(region)]},
+        "material": {"material": Material(regions=[MaterialRegion(region, E=1.0)])},
+        "edits": {"parts": {"edits": [Edit(region, E=1.0)]}},
+    }[what]
+    flag = dataclasses.replace(cloud, means=means, scales=cloud.scales.mean(-1, keepdim=True).expand(-1, 3))  # balls
+    with pytest.raises(ValueError, match=r"Box\(min=") as caught:
+        make_simulation(flag, pinned=False, **({"scene": {"up": up}} | parts)).start()
+    said = str(caught.value)
+    assert "between [0.05, -0.75, " in said  # in scene axes
+    assert "(with z up, as for `wind.flow`: between [0.05, -0.0028, 0.05] and [1.15, 0.0028, 0.75])" in said
+    held = f"it would hold {int(TOP.contains(cloud.means).sum())} of them"
+    turn = f"with z up {held}, but regions are in scene axes, where up is [0.0, -1.0, 0.0]: turn the region."
+    assert said.endswith(turn) is not far
+    assert ("would hold" in said) is not far
 
 
 def test_a_material_region_that_holds_nothing_is_an_error(make_scene):

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import math
 
 import pytest
@@ -10,11 +11,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import GaussianGust, SineSway, WindField
+from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.gaussians import harmonics
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.rendering.cameras.camera import orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer
@@ -258,6 +261,50 @@ def test_the_camera_orbits_the_object_in_scene_units(up, make_cloud, make_simula
     low, high = cloud.means.amin(0), cloud.means.amax(0)
     eye = simulation.painter.camera_at(0).position
     assert float((eye - 0.5 * (low + high)).norm()) == pytest.approx(3 * float((high - low).amax()), rel=1e-4)
+
+
+@pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+@pytest.mark.parametrize("flow", [[6.0, 1.5, 0.0], [0.0, 5.0, 1.0], [-3.0, -4.0, 0.0]])
+def test_without_a_camera_the_wind_blows_across_a_picture_of_960_by_540(up, flow, make_cloud):
+    simulation = Simulation(make_cloud(), wind=flow, up=up, device="cpu")
+    camera = simulation.painter.camera_at(0)
+    assert (camera.width, camera.height) == (960, 540)
+    x, y, z = (camera.world_to_camera[:3, :3].double() @ simulation.scene.frame.direction_to_scene(
+        torch.tensor(flow, dtype=torch.float64))).tolist()  # fmt: skip
+    speed = math.dist(flow, (0.0, 0.0, 0.0))
+    assert x == pytest.approx(math.hypot(*flow[:2]), abs=1e-5 * speed)  # to the right; float32
+    assert math.hypot(y, z) == pytest.approx(abs(flow[2]), abs=1e-5 * speed)
+
+
+@pytest.mark.parametrize(("side", "around"), [(125.0, 40.0), (-20.0, 60.0)])
+def test_without_a_camera_the_front_is_where_photos_were_taken(side, around, make_cloud, tmp_path):
+    """If they are known; those from all around show no front."""
+    cloud = make_cloud()
+    middle = (0.5 * (cloud.means.amin(0) + cloud.means.amax(0))).tolist()
+
+    def known(width, folder):
+        views = []
+        for angle in torch.linspace(side - width, side + width, 9).tolist():
+            to_world = torch.linalg.inv(orbit_camera(middle, (0, 0, 1), 4.0, angle, 10.0, 40.0, 64, 36).world_to_camera)
+            to_world[:, 1:3] *= -1  # as OpenGL has it
+            views.append({"file_path": f"{len(views)}.png", "transform_matrix": to_world.tolist()})
+        folder.mkdir()
+        (folder / "transforms.json").write_text(
+            json.dumps({"fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 18.0, "w": 64, "h": 36, "frames": views})
+        )
+        cameras = {"photo": CaptureCamera(folder, view=0)}
+        return Simulation(cloud, wind=[6.0, 0.0, 0.0], cameras=cameras, device="cpu").painter.camera.azimuth
+
+    assert known(around, tmp_path / "front") == pytest.approx(side, abs=0.1)
+    assert known(160.0, tmp_path / "around") == -90.0  # beside the wind
+
+
+def test_a_wind_without_a_side_and_a_given_camera_leave_the_azimuth(make_cloud):
+    for wind in ([0.0, 0.0, 0.0], [1.0, 0.0, 4.0]):
+        simulation = Simulation(make_cloud(), wind=wind, device="cpu")
+        assert simulation.painter.camera.azimuth == OrbitCamera().azimuth
+    given = OrbitCamera(width=8, height=8, azimuth=12.0)
+    assert Simulation(make_cloud(), wind=[4.0, 0.0, 0.0], camera=given, device="cpu").painter.camera is given
 
 
 def test_a_camera_inside_the_object_is_an_error(make_cloud, make_simulation):

@@ -11,6 +11,7 @@ SMALL = [
     "--config=configs/sim/flag.yaml",
     "--solver.dx=0.1",
     "--scene.generator.init_args.spacing=0.025",
+    "--material.E=9e3",  # soft, for few substeps
     "--device=cpu",
 ]
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.geometry.regions import Region, RegionInFrame, whereabouts
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
 
 
@@ -24,10 +25,13 @@ class ParticleBoundary(Boundary):
         """Particles inside the region at rest; ValueError if there are none."""
         mask = self.region.contains(rest_position)
         if not bool(mask.any()):
-            low, high = self.region.bounds(rest_position)
-            name = type(self).__name__
+            region, points, rotation = self.region, rest_position, torch.eye(3)
+            if isinstance(region, RegionInFrame):
+                points, rotation = region.frame.point_to_scene(points), region.frame.rotation
+                region = region.region
+            between, hint = whereabouts(region, points, rotation)
             raise ValueError(
-                f"The region {self.region!r} of the {name} holds no particle: the simulated particles lie "
-                f"between {low} and {high}; move or enlarge `region`."
+                f"The region {region!r} of the {type(self).__name__} holds no particle: the simulated particles lie "
+                f"{between}; {hint or 'move or enlarge `region`'}."
             )
         return mask

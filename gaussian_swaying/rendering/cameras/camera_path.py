@@ -70,8 +70,8 @@ class OrbitCamera(CameraPath):
 
     def __init__(
         self,
-        width: int = 480,
-        height: int = 270,
+        width: int = 960,
+        height: int = 540,
         fov_y: float = 40.0,
         azimuth: float = -60.0,
         elevation: float = 15.0,
@@ -138,8 +138,8 @@ class LookAtCamera(CameraPath):
         eye: Sequence[float],
         target: Sequence[float],
         up: Sequence[float] | None = None,
-        width: int = 480,
-        height: int = 270,
+        width: int = 960,
+        height: int = 540,
         fov_y: float = 40.0,
         near: float = 0.01,
     ) -> None:

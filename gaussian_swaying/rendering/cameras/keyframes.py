@@ -130,8 +130,8 @@ class KeyframedCamera(CameraPath):
         keys: list[CameraKey],
         interpolation: str = "smooth",
         up: Sequence[float] | None = None,
-        width: int = 480,
-        height: int = 270,
+        width: int = 960,
+        height: int = 540,
         fov_y: float = 40.0,
         near: float = 0.01,
     ) -> None:

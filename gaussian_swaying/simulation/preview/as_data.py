@@ -69,6 +69,7 @@ def run_dict(simulation: Simulation) -> dict[str, Any]:
         "dx_m": simulation.solver.dx,
         "formulation": simulation.solver.formulation,
         "flow": mean_flow(simulation).tolist(),
+        "up": scene.frame.rotation[2].tolist(),
     }
 
 

@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.boundaries.boundary import Boundary
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera
 from gaussian_swaying.simulation.preview.framing import SOLID, nearby, whole_box
 from gaussian_swaying.simulation.preview.ticks import draw_ticks, project
-from gaussian_swaying.simulation.preview.up import floor_mask
+from gaussian_swaying.simulation.preview.up import floor_mask, wind_words
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -322,7 +322,7 @@ def _legend(
     entries = [
         (REGION, f"box of the {int(parts.simulated.sum()):,} simulated Gaussians [scene units]"),
         (PINNED, f"held: {int(parts.pinned.sum()):,} Gaussians"),
-        (WIND, f"wind {[round(v, 2) for v in flow]} m/s (z up), before gusts"),
+        (WIND, f"steady wind {wind_words(flow, simulation.scene.frame.rotation[2].tolist())}"),
         (NORMAL, "normals, flipped to the eye"),
         ((190, 190, 190), f"not simulated: {int((~(parts.simulated | parts.carried)).sum()):,} Gaussians, greyed"),
         ((120, 120, 120), f"faint or loose, follow their neighbours: {int(parts.carried.sum()):,} Gaussians"),

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.simulation.preview.cost import Cost
 from gaussian_swaying.simulation.preview.starter import region_dict
 from gaussian_swaying.simulation.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
+from gaussian_swaying.simulation.preview.up import wind_words
 from gaussian_swaying.simulation.progress import duration
 
 
@@ -17,6 +19,10 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
     """Bounds, opacities and shapes of the Gaussians."""
     corner, own = data["bounds"], data["gaussians"]
     below = ", ".join(f"{share:.0%} below {t}" for t, share in own["opacity_below"].items())
+    infinite = own["opacity_0_or_1"]
+    note = (
+        f"  note: the opacity of {infinite:,} is exactly 0 or 1, an infinite logit, which is read as ±{OPAQUE_LOGIT:g}"
+    )
     normals = "with normals" if own["normals"] else "without normals (the smallest axes are used)"
     return [
         f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
@@ -27,6 +33,7 @@ def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[s
         f"    S1 / S2     {_numbers(own['S1_over_S2'])}   (needles are above 10)",
         f"    S2 / S3     {_numbers(own['S2_over_S3'])}   (surface patches are above 3)",
         f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
+        *([note] if infinite else []),
     ]
 
 
@@ -54,7 +61,7 @@ def suggestion_lines(found: Suggestion, further: int) -> list[str]:
         f"{found.spacing:.3g} m",
         "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
         f"material        {_material(found)}",
-        f"wind            {_numbers(found.flow)} m/s, z up",
+        f"wind            {wind_words(found.flow, found.up.direction)}",
     ]
     return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
 
@@ -78,7 +85,7 @@ def run_lines(run: dict[str, Any]) -> list[str]:
         *(f"                  {region}" for region in run["regions"]),
         f"  frame           {run['frame']}",
         f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
-        f"  wind            {_numbers(run['flow'])} m/s, z up, before modulations",
+        f"  wind            {wind_words(run['flow'], run['up'])}, before modulations",
     ]
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from gaussian_swaying import _program as program
 from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
 from gaussian_swaying.simulation.preview.suggest import Suggestion, at_quality
+from gaussian_swaying.simulation.preview.up import wind_words
 
 DRAFT_FRAMES = 51  # 2 s
 DRAFT_PICTURE = (480, 270)
@@ -140,7 +141,7 @@ solver:
   boundaries:{boundaries}
 
 wind:
-  flow: {_padded(json.dumps(list(s.flow)), 24)}# m/s, z up
+  flow: {_padded(json.dumps(list(s.flow)), 24)}# {wind_words(s.flow, s.up.direction)}
   seed: 0
   modulations:
     - class_path: SineSway

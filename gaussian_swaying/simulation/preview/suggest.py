@@ -16,6 +16,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice, check_positive, check_shape
 from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -96,6 +97,7 @@ def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
         "sh_degree": cloud.sh_degree,
         "normals": cloud.normals is not None,
         "opacity": _three(opacity),
+        "opacity_0_or_1": int((cloud.opacities.abs() == OPAQUE_LOGIT).sum()),
         "opacity_below": {str(t): float((opacity < t).double().mean()) for t in THRESHOLDS if t > 0},
         "S1_over_S2": _three(s1 / s2),
         "S2_over_S3": _three(s2 / s3),
@@ -280,6 +282,16 @@ def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
     """Horizontal flow to the right of a picture from an azimuth [degrees]."""
     angle = math.radians(azimuth)
     return (-speed * math.sin(angle), speed * math.cos(angle), 0.0)
+
+
+def azimuth_beside(flow: Sequence[float]) -> float | None:
+    """Azimuth from which a flow [m/s, z up] goes to the right of the picture [degrees]; None if it is not horizontal.
+
+    The inverse of :func:`_across_picture`.
+    """
+    x, y, z = flow
+    level = math.hypot(x, y)
+    return math.degrees(math.atan2(-x, y)) if level > abs(z) else None
 
 
 # ---- what is simulated

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_vector
+from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.simulation.preview.hold import balanced_base
 from gaussian_swaying.simulation.preview.shape import (
     DIRECTIONS,
@@ -22,6 +23,26 @@ from gaussian_swaying.simulation.preview.shape import (
 
 # conventions of capturing and modelling programs: z up (Blender), y down (COLMAP), y up (glTF)
 CONVENTION = {"+z": 0.75, "-y": 0.75, "+y": 0.5, "-z": -1.0, "+x": -1.0, "-x": -1.0}
+
+
+def wind_words(flow: Sequence[float], up: Sequence[float]) -> str:
+    """A flow in words: with z up, as in ``wind.flow``, and in scene axes, as regions are, if z is not up in them.
+
+    Args:
+        flow: Velocity [m/s], z up.
+        up: Direction that points up in the scene.
+
+    Example:
+        >>> wind_words([2.0, 5.0, 0.0], [0.0, -1.0, 0.0])
+        '[2, 5, 0] m/s, z up ([2, 0, 5] in scene axes)'
+    """
+    rotation = rotation_from_z(up)
+    turned = rotation @ torch.tensor(flow, dtype=torch.float64)
+    here, there = (
+        "[" + ", ".join(f"{round(v, 4) + 0.0:.3g}" for v in vector) + "]" for vector in (flow, turned.tolist())
+    )
+    words = f"{here} m/s, z up"
+    return words if torch.equal(rotation, torch.eye(3).double()) else f"{words} ({there} in scene axes)"
 
 
 @dataclass(frozen=True)

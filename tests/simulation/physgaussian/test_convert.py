@@ -544,7 +544,7 @@ def test_a_region_that_selects_nothing_says_where_the_splat_is_in_its_own_axes(t
     settings = _settings(config, "--scene.ply", str(tmp_path / "bar.ply"), tmp_path=tmp_path)
     with pytest.raises(ValueError, match=r"No Gaussian is selected.*in the axes of the region, 0 are in Box") as caught:
         Simulation.from_settings(PARSER, settings)
-    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("span")[1].split(" in ")[0])]
+    found = [float(v) for v in re.findall(r"-?\d+\.\d+", str(caught.value).split("between")[1].split(" in ")[0])]
     assert found == pytest.approx([*low, *high], abs=1e-4)
     far = {"E": 1e5, "nu": 0.3, "density": 100, "point": [9, 9, 9], "size": [0.1, 0.1, 0.1]}
     config = BASE | {"rotation_degree": [135.0], "rotation_axis": [0], "additional_material_params": [far]}
