@@ -36,10 +36,24 @@ def build_options() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets other computers in (default: this one)")
+    add(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a name or an address by which other computers open the page, if it is none of this computer's own; "
+        "can be given several times",
+    )
     add("--port", type=int, default=8080, help="port of the page; the next free one if it is taken")
-    add("--pixels", type=int, default=1920, help="most pixels of the longer side of a picture")
+    add("--pixels", type=_pixels, default=1920, help="most pixels of the longer side of a picture")
     add("--no-browser", action="store_true", help="only print the address")
     return parser
+
+
+def _pixels(text: str) -> int:
+    if not text.isdecimal() or not 16 <= int(text) <= 8192:
+        raise argparse.ArgumentTypeError(f"expected from 16 to 8192 pixels, but got {text}")
+    return int(text)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -101,9 +115,11 @@ def _live(options: argparse.Namespace, further: Sequence[str]) -> None:
     session = Session(parser, settings_of(parser, options.scene, further))
     if session.simulation.device.type == "cpu":
         share_cores()
-    page = Page(session, options.host, options.port, options.pixels)
+    page = Page(session, options.host, options.port, options.pixels, options.allow_host)
     session.start()
     print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)
+    if page.url_elsewhere is not None:
+        print(f"Other computers open {page.url_elsewhere}; whoever has the link can change the scene.", flush=True)
     if not options.no_browser:
         webbrowser.open(page.url)
     try:

@@ -6,6 +6,8 @@ import math
 import tempfile
 import threading
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,9 +40,7 @@ class Controls:
     def __init__(self, page: Page) -> None:
         self.page, self.session, self.server = page, page.session, page.server
         self.force_end = page.session.simulation.force_scale()
-        self._quiet = False  # while controls are set by the program
         self._upload: tempfile.TemporaryDirectory[str] | None = None
-        self._loading = threading.Lock()
         self._pin: Any = None
         self._handle: Any = None
         self._grabbed = False  # whether what the handle pulls is held by now
@@ -70,10 +70,10 @@ class Controls:
         self.step = gui.add_button("Step", hint="One step, while paused")
         self.reset = gui.add_button("Reset", hint="Back to rest")
         self.speed = gui.add_slider("Speed [x real time]", 0.05, 1.0, 0.05, 1.0, hint="Slow motion below 1")
-        self.pause.on_click(lambda _: self._toggle())
-        self.step.on_click(lambda _: self.session.step())
-        self.reset.on_click(lambda _: self.session.reset())
-        self.speed.on_update(lambda _: self.session.pace(self.speed.value))
+        self._on(self.pause.on_click, self._toggle)
+        self._on(self.step.on_click, self.session.step)
+        self._on(self.reset.on_click, self.session.reset)
+        self._on(self.speed.on_update, lambda: self.session.pace(self.speed.value))
 
     def _wind(self) -> None:
         gui = self.server.gui
@@ -83,8 +83,8 @@ class Controls:
         self.elevation = gui.add_slider("Upwards [deg]", -90.0, 90.0, 1.0, elevation)
         self.gusts = gui.add_slider("Gusts [%]", 0, 100, 1, 0, hint="Replaces the gusts of the configuration")
         for control in (self.wind_speed, self.azimuth, self.elevation):
-            control.on_update(lambda _: self._unless_quiet(self._blow))
-        self.gusts.on_update(lambda _: self._unless_quiet(self._gust))
+            self._on(control.on_update, self._blow)
+        self._on(self.gusts.on_update, self._gust)
 
     def _material(self) -> None:
         gui, settings = self.server.gui, self.session.settings
@@ -96,10 +96,10 @@ class Controls:
         self.grid = gui.add_dropdown(
             "Grid", tuple(GRIDS), initial_value="normal", hint="A coarser grid is faster; starts again"
         )
-        self.stiffness.on_update(lambda _: self._set("material.E", float(f"{10**self.stiffness.value:.3g}")))
-        self.damping.on_update(lambda _: self._set("solver.damping", self.damping.value))
-        self.gravity.on_update(lambda _: self._set("solver.gravity", [0.0, 0.0, -self.gravity.value]))
-        self.grid.on_update(lambda _: self._set("solver.dx", float(f"{self._dx * GRIDS[self.grid.value]:.6g}")))
+        self._on(self.stiffness.on_update, lambda: self._set("material.E", float(f"{10**self.stiffness.value:.3g}")))
+        self._on(self.damping.on_update, lambda: self._set("solver.damping", self.damping.value))
+        self._on(self.gravity.on_update, lambda: self._set("solver.gravity", [0.0, 0.0, -self.gravity.value]))
+        self._on(self.grid.on_update, lambda: self._set("solver.dx", float(f"{self._dx * GRIDS[self.grid.value]:.6g}")))
 
     def _holding(self) -> None:
         gui = self.server.gui
@@ -109,12 +109,12 @@ class Controls:
         self.pin_size = gui.add_slider("Size of the box [% of the object]", 2, 100, 1, 15)
         self.hold = gui.add_button("Hold what is in the box", disabled=True)
         self.free = gui.add_button("Let go of all pins")
-        self.release.on_click(lambda _: self.let_go())
-        self.new_pin.on_click(lambda _: self._place_pin())
-        self.pin_size.on_update(lambda _: self._size_pin())
-        self.hold.on_click(lambda _: self._hold_box())
-        self.free.on_click(lambda _: self.session.change({"solver.boundaries": []}))
-        self.server.scene.on_click()(self._clicked)
+        self._on(self.release.on_click, self.let_go)
+        self._on(self.new_pin.on_click, self._place_pin)
+        self._on(self.pin_size.on_update, self._size_pin)
+        self._on(self.hold.on_click, self._hold_box)
+        self._on(self.free.on_click, lambda: self._set("solver.boundaries", []))
+        self._on(self.server.scene.on_click(), self._clicked, tell_event=True)
 
     def _picture(self) -> None:
         gui = self.server.gui
@@ -125,22 +125,23 @@ class Controls:
         self.arrow = gui.add_checkbox("Arrow of the wind", True)
         self.box = gui.add_checkbox("Box of the grid", False)
         self.pins = gui.add_checkbox("What is held", False, hint="Points that pins and handles hold, at rest")
-        self.shown.on_update(lambda _: self._show())
-        self.light.on_update(lambda _: self._shade())
-        self.shading.on_update(lambda _: self._unless_quiet(self._shade))
-        self.streaks.on_update(lambda _: self._show())
-        self.arrow.on_update(lambda _: self.draw_handles())
-        self.box.on_update(lambda _: self.draw_handles())
-        self.pins.on_update(lambda _: self.draw_handles())
+        changed: dict[Callable[[], None], tuple[Any, ...]] = {
+            self._show: (self.shown, self.streaks),
+            self._shade: (self.light, self.shading),
+            self.draw_handles: (self.arrow, self.box, self.pins),
+        }
+        for what, controls in changed.items():
+            for control in controls:
+                self._on(control.on_update, what)
 
     def _files(self) -> None:
         gui = self.server.gui
         self.record = gui.add_button("Record a video")
         self.save = gui.add_button("Save the configuration", hint="A YAML file that `gaussian-swaying sim` runs")
         self.load = gui.add_upload_button("Load a splat (.ply)", mime_type=".ply")
-        self.record.on_click(self._toggle_recording)
-        self.save.on_click(self._save)
-        self.load.on_upload(lambda _: self._load())
+        self._on(self.record.on_click, self._toggle_recording, tell_event=True)
+        self._on(self.save.on_click, self._save, tell_event=True)
+        self._on(self.load.on_upload, self._load)
 
     # ---- health
 
@@ -170,13 +171,18 @@ class Controls:
 
     # ---- what they do
 
-    def _unless_quiet(self, what: Callable[[], None]) -> None:
-        if not self._quiet:
-            what()
+    def _on(self, subscribe: Callable[[Any], Any], what: Callable[..., None], tell_event: bool = False) -> None:
+        """Do something in its turn when a browser uses a control; not when the program sets its value."""
+        key = object()
+
+        async def asked(event: Any) -> None:  # awaited, and not in one of viser's threads, so that the order stays
+            if event.client is not None:
+                self.page.turns.ask(key, partial(what, event) if tell_event else what)
+
+        subscribe(asked)
 
     def _set(self, name: str, value: Any) -> None:
-        if not self._quiet:
-            self.session.change({name: value})
+        self.session.change({name: value})
 
     def _toggle(self) -> None:
         self.session.pause(not self.session.paused)
@@ -225,7 +231,7 @@ class Controls:
             "/wind/tip", scale=0.12 * scene.size, disable_rotations=True, disable_sliders=True, depth_test=False,
             visible=self.arrow.value,
         )  # fmt: skip
-        self._tip.on_update(lambda _: self._unless_quiet(self._tip_moved))
+        self._on(self._tip.on_update, self._tip_moved)
         self._draw_arrow(self._flow())
         grid = self.session.snapshot.state.grid
         low = np.array(grid.offset) * grid.dx
@@ -266,9 +272,7 @@ class Controls:
             "/wind/arrow", points, (40, 120, 220), shaft_radius=0.008 * size, head_radius=0.02 * size,
             head_length=0.05 * size, visible=self.arrow.value and float(np.linalg.norm(along)) > 0.05,
         )  # fmt: skip
-        self._quiet = True
         self._tip.position = tuple(tail)
-        self._quiet = False
 
     def _tip_moved(self) -> None:
         """The tail of the arrow was dragged: another wind."""
@@ -276,11 +280,9 @@ class Controls:
         along = torch.tensor(self._anchor() - np.array(self._tip.position), dtype=torch.float64)
         flow = scene.frame.direction_to_sim(along / (ARROW * scene.size)).tolist()
         speed, azimuth, elevation = to_angles(flow)
-        self._quiet = True
         self.wind_speed.value = round(min(speed, MOST_SPEED), 1)  # type: ignore[misc]
         self.azimuth.value = round(azimuth, 1)  # type: ignore[misc]
         self.elevation.value = round(elevation, 1)  # type: ignore[misc]
-        self._quiet = False
         self._blow()
 
     # ---- pull and hold
@@ -296,7 +298,7 @@ class Controls:
         self._handle = self.server.scene.add_transform_controls(
             "/pull", scale=0.25 * size, disable_rotations=True, depth_test=False, position=np.array(place)
         )
-        self._handle.on_update(lambda _: self._dragged())
+        self._on(self._handle.on_update, self._dragged)
         self.release.disabled = False
 
     def _dragged(self) -> None:
@@ -365,6 +367,8 @@ class Controls:
         except (ValueError, OSError) as error:
             self.page.tell(str(error))
             return
+        if film.full:
+            self.page.tell(f"The video has the greatest length, {film.seconds:.0f} s, and was saved.")
         if client is not None:
             client.send_file_download("wind.mp4", content, save_immediately=True)
 
@@ -376,23 +380,25 @@ class Controls:
             event.client.send_file_download("live.yaml", text.encode(), save_immediately=True)
 
     def _load(self) -> None:
+        self.load.disabled = True
         content = self.load.value.content
         threading.Thread(target=self._look_at, args=(content,), name="load", daemon=True).start()
 
     def _look_at(self, content: bytes) -> None:
         """Go on with an uploaded splat; its name is never used."""
-        with self._loading:
-            self.page.tell("Looking at the splat, which takes up to a minute.", 60.0)
-            folder = tempfile.TemporaryDirectory()
-            path = Path(folder.name) / "scene.ply"
-            path.write_bytes(content)
-            try:
-                settings = settings_of_splat(self.session.parser, path, self.session.simulation.device)
-            except Exception as error:
-                self.page.tell(" ".join(str(error).split()))
-                folder.cleanup()
-                return
-            self.session.load(settings, lambda: self._loaded(folder))
+        self.page.tell("Looking at the splat, which takes up to a minute.", 60.0)
+        folder = tempfile.TemporaryDirectory()
+        path = Path(folder.name) / "scene.ply"
+        path.write_bytes(content)
+        try:
+            settings = settings_of_splat(self.session.parser, path, self.session.simulation.device)
+            self.session.load(settings, lambda: self.page.turns.ask("loaded", lambda: self._loaded(folder)))
+        except Exception as error:
+            self.page.tell(" ".join(str(error).split()))
+            folder.cleanup()
+        finally:
+            self.load._impl.value = replace(self.load.value, content=b"")
+            self.load.disabled = False
 
     def _loaded(self, folder: tempfile.TemporaryDirectory[str]) -> None:
         """Another scene is there: what belongs to the old one goes, and the controls show its values."""
@@ -415,10 +421,8 @@ class Controls:
             self.grid: "normal",
             self.shading: self.session.simulation.painter.shader is not None,
         }
-        self._quiet = True
         for control, value in shown.items():
             control.value = value  # type: ignore[attr-defined]
-        self._quiet = False
         self.page.tell("", 0.0)
         self.page.look_from_start()
         self.draw_handles()

@@ -114,8 +114,9 @@ class PictureSize:
     def fit(self, width: int, height: int, still: bool = False) -> tuple[int, int]:
         """Size for a window of these pixels; the same shape, and even. If nothing moves, as large as it may be."""
         width, height = max(width, 1), max(height, 1)
-        scale = (1.0 if still else SIZES[self._level]) * min(1.0, self.largest / max(width, height))
-        scale = max(scale, min(1.0, LEAST / min(width, height)))
+        largest = min(1.0, self.largest / max(width, height))
+        scale = largest if still else largest * SIZES[self._level]
+        scale = min(max(scale, LEAST / min(width, height)), largest)
         return max(2 * round(width * scale / 2), 2), max(2 * round(height * scale / 2), 2)
 
     def took(self, seconds: float) -> None:

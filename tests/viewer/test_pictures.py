@@ -76,6 +76,7 @@ def test_pictures_get_smaller_where_they_take_long():
     assert size.fit(2000, 1000) == (250, 124)
     assert size.fit(300, 200) == (144, 96)  # not too small to be read
     assert size.fit(2000, 1000, still=True) == (1000, 500)
+    assert size.fit(1, 2_000_000) == size.fit(1, 2_000_000, still=True) == (2, 1000)  # nor too large
     for _ in range(10):
         size.took(0.01)
     assert size.fit(400, 300) == (400, 300)
