@@ -29,6 +29,7 @@ def build_options() -> argparse.ArgumentParser:
     """The parser of the options that are not those of ``gaussian-swaying sim``."""
     parser = argparse.ArgumentParser(
         prog=program.name("live"),
+        allow_abbrev=False,
         usage=f"{program.name('live')} [SCENE] [options]",
         description="Open a page on which the wind can be changed while a scene moves. SCENE is a splat or a "
         "configuration (.yaml); without it, a flag. Further options are those of `gaussian-swaying sim`, for example "
@@ -45,15 +46,9 @@ def build_options() -> argparse.ArgumentParser:
         "can be given several times",
     )
     add("--port", type=int, default=8080, help="port of the page; the next free one if it is taken")
-    add("--pixels", type=_pixels, default=1920, help="most pixels of the longer side of a picture")
+    add("--pixels", type=int, default=1920, help="most pixels of the longer side of a picture")
     add("--no-browser", action="store_true", help="only print the address")
     return parser
-
-
-def _pixels(text: str) -> int:
-    if not text.isdecimal() or not 16 <= int(text) <= 8192:
-        raise argparse.ArgumentTypeError(f"expected from 16 to 8192 pixels, but got {text}")
-    return int(text)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,18 +62,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     return run_command(
-        lambda: _live(*split(arguments)),
+        lambda: _live(arguments),
         memory="a smaller `scene.region`, a coarser `solver.dx` or fewer `--pixels`",
         expected=(ImportError,),
         arguments=arguments,
     )
 
 
-def split(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
-    """The options of this command, and those of ``gaussian-swaying sim``; the scene comes first."""
-    first = [] if not arguments or arguments[0].startswith("-") else [arguments[0]]
-    options, further = build_options().parse_known_args(arguments[len(first) :])
-    options.scene = first[0] if first else None
+def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """The options of this command with the scene, and those of ``gaussian-swaying sim``, in any order.
+
+    Args:
+        parser: From :meth:`Simulation.parser`; it knows which options have a value.
+        arguments: The command line.
+
+    Raises:
+        ValueError: If there are two scenes, or the number of pixels cannot be.
+    """
+    options, rest = build_options().parse_known_args(arguments)
+    switches = {name for action in parser._actions if action.nargs == 0 for name in action.option_strings}
+    scenes: list[str] = []
+    further: list[str] = []
+    value_follows = False
+    for argument in rest:
+        if value_follows or argument.startswith("-"):
+            value_follows = not value_follows and "=" not in argument and argument not in switches
+            further.append(argument)
+        else:
+            scenes.append(argument)
+    if len(scenes) > 1:
+        raise ValueError(f"Expected one SCENE, but got {' and '.join(scenes)}: give one of them.")
+    if not 16 <= options.pixels <= 8192:
+        raise ValueError(f"Expected `--pixels` from 16 to 8192, but got {options.pixels}.")
+    options.scene = scenes[0] if scenes else None
     return options, further
 
 
@@ -110,8 +126,9 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
     return settings
 
 
-def _live(options: argparse.Namespace, further: Sequence[str]) -> None:
+def _live(arguments: Sequence[str]) -> None:
     parser = Simulation.parser()
+    options, further = split(parser, arguments)
     session = Session(parser, settings_of(parser, options.scene, further))
     if session.simulation.device.type == "cpu":
         share_cores()
