@@ -33,7 +33,9 @@ def parser():
 def test_options_and_scene_come_in_any_order(parser, line):
     options, further = live.split(parser, line.split())
     assert (options.scene, options.port, options.no_browser) == ("my.ply", 9000, True)
-    assert sorted(further) == sorted("--device cpu --wind.flow [1,-2,3] --solver.damping -3 --resume".split())
+    assert sorted(further) == sorted(
+        ["--device", "cpu", "--wind.flow", "[1,-2,3]", "--solver.damping", "-3", "--resume"]
+    )
     assert further.index("cpu") == further.index("--device") + 1
     assert further.index("-3") == further.index("--solver.damping") + 1
 
