@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,13 +98,19 @@ def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Na
     return options, further
 
 
-def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str]) -> Namespace:
+def settings_of(
+    parser: ArgumentParser,
+    scene: str | None,
+    further: Sequence[str],
+    tell: Callable[[float, str], None] = lambda share, what: None,
+) -> Namespace:
     """The settings of what is to be shown.
 
     Args:
         parser: From :meth:`Simulation.parser`.
         scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
         further: Options of ``gaussian-swaying sim``.
+        tell: Told how much is done, from 0 to 1, and what is done next.
 
     Raises:
         ValueError: If a file or an option is bad.
@@ -116,7 +122,7 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
         print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
-        settings = settings_of_splat(parser, scene, resolve_device(device), given)
+        settings = settings_of_splat(parser, scene, resolve_device(device), given, tell)
     else:
         config = scene or (None if any(option.split("=")[0] == "--config" for option in given) else "flag")
         arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
@@ -129,21 +135,26 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
 def _live(arguments: Sequence[str]) -> None:
     parser = Simulation.parser()
     options, further = split(parser, arguments)
-    session = Session(parser, settings_of(parser, options.scene, further))
-    if session.simulation.device.type == "cpu":
-        share_cores()
-    page = Page(session, options.host, options.port, options.pixels, options.allow_host)
-    session.start()
-    print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)
-    if page.url_elsewhere is not None:
-        print(f"Other computers open {page.url_elsewhere}; whoever has the link can change the scene.", flush=True)
-    if not options.no_browser:
-        webbrowser.open(page.url)
+    page = Page(options.host, options.port, options.pixels, options.allow_host)
+    session = None
     try:
+        print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)
+        if page.url_elsewhere is not None:
+            print(f"Other computers open {page.url_elsewhere}; whoever has the link can change the scene.", flush=True)
+        if not options.no_browser:
+            webbrowser.open(page.url)
+        settings = settings_of(parser, options.scene, further, page.progress)
+        page.progress(0.8, "Making the simulation")
+        session = Session(parser, settings)
+        if session.simulation.device.type == "cpu":
+            share_cores()
+        page.show(session)
+        session.start()
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
         print("Ended.")
     finally:
         page.close()
-        session.close()
+        if session is not None:
+            session.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -63,9 +64,10 @@ class Incoming:
             receive = connection.recv
 
             async def receive_good() -> Any:
-                while not self.takes(raw := await receive()):
-                    pass
-                return raw
+                while True:
+                    await asyncio.sleep(0)  # until viser has dealt with the message before, such as a file's beginning
+                    if self.takes(raw := await receive()):
+                        return raw
 
             connection.recv = receive_good
             await handler(connection)

@@ -20,12 +20,14 @@ import torch
 from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.incoming import Incoming
-from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw
+from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw, enlarged
 from gaussian_swaying.viewer.session import Session, Snapshot
 from gaussian_swaying.viewer.turns import Turns
 
 if TYPE_CHECKING:
     import viser
+
+    from gaussian_swaying.viewer.controls import Controls
 
 MOST_PER_SECOND = 30  # pictures for a browser
 JPEG_QUALITY = 75
@@ -85,13 +87,12 @@ def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
 
 
 class Page:
-    """Serves a session.
+    """A page that says how far a scene is loaded, and serves its session from :meth:`show` on.
 
     The simulation never waits for a browser. Each browser has a thread that draws the newest snapshot from its camera;
     a slow one gets fewer pictures, as viser replaces a picture that is not sent yet.
 
     Args:
-        session: The session.
         host: Address to listen on.
         port: Port; the next free one if it is taken.
         largest: Most pixels of the longer side of a picture.
@@ -101,26 +102,28 @@ class Page:
         shown: What is drawn, one of :data:`.pictures.SHOWN`.
         streaks: Whether streaks of air are drawn over it.
         recording: The video that is being recorded, or None.
+        drawn_size: Width and height at which the last picture was drawn [pixels].
     """
 
     def __init__(
         self,
-        session: Session,
         host: str = "127.0.0.1",
         port: int = 8080,
         largest: int = 1920,
         names: Sequence[str] = (),
     ) -> None:
-        from gaussian_swaying.viewer.controls import Controls
-
-        self.session, self.largest = session, largest
+        self.largest = largest
+        self.session: Session
+        self.controls: Controls
         self.shown = "colour"
         self.streaks = False
         self.recording: FilmStrip | None = None
+        self.drawn_size = (0, 0)
         self.recorder: int | None = None  # the browser from whose camera is recorded
         self._closed = threading.Event()
         self._gone: dict[int, threading.Event] = {}
         self._drawn: dict[int, deque[float]] = {}
+        self._shown = threading.Event()  # whether there is a session
         self._threads: list[threading.Thread] = []
         self._drawing = threading.Lock()  # of many browsers one waits for the session, which gets its turn so
         self._notice = ("", 0.0)
@@ -130,11 +133,36 @@ class Page:
         self.server.gui.configure_theme(
             control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
         )
-        self.look_from_start()
+        self._text = self.server.gui.add_markdown("")
+        self._bar = self.server.gui.add_progress_bar(0.0, animated=True)
+        self.progress(0.0, "Loading the scene")
         self.turns = Turns(self._keep_telling, 0.4, self._failed)
-        self.controls = Controls(self)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
+
+    def show(self, session: Session) -> Page:
+        """Show a session, and the controls; returns the page."""
+        from gaussian_swaying.viewer.controls import Controls
+
+        self.session = session
+        self.look_from_start()
+        self.controls = Controls(self)
+        self.progress(None)
+        self._shown.set()
+        return self
+
+    def progress(self, share: float | None, what: str = "") -> None:
+        """Show how much of something is done, from 0 to 1; None if there is nothing to wait for."""
+        self._loading = "" if share is None else f"{what} ..."
+        self._bar.visible = share is not None
+        self._bar.value = 100 * (share or 0.0)  # type: ignore[misc]
+        if not self._shown.is_set():
+            self.write([])
+
+    def write(self, lines: Sequence[str]) -> None:
+        """Write lines in the corner, with what is being loaded and the notice."""
+        further = [f"**{self._loading}**" if self._loading else "", f"_{self.notice}_" if self.notice else ""]
+        self._text.content = "\n\n".join(line for line in (*lines, *further) if line)
 
     @property
     def url(self) -> str:
@@ -174,10 +202,11 @@ class Page:
         self._version += 1
 
     def look_from_start(self) -> None:
-        """Set where a browser looks from at first: from the camera of the configuration."""
+        """Set where a browser looks from at first, from the camera of the configuration, and how far it can drag."""
         simulation = self.session.simulation
         camera = simulation.painter.camera_at(0)
         scene = simulation.scene
+        self.incoming.reach = float(scene.center.abs().amax()) + FAR * scene.size
         up = scene.frame.rotation[2].tolist()
         self.server.scene.set_up_direction(tuple(up))
         first = self.server.initial_camera
@@ -215,10 +244,13 @@ class Page:
         self._gone.pop(client.client_id, threading.Event()).set()
         self._drawn.pop(client.client_id, None)
         if self.recorder == client.client_id:
-            self.turns.ask("stop recording", lambda: self.controls.stop_recording(None))
+            self.turns.ask("stop recording", lambda: self.controls.files.stop_recording(None))
 
     def _serve(self, client: viser.ClientHandle, gone: threading.Event) -> None:
         """Draw for a browser until it is gone."""
+        while not self._shown.wait(0.1):
+            if gone.is_set() or self._closed.is_set():
+                return
         on_cpu = self.session.simulation.device.type == "cpu"
         size = PictureSize(0.14 if on_cpu else 0.05, self.largest, 2 if on_cpu else 0)
         seen: tuple[Any, ...] = ()
@@ -251,6 +283,8 @@ class Page:
             picture = draw(snapshot, camera, self.shown, self.controls.force_end, self.streaks)
         if not still:
             size.took(time.perf_counter() - waited)
+        self.drawn_size = (width, height)
+        picture = enlarged(picture, *size.fit(pose.image_width, pose.image_height, still=True))
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
         times = self._drawn.get(client.client_id)
         if times is not None:
@@ -259,11 +293,11 @@ class Page:
         if film is not None and self.recorder == client.client_id:
             film.add(snapshot.health.time, np.ascontiguousarray(picture))
             if film.full:
-                self.turns.ask("stop recording", lambda: self.controls.stop_recording(client))
+                self.turns.ask("stop recording", lambda: self.controls.files.stop_recording(client))
 
     def _keep_telling(self) -> None:
         """Keep the figures in the corner up to date."""
-        scene = self.session.simulation.scene
-        self.incoming.reach = float(scene.center.abs().amax()) + FAR * scene.size
+        if not self._shown.is_set():
+            return
         with suppress(Exception):  # the figures of a moment, while a scene is replaced
             self.controls.tell()

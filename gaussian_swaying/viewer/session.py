@@ -149,20 +149,29 @@ class Session:
             self._changes.update(values)
             self._wake.notify_all()
 
-    def load(self, settings: Namespace, done: Callable[[], None] = lambda: None) -> None:
+    def load(
+        self,
+        settings: Namespace,
+        done: Callable[[], None] = lambda: None,
+        ended: Callable[[], None] = lambda: None,
+    ) -> None:
         """Go on with another scene, from rest.
 
         Args:
             settings: Its settings.
             done: Called in the thread of the session once the scene is there; not if it cannot be made.
+            ended: Called there in both cases.
         """
 
         def take_scene() -> None:
-            self._take_settings(settings, fresh=True)
-            self._first = settings
-            self._past.clear()
-            self.revision += 1
-            done()
+            try:
+                self._take_settings(settings, fresh=True)
+                self._first = settings
+                self._past.clear()
+                self.revision += 1
+                done()
+            finally:
+                ended()
 
         self._ask(take_scene)
 
@@ -175,7 +184,7 @@ class Session:
         self._ask(self._undo)
 
     def restore(self) -> None:
-        """Go back to rest and to the settings of the start, or of the last scene that was loaded: pins, material, all."""
+        """Go back to rest and to the settings of the start, or of the scene that was loaded: pins, material, all."""
         self._ask(self._restore)
 
     @property

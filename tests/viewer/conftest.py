@@ -123,7 +123,7 @@ def page(parser, settings):
     from gaussian_swaying.viewer.page import Page
 
     session = Session(parser, settings)
-    made = Page(session, port=8400, largest=320)
+    made = Page(port=8400, largest=320).show(session)
     session.start()
     yield made
     made.close()

@@ -28,7 +28,7 @@ def _open(address, **headers):
 def open_page(parser, settings):
     """A page that listens for other computers, too."""
     session = Session(parser, settings)
-    made = Page(session, host="0.0.0.0", port=8460, largest=320, names=["Wind.Example"])
+    made = Page(host="0.0.0.0", port=8460, largest=320, names=["Wind.Example"]).show(session)
     session.start()
     yield made
     made.close()

@@ -46,7 +46,7 @@ def test_it_listens_on_this_computer_only_and_serves_no_files(page):
 
 
 def test_what_is_held_is_shown(page):
-    held = page.controls._held()
+    held = page.controls.holding.places()
     assert len(held) > 5
     assert abs(held[:, 0]).max() < 0.03  # the pole
 
@@ -54,7 +54,7 @@ def test_what_is_held_is_shown(page):
 def test_closing_ends_all_threads(parser, settings):
     before = set(threading.enumerate())
     session = Session(parser, settings)
-    page = Page(session, port=8450)
+    page = Page(port=8450).show(session)
     session.start()
     page.close()
     session.close()
@@ -93,7 +93,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     session.change({"wind.flow": [1e7, 0.0, 0.0]})
     window.get_by_text("to start again").wait_for(timeout=20_000)
     session.change({"wind.flow": [2.0, 0.0, 0.0]})
-    window.get_by_role("button", name="Reset").click()
+    window.get_by_role("button", name="Back to rest").click()
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
@@ -173,7 +173,7 @@ def test_a_click_takes_hold_of_the_flag(page, window, until):
     time.sleep(1.0)
     window.mouse.click(520, 480)
     until(lambda: page.session.pulls)
-    assert page.controls._handle is not None
+    assert page.controls.holding._handle is not None
     window.get_by_role("button", name="Let go of it").click()
     until(lambda: not page.session.pulls)
 
