@@ -116,7 +116,7 @@ def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, mon
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
-    until(lambda: page.recording is not None and page.recording.seconds > 0.3)
+    until(lambda: page.recording is not None and page.recording.seconds > 0.3, 240)
     with window.expect_download(timeout=30_000) as download:
         window.get_by_role("button", name="Stop recording").click()
     video = tmp_path / "wind.mp4"
@@ -134,7 +134,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
 @pytest.mark.slow
 def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.5)
-    with window.expect_download(timeout=60_000):
+    with window.expect_download(timeout=240_000):
         window.get_by_role("button", name="Record a video").click()
     window.get_by_text("has the greatest length").wait_for(timeout=5_000)
     window.get_by_role("button", name="Record a video").wait_for(timeout=5_000)
@@ -146,8 +146,8 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
     other.goto(page.url)
-    until(lambda: len(page.server.get_clients()) == 2, 40)
-    until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 40)
+    until(lambda: len(page.server.get_clients()) == 2, 240)
+    until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 240)
     second.close()
     until(lambda: len(page.server.get_clients()) == 1)
     number = page.session.snapshot.number
@@ -160,14 +160,14 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     path = tmp_path / "../flag.ply"
     write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
     before = page.session.simulation
-    window.locator("input[type=file]").last.set_input_files(path)
-    until(lambda: page.session.simulation is not before, 60)
-    until(lambda: page.session.snapshot.health.time > 0.05, 30)
+    window.locator('input[type=file][accept=".ply"]').set_input_files(path)
+    until(lambda: page.session.simulation is not before, 300)
+    until(lambda: page.session.snapshot.health.time > 0.05, 120)
     assert len(page.session.simulation.scene.model.means) == 144
     assert window.problems == []
     (tmp_path / "text.ply").write_text("not a splat")
-    window.locator("input[type=file]").last.set_input_files(tmp_path / "text.ply")
-    until(lambda: page.notice is not None and "Looking" not in page.notice, 30)
+    window.locator('input[type=file][accept=".ply"]').set_input_files(tmp_path / "text.ply")
+    until(lambda: page.notice is not None and "Looking" not in page.notice, 300)
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 
