@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ def build_options() -> argparse.ArgumentParser:
     """The parser of the options that are not those of ``gaussian-swaying sim``."""
     parser = argparse.ArgumentParser(
         prog=program.name("live"),
+        allow_abbrev=False,
         usage=f"{program.name('live')} [SCENE] [options]",
         description="Open a page on which the wind can be changed while a scene moves. SCENE is a splat or a "
         "configuration (.yaml); without it, a flag. Further options are those of `gaussian-swaying sim`, for example "
@@ -36,6 +37,14 @@ def build_options() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets other computers in (default: this one)")
+    add(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a name or an address by which other computers open the page, if it is none of this computer's own; "
+        "can be given several times",
+    )
     add("--port", type=int, default=8080, help="port of the page; the next free one if it is taken")
     add("--pixels", type=int, default=1920, help="most pixels of the longer side of a picture")
     add("--no-browser", action="store_true", help="only print the address")
@@ -53,28 +62,55 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     return run_command(
-        lambda: _live(*split(arguments)),
+        lambda: _live(arguments),
         memory="a smaller `scene.region`, a coarser `solver.dx` or fewer `--pixels`",
         expected=(ImportError,),
         arguments=arguments,
     )
 
 
-def split(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
-    """The options of this command, and those of ``gaussian-swaying sim``; the scene comes first."""
-    first = [] if not arguments or arguments[0].startswith("-") else [arguments[0]]
-    options, further = build_options().parse_known_args(arguments[len(first) :])
-    options.scene = first[0] if first else None
+def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """The options of this command with the scene, and those of ``gaussian-swaying sim``, in any order.
+
+    Args:
+        parser: From :meth:`Simulation.parser`; it knows which options have a value.
+        arguments: The command line.
+
+    Raises:
+        ValueError: If there are two scenes, or the number of pixels cannot be.
+    """
+    options, rest = build_options().parse_known_args(arguments)
+    switches = {name for action in parser._actions if action.nargs == 0 for name in action.option_strings}
+    scenes: list[str] = []
+    further: list[str] = []
+    value_follows = False
+    for argument in rest:
+        if value_follows or argument.startswith("-"):
+            value_follows = not value_follows and "=" not in argument and argument not in switches
+            further.append(argument)
+        else:
+            scenes.append(argument)
+    if len(scenes) > 1:
+        raise ValueError(f"Expected one SCENE, but got {' and '.join(scenes)}: give one of them.")
+    if not 16 <= options.pixels <= 8192:
+        raise ValueError(f"Expected `--pixels` from 16 to 8192, but got {options.pixels}.")
+    options.scene = scenes[0] if scenes else None
     return options, further
 
 
-def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str]) -> Namespace:
+def settings_of(
+    parser: ArgumentParser,
+    scene: str | None,
+    further: Sequence[str],
+    tell: Callable[[float, str], None] = lambda share, what: None,
+) -> Namespace:
     """The settings of what is to be shown.
 
     Args:
         parser: From :meth:`Simulation.parser`.
         scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
         further: Options of ``gaussian-swaying sim``.
+        tell: Told how much is done, from 0 to 1, and what is done next.
 
     Raises:
         ValueError: If a file or an option is bad.
@@ -86,7 +122,7 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
         with guessing(parser):
             device = parser.parse_args([*given, "--scene.ply", scene]).device
         print(f"Looking at {scene} for a first configuration, which takes up to a minute.", flush=True)
-        settings = settings_of_splat(parser, scene, resolve_device(device), given)
+        settings = settings_of_splat(parser, scene, resolve_device(device), given, tell)
     else:
         config = scene or (None if any(option.split("=")[0] == "--config" for option in given) else "flag")
         arguments = with_shipped([*(["--config", config] if config else []), *given], "sim")
@@ -96,21 +132,29 @@ def settings_of(parser: ArgumentParser, scene: str | None, further: Sequence[str
     return settings
 
 
-def _live(options: argparse.Namespace, further: Sequence[str]) -> None:
+def _live(arguments: Sequence[str]) -> None:
     parser = Simulation.parser()
-    session = Session(parser, settings_of(parser, options.scene, further))
-    if session.simulation.device.type == "cpu":
-        share_cores()
-    page = Page(session, options.host, options.port, options.pixels)
-    session.start()
-    print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)
-    if not options.no_browser:
-        webbrowser.open(page.url)
+    options, further = split(parser, arguments)
+    page = Page(options.host, options.port, options.pixels, options.allow_host)
+    session = None
     try:
+        print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)
+        if page.url_elsewhere is not None:
+            print(f"Other computers open {page.url_elsewhere}; whoever has the link can change the scene.", flush=True)
+        if not options.no_browser:
+            webbrowser.open(page.url)
+        settings = settings_of(parser, options.scene, further, page.progress)
+        page.progress(0.8, "Making the simulation")
+        session = Session(parser, settings)
+        if session.simulation.device.type == "cpu":
+            share_cores()
+        page.show(session)
+        session.start()
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
         print("Ended.")
     finally:
         page.close()
-        session.close()
+        if session is not None:
+            session.close()

@@ -67,32 +67,39 @@ def facing(normals: Tensor, view: Tensor) -> Tensor:
     return torch.where((normals * view).sum(-1, keepdim=True) > 0, -normals, normals)
 
 
-def normal_colors(blended: Tensor, alpha: Tensor, rotation: Tensor) -> Tensor:
+def _shown(alpha: Tensor, smooth: bool) -> Tensor:
+    """How far a pixel of this opacity is shown: where it is covered; or, with smooth edges, fading about that."""
+    return ((2 * alpha - COVERED).clamp(0, 1) if smooth else alpha >= COVERED).to(alpha)
+
+
+def normal_colors(blended: Tensor, alpha: Tensor, rotation: Tensor, smooth: bool = False) -> Tensor:
     """Colours of normals: (n + 1) / 2 in red, green and blue, black for empty pixels.
 
     Args:
         blended: Blended normals in scene axes, shape (H, W, 3).
         alpha: Opacity, shape (H, W, 1).
         rotation: From scene axes to those of the picture, shape (3, 3).
+        smooth: Whether edges fade to black instead of ending at a pixel.
 
     Returns:
         Shape (H, W, 3).
     """
     check_shape("blended", blended, 3)
     normals = torch.nn.functional.normalize(blended @ rotation.mT.to(blended), dim=-1)
-    return torch.where(alpha >= COVERED, 0.5 * (normals + 1), 0.0)
+    return _shown(alpha, smooth) * 0.5 * (normals + 1)
 
 
-def scalar_colors(blended: Tensor, alpha: Tensor, largest: float) -> Tensor:
+def scalar_colors(blended: Tensor, alpha: Tensor, largest: float, smooth: bool = False) -> Tensor:
     """Colours of a blended scalar: violet at 0, yellow at ``largest`` and above, black for empty pixels.
 
     Args:
         blended: Blended values, shape (H, W).
         alpha: Opacity, shape (H, W, 1).
         largest: End of the scale, in the unit of the values.
+        smooth: Whether edges fade to black instead of ending at a pixel.
 
     Returns:
         Shape (H, W, 3).
     """
-    mean = blended / alpha[..., 0].clamp_min(COVERED)
-    return torch.where(alpha >= COVERED, colormap(mean / largest), 0.0)
+    mean = blended / alpha[..., 0].clamp_min(0.5 * COVERED)
+    return _shown(alpha, smooth) * colormap(mean / largest)

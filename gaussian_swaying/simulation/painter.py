@@ -190,13 +190,16 @@ class Painter(nn.Module):
         gaussians = self.deformed(state)
         return self.draw(gaussians, self.colors(gaussians, camera), camera)
 
-    def draw_normals(self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera") -> Tensor:
+    def draw_normals(
+        self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera", smooth: bool = False
+    ) -> Tensor:
         """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3).
 
         Args:
             gaussians: In scene units.
             camera: The camera, on the device of the Gaussians.
             axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (z up).
+            smooth: Whether edges fade to black instead of ending at a pixel.
         """
         normals = passes.facing(gaussians.normals, gaussians.means - camera.position.to(gaussians.means))
         picture = self._draw(gaussians, normals, camera)
@@ -204,9 +207,16 @@ class Painter(nn.Module):
             rotation = self.scene.frame.direction_to_sim(self.scene.identity).mT  # its rows are the scene's axes
         else:
             rotation = torch.cat([camera.world_to_camera[:1, :3], -camera.world_to_camera[1:3, :3]])
-        return passes.normal_colors(picture.color, picture.alpha, rotation)
+        return passes.normal_colors(picture.color, picture.alpha, rotation, smooth)
 
-    def draw_pressure(self, pressure: Tensor, gaussians: DeformedGaussians, camera: Camera, largest: float) -> Tensor:
+    def draw_pressure(
+        self,
+        pressure: Tensor,
+        gaussians: DeformedGaussians,
+        camera: Camera,
+        largest: float,
+        smooth: bool = False,
+    ) -> Tensor:
         """Picture of a force per area, with a colour scale that ends at ``largest`` [Pa], shape (H, W, 3).
 
         Args:
@@ -214,10 +224,11 @@ class Painter(nn.Module):
             gaussians: In scene units.
             camera: The camera, on the device of the Gaussians.
             largest: End of the colour scale [Pa].
+            smooth: Whether edges fade to black instead of ending at a pixel.
         """
         shown = pressure.to(gaussians.means)
         picture = self._draw(gaussians, shown[:, None].expand(-1, 3), camera)
-        return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest)
+        return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest, smooth)
 
     def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
         """Blend any three values of each Gaussian."""

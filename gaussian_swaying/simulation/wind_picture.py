@@ -94,6 +94,11 @@ def _plane(flow: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
+def speed_scale(simulation: Simulation) -> float:
+    """End of the colour scale of streaks [m/s]: 1.5 times the mean flow; 0 in still air."""
+    return 1.5 * float(torch.linalg.vector_norm(simulation.flows(), dim=-1).amax())
+
+
 def draw_wind(
     simulation: Simulation, state: MPMState, camera: Camera, picture: RenderOutput, largest: float | None = None
 ) -> Tensor:
@@ -114,8 +119,7 @@ def draw_wind(
     from PIL import Image, ImageDraw
 
     places, speeds = (part.cpu() for part in streaks(simulation, state, camera))
-    flow = float(torch.linalg.vector_norm(simulation.flows(), dim=-1).amax())
-    largest = largest or 1.5 * flow or float(speeds.amax()) or 1.0
+    largest = largest or speed_scale(simulation) or float(speeds.amax()) or 1.0
     pixel, depth = project(places.reshape(-1, 3), camera)
     pixel, depth = pixel.view(*speeds.shape, 2), depth.view_as(speeds)
     seen = mean_depth(picture).to(depth)

@@ -2,43 +2,51 @@
 
 from __future__ import annotations
 
-import http
 import io
+import logging
 import socket
 import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 import numpy as np
 import torch
 
+from gaussian_swaying.viewer.door import ANY, Door, check_address
 from gaussian_swaying.viewer.film_strip import FilmStrip
-from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw
+from gaussian_swaying.viewer.incoming import Incoming
+from gaussian_swaying.viewer.pictures import PictureSize, camera_of, draw, enlarged
 from gaussian_swaying.viewer.session import Session, Snapshot
+from gaussian_swaying.viewer.turns import Turns
 
 if TYPE_CHECKING:
     import viser
 
+    from gaussian_swaying.viewer.controls import Controls
+
 MOST_PER_SECOND = 30  # pictures for a browser
 JPEG_QUALITY = 75
-LARGEST_UPLOAD = 1 << 30  # bytes
+FAR = 100.0  # longest sides of the object that a handle may be away from it
 BACK = 1.35  # the first view is from farther away than that of the configuration, as the controls cover a part of it
 
 
-def make_server(host: str, port: int) -> viser.ViserServer:
+def make_server(host: str, port: int, door: Door, incoming: Incoming) -> viser.ViserServer:
     """A viser server that opens no tunnel to the internet, whoever asks.
 
     Args:
         host: Address to listen on.
         port: Port; the next free one if it is taken.
+        door: Who may come in.
+        incoming: What a browser may send.
 
     Raises:
         ImportError: If viser is not installed.
+        ValueError: If nothing can listen there.
     """
     try:
         import viser
@@ -52,54 +60,24 @@ def make_server(host: str, port: int) -> viser.ViserServer:
     check_address(host, port)
     # a picture may be drawn while its browser goes away
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-    with redirect_stdout(io.StringIO()), own_pages_only(host):  # its banner; the caller tells the address
-        return Server(host=host, port=port, label="Wind tunnel", verbose=False)
-
-
-def check_address(host: str, port: int) -> None:
-    """Raise ValueError if nothing can listen at an address."""
-    if not 0 < port < 65536:
-        raise ValueError(f"Expected `--port` from 1 to 65535, but got {port}.")
-    try:
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-            probe.bind((host, 0))
-    except OSError as error:
-        raise ValueError(
-            f"Nothing can listen at `--host` {host} ({error.strerror or error}): give an address of this computer, "
-            "such as 127.0.0.1."
-        ) from None
-
-
-LOCAL = ("127.0.0.1", "localhost", "[::1]")
-
-
-def allowed(host: str, headers: Mapping[str, str]) -> bool:
-    """Whether a request comes from a page of the server itself, and not from another website in the same browser.
-
-    Args:
-        host: Where the server listens.
-        headers: Of the request.
-    """
-    asked, origin = headers.get("Host") or "", headers.get("Origin")
-    if host in ("127.0.0.1", "localhost", "::1") and asked.rsplit(":", 1)[0] not in LOCAL:
-        return False  # a name that another site has pointed at this computer
-    return origin is None or urlsplit(origin).netloc == asked
+    warnings.filterwarnings("ignore", message=r"\[viser\] .* does not match annotation", category=UserWarning)
+    with redirect_stdout(io.StringIO()), checked_by(door, incoming):  # its banner; the caller tells the address
+        incoming.server = Server(host=host, port=port, label="Wind tunnel", verbose=False)
+    return incoming.server
 
 
 @contextmanager
-def own_pages_only(host: str) -> Iterator[None]:
-    """Servers that are started meanwhile refuse requests that are not :func:`allowed`."""
+def checked_by(door: Door, incoming: Incoming) -> Iterator[None]:
+    """Servers that are started meanwhile take requests and messages only after these checks."""
     import websockets.asyncio.server as websockets
 
     serve = websockets.serve
+    logger = logging.getLogger(__name__)
+    logger.addFilter(lambda record: "handshake" not in record.getMessage())  # what is no HTTP is no error of ours
 
-    def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
-        def process(connection: Any, request: Any) -> Any:
-            if not allowed(host, request.headers):
-                return connection.respond(http.HTTPStatus.FORBIDDEN, "This is for pages of this program only.\n")
-            return None if process_request is None else process_request(connection, request)
-
-        return serve(*arguments, process_request=process, **options)
+    def checked(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        process = partial(door.answer, process_request)
+        return serve(incoming.guarded(handler), *arguments, process_request=process, logger=logger, **options)
 
     websockets.serve = checked  # type: ignore[assignment, misc]
     try:
@@ -108,93 +86,105 @@ def own_pages_only(host: str) -> Iterator[None]:
         websockets.serve = serve  # type: ignore[misc]
 
 
-def limit_uploads(server: viser.ViserServer, most: int, refused: Callable[[], None]) -> None:
-    """Drop uploads that are too large before they fill the memory.
-
-    Args:
-        server: The server.
-        most: Largest file [bytes].
-        refused: Called for each file that is dropped.
-    """
-    from viser._messages import FileTransferPart, FileTransferStartUpload
-
-    gui, socket = server.gui, server._websock_server
-    start, part = gui._handle_file_transfer_start, gui._handle_file_transfer_part
-
-    def check_start(client: Any, message: Any) -> None:
-        under_way = sum(state["total_bytes"] for state in gui._current_file_upload_states.values())
-        if under_way + message.size_bytes > most:
-            refused()
-        else:
-            start(client, message)
-
-    def check_part(client: Any, message: Any) -> Any:
-        state = gui._current_file_upload_states.get(message.transfer_uuid)
-        if state is not None and state["transferred_bytes"] + len(message.content) > most:  # more than was announced
-            gui._current_file_upload_states.pop(message.transfer_uuid, None)
-            refused()
-        return part(client, message)
-
-    for kind, ours in ((FileTransferStartUpload, check_start), (FileTransferPart, check_part)):
-        socket.unregister_handler(kind)
-        socket.register_handler(kind, ours)
-
-
 class Page:
-    """Serves a session.
+    """A page that says how far a scene is loaded, and serves its session from :meth:`show` on.
 
     The simulation never waits for a browser. Each browser has a thread that draws the newest snapshot from its camera;
     a slow one gets fewer pictures, as viser replaces a picture that is not sent yet.
 
     Args:
-        session: The session.
         host: Address to listen on.
         port: Port; the next free one if it is taken.
         largest: Most pixels of the longer side of a picture.
+        names: Names of this computer that a browser may ask for, besides those that it has.
 
     Attributes:
         shown: What is drawn, one of :data:`.pictures.SHOWN`.
         streaks: Whether streaks of air are drawn over it.
         recording: The video that is being recorded, or None.
+        drawn_size: Width and height at which the last picture was drawn [pixels].
     """
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080, largest: int = 1920) -> None:
-        from gaussian_swaying.viewer.controls import Controls
-
-        self.session, self.largest = session, largest
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        largest: int = 1920,
+        names: Sequence[str] = (),
+    ) -> None:
+        self.largest = largest
+        self.session: Session
+        self.controls: Controls
         self.shown = "colour"
         self.streaks = False
         self.recording: FilmStrip | None = None
+        self.drawn_size = (0, 0)
         self.recorder: int | None = None  # the browser from whose camera is recorded
         self._closed = threading.Event()
         self._gone: dict[int, threading.Event] = {}
         self._drawn: dict[int, deque[float]] = {}
+        self._shown = threading.Event()  # whether there is a session
         self._threads: list[threading.Thread] = []
+        self._drawing = threading.Lock()  # of many browsers one waits for the session, which gets its turn so
         self._notice = ("", 0.0)
         self._version = 0  # of what is drawn besides snapshot and camera
-        self.server = make_server(host, port)
-        limit_uploads(self.server, LARGEST_UPLOAD, self._refuse_upload)
+        self.door, self.incoming = Door(host, names), Incoming(self.tell)
+        self.server = make_server(host, port, self.door, self.incoming)
         self.server.gui.configure_theme(
             control_layout="floating", control_width="medium", show_logo=False, show_share_button=False
         )
-        self.look_from_start()
-        self.controls = Controls(self)
+        self._text = self.server.gui.add_markdown("")
+        self._bar = self.server.gui.add_progress_bar(0.0, animated=True)
+        self.progress(0.0, "Loading the scene")
+        self.turns = Turns(self._keep_telling, 0.4, self._failed)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
-        self._health = threading.Thread(target=self._keep_telling, name="health", daemon=True)
-        self._health.start()
+
+    def show(self, session: Session) -> Page:
+        """Show a session, and the controls; returns the page."""
+        from gaussian_swaying.viewer.controls import Controls
+
+        self.session = session
+        self.look_from_start()
+        self.controls = Controls(self)
+        self.progress(None)
+        self._shown.set()
+        return self
+
+    def progress(self, share: float | None, what: str = "") -> None:
+        """Show how much of something is done, from 0 to 1; None if there is nothing to wait for."""
+        self._loading = "" if share is None else f"{what} ..."
+        self._bar.visible = share is not None
+        self._bar.value = 100 * (share or 0.0)  # type: ignore[misc]
+        if not self._shown.is_set():
+            self.write([])
+
+    def write(self, lines: Sequence[str]) -> None:
+        """Write lines in the corner, with what is being loaded and the notice."""
+        further = [f"**{self._loading}**" if self._loading else "", f"_{self.notice}_" if self.notice else ""]
+        self._text.content = "\n\n".join(line for line in (*lines, *further) if line)
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """Address of the page on this computer, with its token if it has one."""
         host = self.server.get_host()
-        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
-        return f"http://{host}:{self.server.get_port()}"
+        return self._link({"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host))
+
+    @property
+    def url_elsewhere(self) -> str | None:
+        """Address of the page for other computers; None if they cannot reach it."""
+        host = self.server.get_host()
+        return self._link(socket.gethostname() if host in ANY else host) if self.door.token else None
+
+    def _link(self, host: str) -> str:
+        token = f"/?token={self.door.token}" if self.door.token else ""
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}{token}"
 
     def close(self) -> None:
         """Stop serving."""
         self._closed.set()
-        for thread in [*self._threads, self._health]:
+        self.turns.close()
+        for thread in self._threads:
             thread.join(10.0)
         self.server.stop()
 
@@ -212,10 +202,11 @@ class Page:
         self._version += 1
 
     def look_from_start(self) -> None:
-        """Set where a browser looks from at first: from the camera of the configuration."""
+        """Set where a browser looks from at first, from the camera of the configuration, and how far it can drag."""
         simulation = self.session.simulation
         camera = simulation.painter.camera_at(0)
         scene = simulation.scene
+        self.incoming.reach = float(scene.center.abs().amax()) + FAR * scene.size
         up = scene.frame.rotation[2].tolist()
         self.server.scene.set_up_direction(tuple(up))
         first = self.server.initial_camera
@@ -236,9 +227,8 @@ class Page:
         now = time.perf_counter()
         return max((sum(now - t < 2.0 for t in list(times)) / 2.0 for times in self._drawn.values()), default=0.0)
 
-    def _refuse_upload(self) -> None:
-        most = f"{LARGEST_UPLOAD >> 20:,} MiB"
-        self.tell(f"The file is larger than {most}: give it on the command line instead.")
+    def _failed(self, error: Exception) -> None:
+        self.tell(" ".join(str(error).split()) or type(error).__name__)
 
     # ---- browsers
 
@@ -254,10 +244,13 @@ class Page:
         self._gone.pop(client.client_id, threading.Event()).set()
         self._drawn.pop(client.client_id, None)
         if self.recorder == client.client_id:
-            self.controls.stop_recording(None)
+            self.turns.ask("stop recording", lambda: self.controls.files.stop_recording(None))
 
     def _serve(self, client: viser.ClientHandle, gone: threading.Event) -> None:
         """Draw for a browser until it is gone."""
+        while not self._shown.wait(0.1):
+            if gone.is_set() or self._closed.is_set():
+                return
         on_cpu = self.session.simulation.device.type == "cpu"
         size = PictureSize(0.14 if on_cpu else 0.05, self.largest, 2 if on_cpu else 0)
         seen: tuple[Any, ...] = ()
@@ -285,11 +278,13 @@ class Page:
         width, height = size.fit(pose.image_width, pose.image_height, still)
         near = max(float(pose.near), 1e-6)
         camera = camera_of(pose.wxyz.tolist(), pose.position.tolist(), float(pose.fov), width, height, near)
-        with self.session.lock:
+        with self._drawing, self.session.lock:
             waited = time.perf_counter()
             picture = draw(snapshot, camera, self.shown, self.controls.force_end, self.streaks)
         if not still:
             size.took(time.perf_counter() - waited)
+        self.drawn_size = (width, height)
+        picture = enlarged(picture, *size.fit(pose.image_width, pose.image_height, still=True))
         client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
         times = self._drawn.get(client.client_id)
         if times is not None:
@@ -298,11 +293,11 @@ class Page:
         if film is not None and self.recorder == client.client_id:
             film.add(snapshot.health.time, np.ascontiguousarray(picture))
             if film.full:
-                self.controls.stop_recording(client)
-                self.tell(f"The video has the greatest length, {film.seconds:.0f} s, and was saved.")
+                self.turns.ask("stop recording", lambda: self.controls.files.stop_recording(client))
 
     def _keep_telling(self) -> None:
         """Keep the figures in the corner up to date."""
-        while not self._closed.wait(0.4):
-            with suppress(Exception):  # the figures of a moment, while a scene is replaced
-                self.controls.tell()
+        if not self._shown.is_set():
+            return
+        with suppress(Exception):  # the figures of a moment, while a scene is replaced
+            self.controls.tell()

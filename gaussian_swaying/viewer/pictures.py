@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from PIL import Image
 
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -61,9 +62,9 @@ def draw(
     gaussians = painter.deformed(state)
     seen = None
     if shown == "normals":
-        picture = painter.draw_normals(gaussians, camera, "world")
+        picture = painter.draw_normals(gaussians, camera, "world", smooth=True)
     elif shown == "wind force":
-        picture = painter.draw_pressure(simulation.wind_pressure(state), gaussians, camera, force_end)
+        picture = painter.draw_pressure(simulation.wind_pressure(state), gaussians, camera, force_end, smooth=True)
     else:
         seen = painter.draw(gaussians, painter.colors(gaussians, camera), camera)
         picture = seen.color
@@ -71,6 +72,16 @@ def draw(
         seen = seen or painter.draw(gaussians, torch.zeros_like(gaussians.means), camera)  # for its depth
         picture = draw_wind(simulation, state, camera, replace(seen, color=picture))
     return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+def enlarged(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A picture that was drawn small, with smooth edges at the size at which it is shown; uint8, shape (H, W, 3).
+
+    A browser would enlarge it linearly, which shows the pixels as steps, and the blocks of its JPEG as noise at edges.
+    """
+    if picture.shape[:2] == (height, width):
+        return picture
+    return np.asarray(Image.fromarray(np.ascontiguousarray(picture)).resize((width, height), Image.Resampling.LANCZOS))
 
 
 @torch.inference_mode()
@@ -114,8 +125,9 @@ class PictureSize:
     def fit(self, width: int, height: int, still: bool = False) -> tuple[int, int]:
         """Size for a window of these pixels; the same shape, and even. If nothing moves, as large as it may be."""
         width, height = max(width, 1), max(height, 1)
-        scale = (1.0 if still else SIZES[self._level]) * min(1.0, self.largest / max(width, height))
-        scale = max(scale, min(1.0, LEAST / min(width, height)))
+        largest = min(1.0, self.largest / max(width, height))
+        scale = largest if still else largest * SIZES[self._level]
+        scale = min(max(scale, LEAST / min(width, height)), largest)
         return max(2 * round(width * scale / 2), 2), max(2 * round(height * scale / 2), 2)
 
     def took(self, seconds: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,11 @@ if TYPE_CHECKING:
 
 
 def settings_of_splat(
-    parser: ArgumentParser, path: str | os.PathLike[str], device: torch.device, further: Sequence[str] = ()
+    parser: ArgumentParser,
+    path: str | os.PathLike[str],
+    device: torch.device,
+    further: Sequence[str] = (),
+    tell: Callable[[float, str], None] = lambda share, what: None,
 ) -> Namespace:
     """The settings that the preview suggests for a splat: its draft on a CPU, its starter on a GPU.
 
@@ -30,15 +34,21 @@ def settings_of_splat(
         path: The splat.
         device: Where it will be simulated.
         further: Options that replace what is suggested.
+        tell: Told how much is done, from 0 to 1, and what is done next.
 
     Raises:
         ValueError: If the file is not a splat, or nothing in it can move.
         FileNotFoundError: If there is no such file.
     """
     file = Path(path).resolve()
-    found = suggest(read_gaussians(file), quality="draft" if device.type == "cpu" else "normal")
+    tell(0.05, "Reading the splat")
+    gaussians = read_gaussians(file)
+    tell(0.15, "Looking for a region, pins and a grid")
+    found = suggest(gaussians, quality="draft" if device.type == "cpu" else "normal")
     own = ["--device", device.type]
-    draft = parse_text(parser, draft_yaml(found, str(file)), own)
-    found = calibrated_suggestion(found, Simulation.from_settings(parser, draft), SWAY)
+    tell(0.35, "Making a draft")
+    draft = Simulation.from_settings(parser, parse_text(parser, draft_yaml(found, str(file)), own))
+    tell(0.5, "Trying how stiff it is")
+    found = calibrated_suggestion(found, draft, SWAY)
     text = draft_yaml(found, str(file)) if device.type == "cpu" else starter_yaml(found, str(file))
     return parse_text(parser, text, [*own, *further])

@@ -26,6 +26,8 @@ SLOW, FAST = 0.09, 0.025  # s: steps that take longer are halved, and shorter on
 SHORTEST = 32  # a step is at least this part of `frame_dt`
 WINDOW = 2.0  # s, over which rates are averaged
 BEHIND = 0.25  # s that a session may be late before it stops trying to catch up
+ONE_CHANGE = 1.0  # s: changes of the same fields that follow each other sooner are one, as when a slider is dragged
+MOST_UNDONE = 50  # changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,21 @@ class Rates:
     substeps: int
 
 
+@dataclass
+class Past:
+    """What a change took the place of.
+
+    Attributes:
+        settings: The settings before it.
+        names: The fields that it changed, with dots; None for all.
+        time: When, on the clock of ``time.monotonic`` [s].
+    """
+
+    settings: Namespace
+    names: list[str] | None
+    time: float
+
+
 def share_cores() -> None:
     """Give threads that start from now on half of the cores: one simulates and one draws, on a CPU."""
     torch.set_num_threads(max(1, torch.get_num_threads() // 2))
@@ -81,6 +98,8 @@ class Session:
     Attributes:
         settings: The settings as they are now; :meth:`yaml` writes them down.
         problem: One sentence on what went wrong last, or None.
+        revision: Counts how often the settings became others than those asked for: by :meth:`undo`, :meth:`restore`,
+            another scene, or a change that was refused.
         speed: Simulated seconds per second that are wanted; 1 is real time.
         lock: Held while the simulation is changed; whoever draws holds it, too.
     """
@@ -88,6 +107,7 @@ class Session:
     def __init__(self, parser: ArgumentParser, settings: Namespace, simulation: Simulation | None = None) -> None:
         self.parser, self.settings = parser, settings
         self.problem: str | None = None
+        self.revision = 0
         self.speed, self.paused = 1.0, False
         self.lock = threading.RLock()
         self._wake = threading.Condition()
@@ -98,6 +118,8 @@ class Session:
         self._anchor: tuple[float, float] | None = None
         self._pull: Pull | None = None
         self._number = 0
+        self._first = settings  # those that `restore` goes back to
+        self._past: deque[Past] = deque(maxlen=MOST_UNDONE)
         self._edited = False  # whether the material was changed since the simulation was made
         self.simulation = simulation or Simulation.from_settings(parser, settings)
         self._begin(self.simulation.start())
@@ -127,23 +149,48 @@ class Session:
             self._changes.update(values)
             self._wake.notify_all()
 
-    def load(self, settings: Namespace, done: Callable[[], None] = lambda: None) -> None:
+    def load(
+        self,
+        settings: Namespace,
+        done: Callable[[], None] = lambda: None,
+        ended: Callable[[], None] = lambda: None,
+    ) -> None:
         """Go on with another scene, from rest.
 
         Args:
             settings: Its settings.
             done: Called in the thread of the session once the scene is there; not if it cannot be made.
+            ended: Called there in both cases.
         """
 
         def take_scene() -> None:
-            self._take_settings(settings, fresh=True)
-            done()
+            try:
+                self._take_settings(settings, fresh=True)
+                self._first = settings
+                self._past.clear()
+                self.revision += 1
+                done()
+            finally:
+                ended()
 
         self._ask(take_scene)
 
     def reset(self) -> None:
         """Go back to rest."""
         self._ask(self._reset)
+
+    def undo(self) -> None:
+        """Take the last change back, or :meth:`restore`; the motion goes on if it did with the change."""
+        self._ask(self._undo)
+
+    def restore(self) -> None:
+        """Go back to rest and to the settings of the start, or of the scene that was loaded: pins, material, all."""
+        self._ask(self._restore)
+
+    @property
+    def changes(self) -> int:
+        """How many changes can be undone."""
+        return len(self._past)
 
     def pause(self, paused: bool = True) -> None:
         """Pause, or go on."""
@@ -240,6 +287,7 @@ class Session:
                 what()
         except Exception as error:
             self.problem = _sentence(error)
+            self.revision += 1
 
     def _advance(self, single: bool) -> None:
         """One step, then wait until its time has come."""
@@ -310,17 +358,42 @@ class Session:
             self._begin(self.simulation.start())
 
     def _change(self, values: Mapping[str, Any]) -> None:
-        """Change the settings, and the simulation with them."""
-        settings = changed_settings(self.parser, self.settings, values)
+        before, now = self.settings, time.monotonic()
+        self._apply(changed_settings(self.parser, self.settings, values), list(values))
+        last = self._past[-1] if self._past else None
+        if last is not None and last.names == list(values) and now - last.time < ONE_CHANGE:
+            last.time = now
+        else:
+            self._past.append(Past(before, list(values), now))
+
+    def _apply(self, settings: Namespace, names: list[str]) -> None:
+        """Take settings of which some fields differ, and change the simulation with them."""
         if not self._broken:
             self.problem = None
-        state = take(self.simulation, self.snapshot.state, self.parser, settings, list(values))
+        state = take(self.simulation, self.snapshot.state, self.parser, settings, names)
         if state is None:
             self._take_settings(settings)
         else:
             self.settings = settings
-            self._edited |= any(name.startswith("material.") for name in values)
+            self._edited |= any(name.startswith("material.") for name in names)
             self._publish(state, self.snapshot.health)
+
+    def _undo(self) -> None:
+        if not self._past:
+            return
+        past = self._past[-1]
+        if past.names is None or self._broken:
+            self._take_settings(past.settings, fresh=True)
+        else:
+            self._apply(past.settings, past.names)
+        self._past.pop()
+        self.revision += 1
+
+    def _restore(self) -> None:
+        before = self.settings
+        self._take_settings(self._first, fresh=True)
+        self._past.append(Past(before, None, 0.0))
+        self.revision += 1
 
     def _take_settings(self, settings: Namespace, fresh: bool = False) -> None:
         """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""

@@ -21,14 +21,37 @@ def parser():
     return Simulation.parser()
 
 
-def test_the_scene_comes_first_and_the_rest_is_for_the_simulation():
-    options, further = live.split(["my.ply", "--port", "9000", "--device", "cpu", "--no-browser"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "my.ply --port 9000 --device cpu --no-browser --wind.flow [1,-2,3] --solver.damping -3 --resume",
+        "--port 9000 --resume my.ply --device cpu --wind.flow [1,-2,3] --no-browser --solver.damping -3",
+        "--device cpu --no-browser --wind.flow [1,-2,3] --solver.damping -3 --resume --port 9000 my.ply",
+        "--no-browser --device cpu my.ply --wind.flow [1,-2,3] --solver.damping -3 --port=9000 --resume",
+    ],
+)
+def test_options_and_scene_come_in_any_order(parser, line):
+    options, further = live.split(parser, line.split())
     assert (options.scene, options.port, options.no_browser) == ("my.ply", 9000, True)
-    assert further == ["--device", "cpu"]
-    options, further = live.split(["--solver.dx", "0.1"])
-    assert options.scene is None
-    assert options.host == "127.0.0.1"
-    assert further == ["--solver.dx", "0.1"]
+    assert sorted(further) == sorted(
+        ["--device", "cpu", "--wind.flow", "[1,-2,3]", "--solver.damping", "-3", "--resume"]
+    )
+    assert further.index("cpu") == further.index("--device") + 1
+    assert further.index("-3") == further.index("--solver.damping") + 1
+
+
+def test_options_of_this_command_are_not_shortened_and_there_is_one_scene(parser):
+    options, further = live.split(parser, ["--solver.dx=0.1", "--host", "::1"])
+    assert (options.scene, options.host, further) == (None, "::1", ["--solver.dx=0.1"])
+    assert live.split(parser, ["--po", "8081"])[1] == ["--po", "8081"]
+    with pytest.raises(ValueError, match=r"one SCENE, but got a\.ply and b\.ply"):
+        live.split(parser, ["a.ply", "--device", "cpu", "b.ply"])
+
+
+@pytest.mark.parametrize("pixels", ["0", "-5", "9000"])
+def test_pixels_are_limited(capsys, pixels):
+    assert live.main(["--pixels", pixels, "--no-browser"]) == 2
+    assert "from 16 to 8192" in capsys.readouterr().err
 
 
 def test_without_a_scene_it_is_the_flag(parser):

@@ -15,6 +15,18 @@ SMALL = [
     "--device=cpu",
 ]
 
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
 
 @pytest.fixture(scope="session")
 def parser():
@@ -35,7 +47,7 @@ def session(parser, settings):
     made.close()
 
 
-def until(condition, seconds=20.0):
+def until(condition, seconds=60.0):
     """Wait until a condition holds."""
     end = time.monotonic() + seconds
     while not condition():
@@ -46,3 +58,81 @@ def until(condition, seconds=20.0):
 @pytest.fixture(name="until")
 def _until():
     return until
+
+
+POSE = {"wxyz": [0.7071, -0.7071, 0, 0], "position": [0.6, -2, 0.4], "look_at": [0.6, 0, 0.4], "fov": 0.8}
+POSE |= {"up_direction": [0, 0, 1], "near": 0.01, "far": 100.0}
+
+
+class Client:
+    """A browser without a browser: sends what it likes, and reads as few frames ahead as possible."""
+
+    def __init__(self, page, width=64, height=32, **options):
+        viser = pytest.importorskip("viser", reason="needs the extra [viewer]")
+        self._encode = pytest.importorskip("msgspec").msgpack.encode
+        connect = pytest.importorskip("websockets.sync.client").connect
+        protocols = [f"viser-v{viser.__version__}"]
+        address = page.url.replace("http", "ws")
+        quiet = {"max_size": None, "max_queue": 1, "close_timeout": 1, "ping_interval": None}
+        self.socket = connect(address, subprotocols=protocols, **quiet, **options)
+        self.look(image_width=width, image_height=height)
+
+    def look(self, **pose):
+        self.send("ViewerCameraMessage", **(POSE | {"image_width": 64, "image_height": 32} | pose))
+
+    def send(self, kind, **fields):
+        self.socket.send(self._encode({"type": kind, **fields}))
+
+    def set(self, control, value):
+        self.send("GuiUpdateMessage", uuid=control._impl.uuid, updates={"value": value})
+
+    def drag(self, name, position):
+        self.send("TransformControlsUpdateMessage", name=name, wxyz=[1, 0, 0, 0], position=position, owner="")
+
+    def click(self, origin, direction):
+        place = {"ray_origin": origin, "ray_direction": direction, "screen_pos": [[0.5, 0.5]]}
+        self.send("ScenePointerMessage", event_type="click", modifier=None, **place)
+
+    def close(self):
+        self.socket.close()
+
+
+@pytest.fixture
+def connect(until):
+    """Connects to a page, which knows of it then; what is open at the end is closed."""
+    opened = []
+
+    def connect(page, *arguments, wait=True, **options):
+        known = len(page.server.get_clients())
+        opened.append(Client(page, *arguments, **options))
+        if wait:
+            until(lambda: len(page.server.get_clients()) > known)
+        return opened[-1]
+
+    yield connect
+    for client in opened:
+        client.close()
+
+
+@pytest.fixture
+def page(parser, settings):
+    """A page with a small flag, and its session, which runs."""
+    pytest.importorskip("viser", reason="needs the extra [viewer]")
+    from gaussian_swaying.viewer.page import Page
+
+    session = Session(parser, settings)
+    made = Page(port=8400, largest=320).show(session)
+    session.start()
+    yield made
+    made.close()
+    session.close()
+
+
+@pytest.fixture(scope="module")
+def browser(chromium):
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
+        yield started
+        started.close()

@@ -6,60 +6,30 @@ import urllib.error
 import urllib.request
 
 import pytest
+import torch
 import yaml
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.preview.ticks import project
 from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer import page as page_module
-from gaussian_swaying.viewer.page import Page, allowed, check_address
-from gaussian_swaying.viewer.pictures import draw
-
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
-
-
-@pytest.fixture
-def page(parser, settings):
-    """A page with a small flag, and its session, which runs."""
-    session = Session(parser, settings)
-    made = Page(session, port=8400, largest=320)
-    session.start()
-    yield made
-    made.close()
-    session.close()
-
-
-@pytest.fixture(scope="module")
-def browser(chromium):
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=chromium, args=FLAGS)
-        yield started
-        started.close()
+from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.pictures import camera_of, draw
 
 
 @pytest.fixture
 def window(browser, page):
     """A browser window with the page, and the errors that it logs."""
     context = browser.new_context(viewport={"width": 1100, "height": 900}, accept_downloads=True)
+    context.set_default_timeout(90_000)  # a browser that draws without a GPU is slow on a busy machine
     opened = context.new_page()
     opened.problems = []
     opened.on("pageerror", lambda error: opened.problems.append(str(error)))
     opened.goto(page.url)
-    opened.get_by_text("pictures a second").wait_for(timeout=30_000)
+    opened.get_by_text("pictures a second").wait_for(timeout=90_000)
     yield opened
     context.close()
 
@@ -78,51 +48,8 @@ def test_it_listens_on_this_computer_only_and_serves_no_files(page):
     assert page.server.request_share_url() is None  # no tunnel, whoever asks
 
 
-def test_other_websites_in_the_same_browser_are_refused(page):
-    """Neither by their own name, nor by one that they have pointed at this computer."""
-    for headers in ({"Origin": "https://evil.example"}, {"Host": "evil.example"}):
-        request = urllib.request.Request(page.url, headers=headers)
-        with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(request, timeout=10)
-    own = urllib.request.Request(page.url, headers={"Origin": page.url})
-    assert urllib.request.urlopen(own, timeout=10).status == 200
-    assert allowed("0.0.0.0", {"Host": "my.machine:8080", "Origin": "http://my.machine:8080"})
-    assert not allowed("0.0.0.0", {"Host": "my.machine:8080", "Origin": "http://evil.example"})
-
-
-@pytest.mark.parametrize(("host", "port", "field"), [("127.0.0.1", 70000, "--port"), ("10.99.99.99", 8080, "--host")])
-def test_an_address_that_cannot_be_is_refused(host, port, field):
-    with pytest.raises(ValueError, match=field):
-        check_address(host, port)
-
-
-def test_large_uploads_are_dropped_before_they_arrive(page):
-    from viser._messages import FileTransferPart, FileTransferStartUpload
-
-    gui, handlers = page.server.gui, page.server._websock_server._incoming_handlers
-    button = page.controls.load._impl.uuid
-
-    def announce(size, name):
-        message = FileTransferStartUpload(button, name, "../../x.ply", "", 2, size)
-        handlers[FileTransferStartUpload][0](0, message)
-
-    announce((1 << 30) + 1, "large")
-    assert "1,024 MiB" in page.notice
-    assert "large" not in gui._current_file_upload_states
-    page.tell("", 0.0)
-    announce(100, "small")
-    state = gui._current_file_upload_states["small"]
-    assert page.notice is None
-    announce((1 << 30) - 50, "together too large")
-    assert page.notice is not None
-    state["transferred_bytes"] = 1 << 30  # more than was announced
-    handlers[FileTransferPart][0](0, FileTransferPart(button, "small", 1, b"more"))
-    assert "small" not in gui._current_file_upload_states
-    assert "1,024 MiB" in page.notice
-
-
 def test_what_is_held_is_shown(page):
-    held = page.controls._held()
+    held = page.controls.holding.places()
     assert len(held) > 5
     assert abs(held[:, 0]).max() < 0.03  # the pole
 
@@ -130,12 +57,12 @@ def test_what_is_held_is_shown(page):
 def test_closing_ends_all_threads(parser, settings):
     before = set(threading.enumerate())
     session = Session(parser, settings)
-    page = Page(session, port=8450)
+    page = Page(port=8450).show(session)
     session.start()
     page.close()
     session.close()
     end = time.monotonic() + 10
-    names = ("health", "simulation")
+    names = ("turns", "simulation")
     while any(t.name in names for t in set(threading.enumerate()) - before):
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -169,7 +96,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     session.change({"wind.flow": [1e7, 0.0, 0.0]})
     window.get_by_text("to start again").wait_for(timeout=20_000)
     session.change({"wind.flow": [2.0, 0.0, 0.0]})
-    window.get_by_role("button", name="Reset").click()
+    window.get_by_role("button", name="Back to rest").click()
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
@@ -189,7 +116,7 @@ def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, mon
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
-    until(lambda: page.recording is not None and page.recording.seconds > 0.3)
+    until(lambda: page.recording is not None and page.recording.seconds > 0.3, 240)
     with window.expect_download(timeout=30_000) as download:
         window.get_by_role("button", name="Stop recording").click()
     video = tmp_path / "wind.mp4"
@@ -207,7 +134,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
 @pytest.mark.slow
 def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.5)
-    with window.expect_download(timeout=60_000):
+    with window.expect_download(timeout=240_000):
         window.get_by_role("button", name="Record a video").click()
     window.get_by_text("has the greatest length").wait_for(timeout=5_000)
     window.get_by_role("button", name="Record a video").wait_for(timeout=5_000)
@@ -219,8 +146,8 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
     other.goto(page.url)
-    until(lambda: len(page.server.get_clients()) == 2, 40)
-    until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 40)
+    until(lambda: len(page.server.get_clients()) == 2, 240)
+    until(lambda: sum(len(times) > 3 for times in page._drawn.values()) == 2, 240)
     second.close()
     until(lambda: len(page.server.get_clients()) == 1)
     number = page.session.snapshot.number
@@ -233,56 +160,60 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     path = tmp_path / "../flag.ply"
     write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
     before = page.session.simulation
-    window.locator("input[type=file]").first.set_input_files(path)
-    until(lambda: page.session.simulation is not before, 60)
-    until(lambda: page.session.snapshot.health.time > 0.05, 30)
+    window.locator('input[type=file][accept=".ply"]').set_input_files(path)
+    until(lambda: page.session.simulation is not before, 300)
+    until(lambda: page.session.snapshot.health.time > 0.05, 120)
     assert len(page.session.simulation.scene.model.means) == 144
     assert window.problems == []
     (tmp_path / "text.ply").write_text("not a splat")
-    window.locator("input[type=file]").first.set_input_files(tmp_path / "text.ply")
-    until(lambda: page.notice is not None and "Looking" not in page.notice, 30)
+    window.locator('input[type=file][accept=".ply"]').set_input_files(tmp_path / "text.ply")
+    until(lambda: page.notice is not None and "Looking" not in page.notice, 300)
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 
-@pytest.mark.slow
 def test_a_click_takes_hold_of_the_flag(page, window, until):
-    time.sleep(1.0)
-    window.mouse.click(520, 480)
-    until(lambda: page.session.pulls)
-    assert page.controls._handle is not None
-    window.get_by_role("button", name="Let go of it").click()
-    until(lambda: not page.session.pulls)
+    """Where it is clicked; the handle appears there, and lets go."""
+    session, holding = page.session, page.controls.holding
+    client = next(iter(page.server.get_clients().values()))
+    session.pause()
+    number = None
+    while number != session.snapshot.number:
+        number = session.snapshot.number
+        time.sleep(0.5)
+    pose, scene = client.camera, session.simulation.scene
+    width, height = window.viewport_size["width"], window.viewport_size["height"]
+    camera = camera_of(pose.wxyz, pose.position, pose.fov, width, height)
+    means = session.simulation.painter.deformed(session.snapshot.state).means.double()
+    wanted = means[(means - scene.center.double()).norm(dim=-1).argmin()]
+    pixel, _ = project(wanted[None], camera)
+    window.mouse.click(*pixel[0].tolist())
+    until(lambda: session.pulls and holding._handle is not None, 60)
+    grabbed = torch.tensor(holding._handle.position, dtype=torch.float64)
+    assert float((grabbed - wanted).norm()) < 0.05 * scene.size
+    assert not holding.release.disabled
+    window.mouse.click(10, height - 10)  # beside the object: what is held stays held
+    time.sleep(0.5)
+    assert session.pulls
+    window.get_by_role("button", name="Let go of it").dispatch_event("click")
+    until(lambda: not session.pulls and holding._handle is None, 60)
+    assert window.problems == []
 
 
-def _connect(page, size):
-    """A client that says where it looks from, with as few frames read ahead as possible."""
-    connect = pytest.importorskip("websockets.sync.client").connect
-    msgspec = pytest.importorskip("msgspec")
-    viser = pytest.importorskip("viser")
-    address = page.url.replace("http", "ws")
-    socket = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, max_queue=1)
-    pose = {"wxyz": [0.7071, -0.7071, 0, 0], "position": [0.6, -2, 0.4], "look_at": [0.6, 0, 0.4], "fov": 0.8}
-    pose |= {"up_direction": [0, 0, 1], "near": 0.01, "far": 100.0, "image_height": size, "image_width": 2 * size}
-    socket.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage"} | pose))
-    return socket
-
-
-def test_a_client_that_reads_slowly_slows_nobody(page, until):
+def test_a_client_that_reads_slowly_slows_nobody(page, connect, until):
     """One does not read at all, another reads everything; nothing piles up for the first."""
     page.largest = 1000
-    slow, quick = _connect(page, 500), _connect(page, 100)
-    until(lambda: len(page.server.get_clients()) == 2)
+    slow, quick = connect(page, 1000, 500), connect(page, 200, 100)
     number = page.session.snapshot.number
     received, end = 0, time.monotonic() + 5
     while time.monotonic() < end:
-        received += len(quick.recv(timeout=5)) > 500
+        received += len(quick.socket.recv(timeout=5)) > 500
     assert received > 5
     assert page.session.snapshot.number > number + 5
     buffers = [state.message_buffer for state in page.server._websock_server._client_state_from_id.values()]
     assert len(buffers) == 2
     assert all(len(buffer.message_from_id) < 30 for buffer in buffers)
     quick.close()
-    slow.socket.close()  # without a word
+    slow.socket.socket.close()  # without a word
     until(lambda: len(page.server.get_clients()) == 0, 60)
     number = page.session.snapshot.number
     until(lambda: page.session.snapshot.number > number + 2)
@@ -290,12 +221,12 @@ def test_a_client_that_reads_slowly_slows_nobody(page, until):
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_memory_does_not_grow_in_ten_minutes(page):
+def test_memory_does_not_grow_in_ten_minutes(page, connect):
     """Measured after a minute, when everything has been used once."""
     resource = pytest.importorskip("resource")
-    socket, begin, sizes = _connect(page, 200), time.monotonic(), []
+    socket, begin, sizes = connect(page, 400, 200), time.monotonic(), []
     while time.monotonic() - begin < 600:
-        socket.recv(timeout=10)
+        socket.socket.recv(timeout=10)
         if time.monotonic() - begin > 60 * (len(sizes) + 1):
             with open("/proc/self/statm") as file:
                 sizes.append(int(file.read().split()[1]) * resource.getpagesize() / 2**20)

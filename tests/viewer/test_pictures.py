@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.simulation.wind_picture import draw_wind
 from gaussian_swaying.viewer.controls import from_angles, to_angles
 from gaussian_swaying.viewer.film_strip import FilmStrip
-from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, under_cursor
+from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, enlarged, under_cursor
 
 
 def _pose(session):
@@ -59,6 +60,31 @@ def test_streaks_of_air_are_those_of_the_render(session, shown):
         assert (apart > 2.0).mean() < 1e-3  # the camera in float32: the ends of a few streaks
 
 
+@pytest.mark.parametrize("shown", ["normals", "wind force"])
+def test_edges_of_passes_fade(session, shown):
+    """Between the object and the black around it some pixels are in between; a hard edge has none."""
+    wxyz, eye, fov, camera = _pose(session)
+    small = camera_of(wxyz, eye, fov, camera.width // 2, camera.height // 2)
+    picture = draw(session.snapshot, small, shown).max(-1).astype(float)
+    inside = np.median(picture[picture > 0])
+    between = ((picture > 0.1 * inside) & (picture < 0.8 * inside)).sum()
+    outline = np.abs(np.diff((picture > 0.5 * inside).astype(int), axis=0)).sum()
+    assert between > 0.5 * outline
+
+
+def test_a_small_picture_is_shown_with_smooth_edges(session):
+    """Closer to the picture at full size than a browser's linear enlargement of the small one."""
+    wxyz, eye, fov, camera = _pose(session)
+    width, height = 4 * (camera.width // 4), 4 * (camera.height // 4)
+    full = draw(session.snapshot, camera_of(wxyz, eye, fov, width, height)).astype(float)
+    small = draw(session.snapshot, camera_of(wxyz, eye, fov, width // 4, height // 4))
+    ours = enlarged(small, width, height)
+    assert ours.shape == full.shape
+    linear = np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BILINEAR)).astype(float)
+    assert np.square(ours - full).mean() < np.square(linear - full).mean()
+    assert enlarged(ours, width, height) is ours
+
+
 def test_the_cursor_finds_what_is_under_it(session):
     place = under_cursor(session.snapshot, [0.6, -3.0, 0.4], [0.0, 1.0, 0.0])
     assert place == pytest.approx([0.6, 0.0, 0.4], abs=0.04)
@@ -76,6 +102,7 @@ def test_pictures_get_smaller_where_they_take_long():
     assert size.fit(2000, 1000) == (250, 124)
     assert size.fit(300, 200) == (144, 96)  # not too small to be read
     assert size.fit(2000, 1000, still=True) == (1000, 500)
+    assert size.fit(1, 2_000_000) == size.fit(1, 2_000_000, still=True) == (2, 1000)  # nor too large
     for _ in range(10):
         size.took(0.01)
     assert size.fit(400, 300) == (400, 300)

@@ -159,6 +159,75 @@ def test_reset_keeps_what_was_changed(session, until):
     assert session.simulation.solver.damping == 3.0
 
 
+def _stiffness(session):
+    return float(session.simulation.scene.points.youngs_modulus.amax())
+
+
+def test_restore_brings_pins_and_material_back(session, until):
+    """All that was changed, and the motion starts at rest; that can be undone, too."""
+    session.start()
+    first, rest, stiffness = session.yaml(), _position(session).clone(), _stiffness(session)
+    session.change({"solver.boundaries": []})
+    until(lambda: len(session.simulation.solver.bound.body.boundaries) == 0)
+    session.change({"material.E": 2e4, "wind.flow": [0.0, 1.0, 0.0], "wind.modulations": [], "shader": None})
+    until(lambda: session.settings.material.E == 2e4)
+    changed = session.yaml()
+    session.pause()
+    session.restore()
+    until(lambda: session.revision == 1)
+    assert session.yaml() == first
+    assert len(session.simulation.solver.bound.body.boundaries) == 1
+    assert _stiffness(session) == stiffness
+    assert len(session.simulation.wind.modulations) == 2
+    assert session.simulation.painter.shader is not None
+    assert torch.equal(_position(session), rest)
+    session.undo()
+    until(lambda: session.revision == 2)
+    assert session.yaml() == changed
+    assert _stiffness(session) == pytest.approx(2e4)
+
+
+def test_undo_takes_the_last_change_back_in_motion(session, until, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.viewer.session.ONE_CHANGE", 100.0)
+    session.start()
+    first, stiffness = session.yaml(), _stiffness(session)
+    for damping in (1.0, 2.0, 3.0):  # as a slider that is dragged: one change
+        session.change({"solver.damping": damping})
+        until(lambda damping=damping: session.settings.solver.damping == damping)
+    session.change({"material.E": 2e4})
+    until(lambda: session.changes == 2)
+    simulation, before = session.simulation, session.snapshot.health.time
+    session.undo()
+    until(lambda: session.changes == 1)
+    assert _stiffness(session) == pytest.approx(stiffness)
+    assert session.settings.solver.damping == 3.0
+    session.undo()
+    session.undo()
+    session.undo()  # there is nothing left
+    until(lambda: session.changes == 0)
+    until(lambda: session.snapshot.health.time > before)
+    assert session.yaml() == first
+    assert session.simulation is simulation
+    monkeypatch.setattr("gaussian_swaying.viewer.session.ONE_CHANGE", 0.0)
+    for damping in (1.0, 2.0):
+        session.change({"solver.damping": damping})
+        until(lambda damping=damping: session.settings.solver.damping == damping)
+    until(lambda: session.changes == 2)
+
+
+def test_undo_heals_what_diverged_and_forgets_what_was_refused(session, until):
+    session.start()
+    session.change({"material.E": -1.0})
+    until(lambda: session.problem is not None)
+    assert (session.changes, session.revision) == (0, 1)
+    session.change({"wind.flow": [1e7, 0.0, 0.0]})
+    until(lambda: session.broken)
+    session.undo()
+    until(lambda: not session.broken and session.snapshot.health.time > 0.05)
+    assert session.problem is None
+    assert float(session.simulation.wind.flows.norm()) < 100
+
+
 def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
     """Edits act at their time, and another stiffness leaves them what they are."""
     file = tmp_path / "edited.yaml"
@@ -181,10 +250,13 @@ def test_material_of_parts_is_that_of_a_run(parser, settings, until, tmp_path):
 def test_another_scene_starts_at_rest(parser, settings, session, until):
     session.start()
     until(lambda: session.snapshot.health.time > 0.2)
+    session.change({"solver.damping": 2.0})
+    until(lambda: session.changes == 1)
     told = []
     session.load(settings, lambda: told.append(session.snapshot.health.time))
     until(lambda: told)
     assert told == [0.0]
+    assert session.changes == 0  # those of the other scene
 
 
 def test_the_saved_configuration_is_that_of_the_session(parser, session, until, tmp_path):

@@ -34,7 +34,7 @@ def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
     session = Session(parser, parser.parse_args([*arguments, "--device", device]))
     if device == "cpu":
         share_cores()
-    page = Page(session, port=8700, largest=max(SIZES[device]))
+    page = Page(port=8700, largest=max(SIZES[device])).show(session)
     first = page.server.initial_camera
     wxyz = camera_rotation(first.position, first.look_at, session.simulation.scene.frame.rotation[2].tolist())
     session.start()
@@ -44,7 +44,7 @@ def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
     for _ in client.pictures(WARM):
         pass
     began, simulated = time.perf_counter(), session.snapshot.health.time
-    received = [(at, len(jpeg), size_of(jpeg)) for at, jpeg in client.pictures(seconds)]
+    received = [(at, len(jpeg)) for at, jpeg in client.pictures(seconds)]
     real_time = (session.snapshot.health.time - simulated) / (time.perf_counter() - began)
     step = session.simulation.frame_dt
     waited = [latency(session, client, k) for k in range(CHANGES)]
@@ -59,8 +59,8 @@ def watch(name: str, arguments: list[str], device: str, seconds: float) -> Row:
         "window": [width, height],
         "seconds": seconds,
         "pictures_per_s": len(received) / seconds,
-        "picture_bytes": statistics.median(size for _, size, _ in received) if received else None,
-        "picture": statistics.mode(shape for *_, shape in received) if received else None,
+        "picture_bytes": statistics.median(size for _, size in received) if received else None,
+        "picture": "x".join(map(str, page.drawn_size)),  # it is enlarged to the window before it is sent
         "latency_ms": statistics.median(waited),
         "real_time": real_time,
         "step_s": step,
@@ -97,13 +97,6 @@ def pixels_of(jpeg: bytes) -> np.ndarray:
     from PIL import Image
 
     return np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"))
-
-
-def size_of(jpeg: bytes) -> str:
-    """Width and height of a picture."""
-    from PIL import Image
-
-    return "x".join(map(str, Image.open(io.BytesIO(jpeg)).size))
 
 
 def add_arguments(command: argparse.ArgumentParser) -> None:

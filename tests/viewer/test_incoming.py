@@ -1,0 +1,189 @@
+"""What a browser may send to the live page: hostile ones change nothing but values, and break nothing."""
+
+import threading
+import time
+
+import pytest
+
+pytest.importorskip("viser", reason="needs the extra [viewer]")
+from viser._messages import FileTransferPart, FileTransferStartUpload
+
+from gaussian_swaying.viewer import incoming as incoming_module
+from gaussian_swaying.viewer import page as page_module
+from gaussian_swaying.viewer.incoming import TOO_LARGE, Incoming, what_is_wrong
+from gaussian_swaying.viewer.pictures import draw
+
+
+@pytest.fixture
+def client(page, connect):
+    return connect(page)
+
+
+def _announce(page, name, size, parts=2):
+    """Whether an upload is taken; as viser would go on with it."""
+    button = page.controls.files.load._impl.uuid
+    message = FileTransferStartUpload(button, name, "../../x.ply", "", parts, size)
+    if taken := page.incoming._good_upload(message):
+        page.server.gui._handle_file_transfer_start(0, message)
+    return taken
+
+
+def _part(page, name, index, content):
+    message = FileTransferPart(page.controls.files.load._impl.uuid, name, index, content)
+    if taken := page.incoming._good_part(message):
+        page.server.gui._handle_file_transfer_part(0, message)
+    return taken
+
+
+def test_uploads_of_sizes_that_cannot_be_are_dropped(page):
+    for size, parts in ((0, 0), (0, 2), (-(10**12), 2), (10, 0), (10, -1), (10, 10**6)):
+        assert not _announce(page, "odd", size, parts)
+    assert page.server.gui._current_file_upload_states == {}
+
+
+def test_uploads_are_limited_by_the_bytes_that_arrive_from_all_clients(page, monkeypatch):
+    assert not _announce(page, "large", (1 << 30) + 1)
+    assert "1,024 MiB" in page.notice
+    monkeypatch.setattr(incoming_module, "LARGEST_UPLOAD", 1000)
+    monkeypatch.setattr(incoming_module, "LEAST_PART", 100)
+    under_way = page.server.gui._current_file_upload_states
+    assert _announce(page, "one", 900)
+    assert _announce(page, "other", 900)  # what is announced counts for nothing
+    assert _part(page, "one", 0, b"x" * 800)
+    assert not _part(page, "other", 0, b"x" * 201)
+    assert list(under_way) == ["one"]
+    assert page.notice == TOO_LARGE
+    assert not _part(page, "one", 1, b"x" * 101)  # more than was announced
+    assert under_way == {}
+    for k in range(incoming_module.MOST_UPLOADS):
+        assert _announce(page, str(k), 200)
+    assert not _announce(page, "one more", 200)
+    assert "Another file" in page.notice
+
+
+def test_a_client_sets_values_only(page, client, until):
+    """Neither attributes of the server's handles, nor values of another type, nor those of buttons that are off."""
+    slider, hold = page.controls.damping, page.controls.holding.hold
+    uuid, callbacks, props = slider._impl.uuid, slider._impl.update_cb, slider._impl.props
+    for name in ("uuid", "update_cb", "props", "removed", "gui_api", "is_button"):
+        client.send("GuiUpdateMessage", uuid=uuid, updates={name: 3})
+        client.send("GuiUpdateMessage", uuid=uuid, updates={"value": 3.0, name: 3})
+    client.send("GuiUpdateMessage", uuid=uuid, updates={})
+    client.send("GuiUpdateMessage", uuid=uuid, updates="value")
+    client.set(hold, True)
+    client.set(page.controls.files.load, "text")
+    client.send("GuiFormDirtyMessage", uuid="many of them stay in memory")
+    client.send("NoSuchMessage")
+    client.socket.send(b"\xff\x00 neither")
+    client.socket.send("text")
+    client.set(slider, 4.0)
+    until(lambda: slider.value == 4.0)
+    assert (slider._impl.uuid, slider._impl.removed, slider._impl.is_button) == (uuid, False, False)
+    assert slider._impl.update_cb is callbacks
+    assert slider._impl.props is props
+    until(lambda: page.session.settings.solver.damping == 4.0)
+    assert page.session.problem is None
+
+
+def test_a_value_out_of_range_gets_a_sentence(page, client, until):
+    bad = {"wind_speed": (1e9, -1, float("nan"), "12", True, None), "shown": ("everything", 3), "shading": ("yes", 1)}
+    good = {"wind_speed": 12.0, "shown": "normals", "shading": False}
+    for name, values in bad.items():
+        handle = getattr(page.controls, name)
+        before = handle.value
+        for value in values:
+            page.tell("")
+            client.set(handle, value)
+            until(lambda: page.notice)
+            assert handle.label in page.notice
+            assert handle.value == before
+        client.set(handle, good[name])
+        until(lambda: not page.notice)  # it is the sentence on a number that is being typed
+        assert handle.value == good[name]
+
+
+def test_the_sentence_names_the_range(page):
+    assert what_is_wrong(page.controls.wind_speed, 31) == "Speed [m/s] goes from 0 to 30: 31 was refused."
+    assert what_is_wrong(page.controls.wind_speed, 30) is None
+
+
+def test_cameras_that_cannot_be_are_dropped(page, client, until):
+    camera, bad = next(iter(page.server.get_clients().values())).camera, float("nan")
+    for change in (
+        {"position": [bad, 0, 0]}, {"position": [1, 2]}, {"wxyz": [0, 0, 0, 0]}, {"fov": 0.0}, {"fov": 4.0},
+        {"image_width": float("inf")}, {"image_height": -5}, {"near": "x"}, {"look_at": None},
+    ):  # fmt: skip
+        client.look(**({"fov": 0.5} | change))
+    client.look(fov=0.6)
+    until(lambda: camera.fov != 0.8)
+    assert camera.fov == 0.6
+    assert page.notice is None
+
+
+def test_no_camera_makes_a_picture_larger_than_the_limit(page, connect, until, monkeypatch):
+    sizes = []
+    monkeypatch.setattr(page_module, "draw", lambda *args: sizes.append((args[1].width, args[1].height)) or draw(*args))
+    client = connect(page, 1, 2_000_000)
+    until(lambda: sizes)
+    client.look(image_width=2_000_000, image_height=1)
+    until(lambda: sizes[-1][0] > sizes[-1][1])
+    assert max(max(size) for size in sizes) <= page.largest
+
+
+def test_handles_are_not_dragged_to_the_end_of_the_world(page, client, until):
+    tip = page.controls._tip
+    before = tuple(tip.position)
+    for place in ([1e30, 0, 0], [1e6, 0, 0], [float("nan"), 0, 0], [1, 2], "abc"):
+        client.drag("/wind/tip", place)
+    until(lambda: page.notice is not None)
+    assert "dragged that far" in page.notice
+    assert tuple(tip.position) == before
+    client.drag("/wind/tip", [0.0, 0.0, 1.0])
+    until(lambda: tuple(page.controls._tip.position) != before)
+    for origin, direction in (([0, 0, 0], [0, 0, 0]), ([float("inf"), 0, 0], [1, 0, 0]), (None, None)):
+        client.click(origin, direction)
+    time.sleep(0.2)
+    assert not page.session.pulls
+
+
+def test_before_the_server_is_there_nothing_passes():
+    assert not Incoming(print).takes(b"")
+
+
+def test_many_clients_at_once_are_served_in_turn(page, connect, until, capfd):
+    """Each of 24 drags and presses as fast as it can; nothing fails, and nothing that is asked last is lost."""
+    controls, failed = page.controls, []
+    clients = [connect(page) for _ in range(24)]
+
+    def play(number, client):
+        try:
+            for k in range(10):
+                client.set(controls.wind_speed, (7 * k + number) % 30)
+                client.set(controls.damping, k % 10)
+                client.drag("/wind/tip", [0.1 * (k % 7), -0.2, 1.2])
+                client.click([0.6, -3.0, 0.4], [0.0, 1.0, 0.0])
+                client.drag("/pull", [0.6, 0.01 * (k % 20), 0.4])
+                client.set(controls.holding.new_pin, True)
+                client.set(controls.holding.pin_size, 2 + k % 50)
+                client.set(controls.holding.release, True)
+                client.set(controls.arrow, k % 2 == 0)
+                client.set(controls.box, k % 2 == 1)
+                time.sleep(0.1)
+        except Exception as error:
+            failed.append(error)
+
+    players = [threading.Thread(target=play, args=arguments) for arguments in enumerate(clients)]
+    for player in players:
+        player.start()
+    for player in players:
+        player.join()
+    assert failed == []
+    clients[0].set(controls.damping, 7.5)
+    until(lambda: page.session.settings.solver.damping == 7.5, 60)
+    for client in clients:
+        client.socket.socket.close()  # all at once, without a word
+    until(lambda: not page.server.get_clients(), 60)
+    told = "".join(capfd.readouterr())
+    assert "Traceback" not in told, told[-3000:]
+    assert "exception" not in told
+    assert page.session.problem is None or page.session.broken  # only the wind may have been too much

@@ -1,0 +1,225 @@
+"""The panel of the live page: what its controls show and do, asked by a client and read from the session."""
+
+import math
+
+import pytest
+import yaml
+
+pytest.importorskip("viser", reason="needs the extra [viewer]")
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.viewer.gusts import KINDS
+from gaussian_swaying.viewer.legends import legend
+from gaussian_swaying.viewer.materials import MATERIALS, in_pascal, like
+from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.session import Session
+
+
+@pytest.fixture
+def client(page, connect):
+    return connect(page)
+
+
+def _modulations(session):
+    return [
+        (m["class_path"].rsplit(".", 1)[-1], m["init_args"])
+        for m in yaml.safe_load(session.yaml())["wind"]["modulations"]
+    ]
+
+
+def test_the_configuration_comes_back_and_changes_are_undone(page, client, until):
+    """Pins and material too, and the controls show it."""
+    session, controls = page.session, page.controls
+    first = session.yaml()
+    assert controls.undo.disabled
+    client.set(controls.holding.free, True)
+    until(lambda: session.settings.solver.boundaries == [])
+    client.set(controls.stiffness, 5e5)
+    until(lambda: session.settings.material.E == 5e5)
+    client.set(controls.wind_speed, 1.0)
+    until(lambda: session.changes == 3 and not controls.undo.disabled)
+    client.set(controls.undo, True)
+    until(lambda: controls.wind_speed.value == pytest.approx(6.2))
+    assert controls.stiffness.value == 5e5
+    client.set(controls.restore, True)
+    until(lambda: session.yaml() == first)
+    until(lambda: controls.stiffness.value == 9e3)
+    assert len(session.simulation.solver.bound.body.boundaries) == 1
+    assert len(controls.holding.places()) > 5
+
+
+def test_modulations_that_are_there_are_shown_and_edited(page, client, until):
+    session, gusts = page.session, page.controls.gusts
+    there = _modulations(session)
+    assert [kind for kind, _ in there] == ["SineSway", "GaussianGust"]
+    shown = [{field: control.value for field, control in numbers.items()} for numbers in gusts.numbers]
+    assert shown == [arguments for _, arguments in there]
+    client.set(gusts.numbers[0]["period"], 3.0)
+    until(lambda: session.simulation.wind.modulations[0].period == 3.0)
+    assert session.simulation.wind.modulations[1].std == there[1][1]["std"]
+    period = gusts.numbers[0]["period"]
+    client.set(gusts.add, "Gusts")
+    until(lambda: len(gusts.numbers) == 3)
+    assert [kind for kind, _ in _modulations(session)] == ["SineSway", "GaussianGust", "UniformGust"]
+    assert period._impl.removed  # the list is drawn anew
+    client.set(gusts.numbers[2]["delta"], 0.7)
+    until(lambda: session.simulation.wind.modulations[2].delta == 0.7)
+    client.set(gusts.removers[0], True)
+    until(lambda: len(gusts.numbers) == 2)
+    assert [kind for kind, _ in _modulations(session)] == ["GaussianGust", "UniformGust"]
+    assert session.problem is None
+    session.undo()
+    until(lambda: len(gusts.numbers) == 3)
+    assert gusts.numbers[0]["period"].value == 3.0
+
+
+def test_every_kind_of_modulation_can_be_added(page, client, until):
+    session, gusts = page.session, page.controls.gusts
+    for number, name in enumerate(KINDS, 3):
+        client.set(gusts.add, name)
+        until(lambda number=number: len(gusts.numbers) == number)
+    assert session.problem is None
+    assert [kind for kind, _ in _modulations(session)][2:] == list(KINDS.values())
+
+
+def test_stiffness_is_in_pascal_on_a_logarithmic_slider(page, client, until):
+    session, controls = page.session, page.controls
+    assert controls.stiffness.value == 9e3
+    assert controls.stiffness_log.value == (round(math.log10(9e3), 2),)
+    assert controls.feels.content == "9 kPa: like jelly"
+    client.set(controls.stiffness_log, [6.3])
+    until(lambda: pytest.approx(10**6.3, rel=0.005) == session.settings.material.E)
+    until(lambda: controls.feels.content == "2 MPa: like rubber")
+    assert controls.stiffness.value == session.settings.material.E
+    client.set(controls.stiffness, 3e4)
+    until(lambda: controls.stiffness_log.value == (pytest.approx(math.log10(3e4), abs=0.005),))
+    until(lambda: session.settings.material.E == 3e4)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "name"),
+    [(150.0, "soft jelly"), (3e4, "muscle at rest"), (2e6, "rubber"), (2e7, "cork"), (2e11, "metal or stone")],
+)
+def test_a_stiffness_has_a_name(stiffness, name):
+    assert like(stiffness) == name
+
+
+def test_the_table_of_materials_has_no_gap():
+    starts = [least for least, _ in MATERIALS]
+    assert starts == sorted(set(starts))
+    assert starts[0] == 0
+    assert [like(least) for least, _ in MATERIALS] == [name for _, name in MATERIALS]
+    assert [in_pascal(e) for e in (0.5, 999, 1e3, 2.5e6, 1e9)] == ["0.5 Pa", "999 Pa", "1 kPa", "2.5 MPa", "1 GPa"]
+
+
+def test_wind_force_and_streaks_have_legends(page, client, until):
+    controls = page.controls
+    assert not controls.legends.visible
+    client.set(controls.shown, "wind force")
+    until(lambda: controls.legends.visible)
+    assert legend("Force of the wind", "Pa", page.session.simulation.force_scale()) == controls.legends.content
+    client.set(controls.shown, "colour")
+    client.set(controls.streaks, True)
+    until(lambda: "Speed of the air [m/s]" in controls.legends.content and "Force" not in controls.legends.content)
+    client.set(controls.wind_speed, 20.0)
+    until(lambda: ">30 and more<" in controls.legends.content)  # 1.5 times the flow
+    client.set(controls.streaks, False)
+    until(lambda: not controls.legends.visible)
+
+
+def test_the_colours_of_a_legend_are_those_of_the_picture():
+    text = legend("Force", "Pa", 8.0)
+    assert ">0<" in text
+    assert ">4<" in text
+    assert ">8 and more<" in text
+    assert text.index("rgb(68,1,84)") < text.index("rgb(253,231,37)")  # viridis, from violet to yellow
+
+
+def test_the_button_says_that_a_video_counts_simulated_time(page, client, until):
+    button = page.controls.files.record
+    assert "simulated time" in button.label
+    client.set(button, True)
+    until(lambda: page.recording is not None)
+    until(lambda: "of simulated time" in page._text.content)
+    client.set(button, True)
+    until(lambda: page.recording is None and "simulated time" in button.label)
+
+
+def _upload(client, button, content):
+    client.send(
+        "FileTransferStartUpload", source_component_uuid=button._impl.uuid, transfer_uuid="one", filename="x",
+        mime_type="", part_count=1, size_bytes=len(content),
+    )  # fmt: skip
+    client.send(
+        "FileTransferPart", source_component_uuid=button._impl.uuid, transfer_uuid="one", part_index=0, content=content
+    )
+
+
+def test_a_configuration_is_loaded(page, client, until):
+    session, files = page.session, page.controls.files
+    given = yaml.safe_load(session.yaml())
+    given["wind"]["flow"], given["material"]["E"] = [0.0, 2.5, 0.0], 1.5e4
+    before = session.simulation
+    _upload(client, files.load_settings, yaml.safe_dump(given).encode())
+    until(lambda: session.simulation is not before)
+    until(lambda: page.controls.wind_speed.value == 2.5 and not files.load_settings.disabled)
+    assert page.controls.stiffness.value == 1.5e4
+    assert session.changes == 0
+    assert not page._bar.visible
+    assert files.load_settings.value.content == b""  # it is not kept
+    now = session.simulation
+    for content, told in (
+        (b"wind: {flows: 3}", "flows"),
+        (b"\xff\xfe", "UTF-8"),
+        (b"scene: {ply: /none/there.ply}", "load it first"),
+        (b"a: " + b"[" * 100, "nested"),
+    ):
+        page.tell("")
+        _upload(client, files.load_settings, content)
+        until(lambda told=told: told in (page.notice or ""))
+        until(lambda: not files.load_settings.disabled)
+    assert session.simulation is now
+
+
+def test_configurations_are_not_loaded_where_others_can_open_the_page(parser, settings):
+    session = Session(parser, settings)
+    page = Page(host="0.0.0.0", port=8470).show(session)
+    assert page.controls.files.load_settings.disabled
+    page.close()
+
+
+def test_a_bar_shows_how_far_a_scene_is_loaded(parser, settings, connect, until):
+    """From the start, before there is a session; then it goes away."""
+    page = Page(port=8480)
+    try:
+        assert page._bar.visible
+        assert "Loading" in page._text.content
+        connect(page)
+        page.progress(0.35, "Making a draft")
+        assert page._bar.value == 35
+        assert "Making a draft" in page._text.content
+        session = Session(parser, settings)
+        page.show(session)
+        assert not page._bar.visible
+        until(lambda: "pictures a second" in page._text.content)
+        assert "draft" not in page._text.content
+        until(lambda: page.drawn_size[0] > 0)  # for the client that came early, too
+    finally:
+        page.close()
+        session.close()
+
+
+def test_a_splat_that_is_loaded_tells_how_far_it_is(page, client, until, tmp_path, monkeypatch):
+    path = tmp_path / "flag.ply"
+    write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
+    told, before = [], page.session.simulation
+    tell = page.progress
+    monkeypatch.setattr(page, "progress", lambda share, what="": (told.append(share), tell(share, what)))
+    _upload(client, page.controls.files.load, path.read_bytes())
+    until(lambda: page.session.simulation is not before, 60)
+    until(lambda: told[-1] is None)
+    shares = [share for share in told if share is not None]
+    assert shares == sorted(shares)
+    assert len(shares) > 4
+    until(lambda: page.controls.stiffness.value == page.session.settings.material.E)
+    assert "scene.ply" in page.session.yaml()

@@ -1,0 +1,42 @@
+"""One thread does what is asked, in order."""
+
+import threading
+import time
+
+from gaussian_swaying.viewer.turns import Turns
+
+
+def test_what_is_asked_is_done_in_order_and_of_the_same_only_the_last(until):
+    done, failed, begun, go_on = [], [], threading.Event(), threading.Event()
+    turns = Turns(lambda: None, 0.01, failed.append)
+
+    def wait():
+        begun.set()
+        go_on.wait(10)
+
+    turns.ask("wait", wait)
+    begun.wait(10)
+    for k in range(5):
+        turns.ask("slider", lambda k=k: done.append(("slider", k, threading.current_thread().name)))
+        turns.ask("button", lambda k=k: done.append(("button", k, threading.current_thread().name)))
+    go_on.set()
+    until(lambda: len(done) == 2)
+    assert done == [("slider", 4, "turns"), ("button", 4, "turns")]
+    turns.ask("bad", lambda: 1 / 0)
+    turns.ask("good", lambda: done.append("good"))
+    until(lambda: done[-1] == "good")
+    assert [type(error) for error in failed] == [ZeroDivisionError]
+    turns.close()
+    turns.ask("late", lambda: done.append("late"))
+    time.sleep(0.05)
+    assert done[-1] == "good"
+
+
+def test_something_is_done_regularly_however_much_is_asked(until):
+    times, stop = [], time.monotonic() + 5
+    turns = Turns(lambda: times.append(time.monotonic()), 0.02, print)
+    while len(times) < 5 and time.monotonic() < stop:
+        turns.ask("busy", lambda: None)
+    turns.close()
+    assert len(times) >= 5
+    assert min(b - a for a, b in zip(times, times[1:], strict=False)) > 0.015  # the clock ticks in less than 5 ms
