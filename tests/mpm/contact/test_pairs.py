@@ -15,3 +15,25 @@ def test_a_place_very_far_away_hides_no_pair():
     expected = (torch.cdist(place.double(), place.double()) < reach).triu(1).nonzero()
     assert len(expected) > 30
     assert torch.equal(torch.stack([first, second], -1), expected)
+
+
+def test_a_pair_at_the_far_sides_of_two_cells_is_found():
+    """Cells as wide as the reach: narrower ones would hold the two places 0.95 reaches apart in cells 0 and 2."""
+    place = torch.tensor([[0.0, 0.0, 0.0], [0.093, 5.0, 0.0], [0.188, 5.0, 0.0]], dtype=torch.float64)
+    for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        first, second = close_pairs(place[:, axes], 0.1, 9 * place, 0.0)
+        assert (first.tolist(), second.tolist()) == ([1], [2])
+
+
+def test_only_places_in_the_cells_beside_are_looked_at(monkeypatch):
+    """On a lattice a little wider than the reach: at most two further on in the column, and three in each of four."""
+    looked, repeat = [], torch.repeat_interleave
+
+    def counted(*args):
+        looked.append(len(found := repeat(*args)))
+        return found
+
+    monkeypatch.setattr(torch, "repeat_interleave", counted)
+    lattice = torch.cartesian_prod(*(3 * [0.101 * torch.arange(9, dtype=torch.float64)]))
+    assert len(close_pairs(lattice, 0.1, 9 * lattice, 0.0)[0]) == 0
+    assert 0 < sum(looked) <= 14 * len(lattice)
