@@ -18,8 +18,8 @@ def test_a_place_very_far_away_hides_no_pair():
 
 
 def test_a_pair_at_the_far_sides_of_two_cells_is_found():
-    """Cells as wide as the reach: narrower ones would hold the two places 0.95 reaches apart in cells 0 and 2."""
-    place = torch.tensor([[0.0, 0.0, 0.0], [0.093, 5.0, 0.0], [0.188, 5.0, 0.0]], dtype=torch.float64)
+    """Cells as wide as the reach: with cells of 0.9 reaches these places would lie in cells 0 and 2."""
+    place = torch.tensor([[0.0, 0.0, 0.0], [0.089, 5.0, 0.0], [0.181, 5.0, 0.0]], dtype=torch.float64)
     for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         first, second = close_pairs(place[:, axes], 0.1, 9 * place, 0.0)
         assert (first.tolist(), second.tolist()) == ([1], [2])
@@ -34,6 +34,6 @@ def test_only_places_in_the_cells_beside_are_looked_at(monkeypatch):
         return found
 
     monkeypatch.setattr(torch, "repeat_interleave", counted)
-    lattice = torch.cartesian_prod(*(3 * [0.101 * torch.arange(9, dtype=torch.float64)]))
+    lattice = 0.101 * torch.cartesian_prod(*(torch.arange(count, dtype=torch.float64) for count in (61, 4, 4)))
     assert len(close_pairs(lattice, 0.1, 9 * lattice, 0.0)[0]) == 0
     assert 0 < sum(looked) <= 14 * len(lattice)
