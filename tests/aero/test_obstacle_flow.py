@@ -39,13 +39,22 @@ def test_the_velocity_of_a_street_is_the_slope_of_its_stream_function(aside):
 
 
 def test_a_plane_wake_has_half_of_its_depth_where_it_was_measured():
-    """Wygnanski and others: at 0.29 sqrt(theta x) from its middle; also just behind the body, where it is deepest."""
+    """Wygnanski and others: at 0.29 sqrt(theta x) from its middle."""
     width, drag = 0.3, 1.1
     theta = 0.5 * drag * width
     behind = torch.tensor([4.0, 9.0, 30.0], dtype=DOUBLE)
     middle = plane_wake(behind, torch.zeros_like(behind), width, drag)
     edge = plane_wake(behind, 0.29 * (theta * behind).sqrt(), width, drag)
     torch.testing.assert_close(edge / middle, torch.full_like(behind, 0.5), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("behind", [1e-3, 0.1, 0.5])
+def test_a_plane_wake_takes_the_momentum_right_behind_the_body(behind):
+    """The integral of u (U - u): half of C_D times the width. The least wide wake takes it with its largest depth."""
+    y = torch.linspace(-3, 3, 20001, dtype=DOUBLE)
+    share = plane_wake(torch.full_like(y, behind), y, 0.3, 1.1)
+    assert float(torch.trapezoid(share * (1 - share), y)) == pytest.approx(0.5 * 1.1 * 0.3, rel=1e-9)
+    assert float(share.max()) == pytest.approx(math.sqrt(0.5))
 
 
 def test_a_round_wake_widens_by_a_twentieth():

@@ -153,6 +153,13 @@ def test_a_round_trip_needs_a_surface_at_every_neighbour_of_its_pixel(share):
         assert float(apart) < 1e-9
 
 
+def test_a_round_trip_needs_a_pixel_of_the_other_picture():
+    camera, pixel = _camera(0.6), torch.tensor([[50.5, 90.5]], dtype=torch.float64)
+    aside = look_at_camera((0.8, -1.6, 0.4), (1.4, 0.0, 0.4), (0.0, 0.0, 1.0), 30.0, SIZE, SIZE, dtype=torch.float64)
+    depth = sample(_plane(camera).depth, pixel)
+    assert not bool(round_trip(pixel, depth, camera, OtherView(_photo(0.6, 0.4), aside, _plane(aside)))[1])
+
+
 def test_round_trips_are_trusted_less_the_longer_they_are():
     apart = torch.tensor([0.0, 0.5, 1.9, 2.1, 0.5], requires_grad=True)
     weight = trust(apart, torch.tensor([True, True, True, True, False]), 2.0)
