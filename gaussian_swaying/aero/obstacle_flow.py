@@ -75,8 +75,9 @@ def cylinder_flow(velocity: Tensor, place: Tensor, axis: Tensor, radius: float) 
 def carlson_rd(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     r"""Carlson's elliptic integral :math:`R_D = \tfrac32 \int_0^\infty [(t+x)(t+y)]^{-1/2} (t+z)^{-3/2} dt`.
 
-    By duplication (Carlson 1995, Numer. Algorithms 10, 13), which halves the spread of the arguments seven times and
-    then takes a series that is exact to float64.
+    By duplication (Carlson 1995, Numer. Algorithms 10, 13): each of nine steps quarters the spread of the arguments,
+    and a series takes what remains. Its next terms are below 1e-17 if the arguments are within 1e12 of each other, those
+    of half axes within 1e6.
 
     Args:
         x: Positive, any shape.
@@ -97,10 +98,7 @@ def carlson_rd(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     a, b, c = 1 - x / mean, 1 - y / mean, 1 - z / mean
     e2 = a * b - 6 * c * c
     e3 = (3 * a * b - 8 * c * c) * c
-    e4 = 3 * (a * b - c * c) * c * c
-    e5 = a * b * c * c * c
-    series = 1 - 3 / 14 * e2 + e3 / 6 + 9 / 88 * e2 * e2 - 3 / 22 * e4 - 9 / 52 * e2 * e3 + 3 / 26 * e5
-    return 3 * total + factor * series / (mean * mean.sqrt())
+    return 3 * total + factor * (1 - 3 / 14 * e2 + e3 / 6) / (mean * mean.sqrt())
 
 
 @lru_cache(maxsize=64)

@@ -56,10 +56,11 @@ class Normal:
     def covariance(self) -> Tensor:
         r"""Covariance of the unknowns in shares of their ranges, shape (U, U).
 
-        :math:`A^{-1} \bigl(\tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1}`, where the gradients are summed over
-        clusters of residuals whose errors are alike (neighbouring tracks at all times): the sandwich of White (1980)
-        and Liang & Zeger (1986). The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far too
-        small.
+        :math:`A^{-1} \bigl(\tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are summed
+        over clusters of residuals whose errors are alike (neighbouring tracks at all times): the sandwich of White
+        (1980) and Liang & Zeger (1986). The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far
+        too small alone. It is added, as the sandwich of few clusters, or of residuals below the least standard
+        deviation that is believed, may be near zero.
         """
         inverse = torch.linalg.pinv(self.matrix, hermitian=True)
         clusters = int((self.scores.abs().sum(-1) > 0).sum())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_LARGEST = 2**62  # of a key
+_LARGEST = 2**62  # of a key; it must fit into int64
 
 
 def equal_rows(rows: Tensor) -> Tensor:

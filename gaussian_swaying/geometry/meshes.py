@@ -193,10 +193,9 @@ def triangle_distance(place: Tensor, corners: Tensor) -> Tensor:
     bp, cp = place - b, place - c
     d3, d4, d5, d6 = (ab * bp).sum(-1), (ac * bp).sum(-1), (ab * cp).sum(-1), (ac * cp).sum(-1)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    total = va + vb + vc
+    total = va + vb + vc  # above zero inside
     inside = (va > 0) & (vb > 0) & (vc > 0)
-    safe = torch.where(total.abs() > 0, total, 1.0)
-    foot = a + (vb / safe)[:, None] * ab + (vc / safe)[:, None] * ac
+    foot = a + (vb / total)[:, None] * ab + (vc / total)[:, None] * ac
     best = torch.where(inside, (place - foot).norm(dim=-1), float("inf"))
     for p, q in ((a, b), (b, c), (c, a)):
         side = q - p

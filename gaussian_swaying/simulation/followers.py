@@ -207,4 +207,4 @@ def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: floa
     mass = scatter(follower_stencil(position, grid), points.mass[:, None, None])[:, 0]
     own = follower_stencil(place.to(position), grid)
     empty = gather((mass <= 0).to(mass)[:, None], own)[:, 0, 0]
-    return torch.where((own.inside & (empty == 0))[:, None], place, position[nearest].to(place))
+    return torch.where((own.inside & (empty == 0))[:, None], place, position[nearest])

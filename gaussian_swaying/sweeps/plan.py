@@ -158,7 +158,10 @@ def _located(error: Exception, where: str) -> tuple[Any, ...]:
 
 
 def _telling(runs: Sequence[Mapping[str, Any]]) -> list[int]:
-    """The runs in which a value appears for the first time; of axes with a number in every run, the first one."""
+    """The runs in which a value appears for the first time; of axes with a number in every run, the first one.
+
+    Those are seeds and draws, all alike: with more than a hundred of them, to check each would take long.
+    """
     many = {name: len({json.dumps(run[name]) for run in runs}) == len(runs) > 100 for name in runs[0]}
     seen: set[tuple[str, str]] = set()
     found = []

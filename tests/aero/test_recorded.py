@@ -178,6 +178,44 @@ def test_a_file_of_turbsim(tmp_path):
     assert found.spacing == (1.0, 2.0)
 
 
+HEADER = {"kind": 7, "nz": 1, "ny": 2, "towers": 0, "nt": 2, "dz": 2.0, "dy": 1.0, "dt": 0.5, "speed": 8.0} | {
+    name: 1.0 for name in ("hub", "bottom", "slope_u", "shift_u", "slope_v", "shift_v", "slope_w", "shift_w")
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "fits"),
+    [
+        ({}, True),  # the smallest: one row of two places at two times
+        ({"towers": 3, "letters": 5}, True),
+        ({"nz": 0}, False),
+        ({"ny": 1}, False),
+        ({"nt": 1}, False),
+        ({"towers": -1}, False),
+        ({"letters": -4}, False),
+        *(({name: value}, False) for name in ("dz", "dy", "dt", "speed") for value in (0.0, -1.0, math.nan)),
+        *(({name: value}, False) for name in ("slope_u", "slope_w", "slope_v") for value in (0.0, math.nan, math.inf)),
+        ({"shift_v": math.nan}, False),
+        ({"more": 2}, False),
+        ({"more": -2}, False),
+    ],
+)
+def test_headers_of_turbsim(tmp_path, changes, fits):
+    """Each file is as long as its header says, but the last two."""
+    own = HEADER | {"letters": 0, "more": 0} | changes
+    more = own.pop("more")
+    values = own["nt"] * (own["ny"] * own["nz"] + own["towers"]) * 3
+    size = 2 * values + own["letters"] + more  # may be below zero, as the header is longer
+    data = struct.pack("<h4i12fi", *own.values())
+    path = tmp_path / "w.bts"
+    path.write_bytes((data + bytes(max(size, 0)))[: len(data) + size])
+    if fits:
+        assert read_bts(path).velocity.shape == (2, 2, 1, 3)
+    else:
+        with pytest.raises(ValueError, match="is damaged"):
+            read_bts(path)
+
+
 def test_planes_of_turbsim_pass_one_after_the_other(tmp_path):
     path, velocity = _bts(tmp_path / "w.bts")
     wind = WindField([0.0, -8.0, 0.0], effects=[FrozenWind(path, origin=[1.0, 2.0, 3.0])])

@@ -1,12 +1,13 @@
 """Residuals of pictures and silhouettes: as small as the noise at the truth, and larger away from it."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from gaussian_swaying.fitting.ensemble import Ensemble
-from gaussian_swaying.fitting.evidence import PATCHES, Block, PictureEvidence, compare, scales_of
+from gaussian_swaying.fitting.evidence import PATCHES, Block, Evidence, PictureEvidence, compare, scales_of
 from gaussian_swaying.fitting.fit import Fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.videos import read_videos
@@ -40,3 +41,31 @@ def test_silhouettes_need_masks(own, simulation):
     plan = Plan(["base"], ["video"], [read_unknown("wind.speed", [1, 9])], stages=("silhouettes",))
     with pytest.raises(ValueError, match="no silhouettes"):
         Fit(simulation, videos, plan)
+
+
+def test_tracks_share_their_clusters_over_cameras_and_pictures_do_not():
+    """A track's error is that of a place of the object, whoever sees it; a patch of a picture is a camera's own."""
+
+    class Given(Evidence):
+        floor = 1.0
+
+        def __init__(self, kind):
+            super().__init__(SimpleNamespace(times=(0.0, 0.5, 1.0)))
+            self.kind = kind
+
+        def residuals(self, simulation, states, frame):
+            return torch.zeros(len(states), PATCHES**2, 1), torch.arange(PATCHES**2)
+
+    def run(values, times, *_, **__):
+        return [[None] * len(values) for _ in times]
+
+    ensemble = SimpleNamespace(simulation=None, run=run)
+    evidence = [Given(kind) for kind in ("pixels", "tracks", "pixels", "tracks", "pixels")]
+    found = {block.kind: block for block in compare(ensemble, evidence, [{}, {}], (0.0, 0.5, 1.0))}
+    patches = set(range(PATCHES**2))
+    assert found["tracks"].values.shape == (2, 2 * 2 * len(patches), 1)  # two cameras at two times after the start
+    assert set(found["tracks"].cluster.tolist()) == patches
+    own = found["pixels"].cluster.reshape(2, 3, -1)  # times, cameras
+    assert torch.equal(own[0], own[1])
+    assert len(own.unique()) == 3 * len(patches)
+    assert 0 <= int(own.min()) < int(own.max()) < len(evidence) * len(patches)

@@ -5,7 +5,14 @@ import torch
 
 from gaussian_swaying.fitting.evidence import Block, scales_of
 from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
-from gaussian_swaying.fitting.least_squares import Progress, iterate, linearised, sensitivities
+from gaussian_swaying.fitting.least_squares import (
+    Progress,
+    huber,
+    iterate,
+    linearised,
+    normal_equations,
+    sensitivities,
+)
 from gaussian_swaying.fitting.unknowns import Unknown
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
@@ -101,3 +108,35 @@ def test_the_lowest_place_of_a_narrow_valley_is_found():
     while not progress.done and progress.iteration < 60:
         iterate(valley, lambda blocks: {"tracks": 0.1}, progress, 1e-5)
     assert progress.place.tolist() == pytest.approx([0.7, 0.441], abs=1e-3)
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 5])
+def test_the_error_of_a_mean_is_that_of_its_clusters_and_of_its_residuals(clusters):
+    """A mean of C clusters of equal size, in textbooks: variance of their means over C, and sigma^2 / n beside it."""
+    size, sigma = 6, 0.2
+    draw = torch.randn(clusters, size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    values = 0.1 * (draw - draw.mean())  # all below HUBER, and their mean is the best place
+    cluster = 2 * torch.arange(clusters).repeat_interleave(size)  # every other one is empty
+    variants = torch.stack([values, values + 0.004])  # the unknown is added to each
+    block = Block("tracks", variants.reshape(2, -1, 1), cluster)
+    found = normal_equations([block], {"tracks": sigma}, torch.tensor([0.004], dtype=torch.float64)).covariance()
+    between = values.mean(1).var() / clusters if clusters > 1 else 0.0
+    expected = float(between + sigma**2 / (clusters * size))
+    assert found.shape == (1, 1)
+    assert float(found) == pytest.approx(expected, rel=1e-10)  # rounding of a difference of 0.004
+
+
+def test_the_cost_is_hubers_function():
+    """Against torch's, on both sides of 1.345 standard deviations."""
+    sigma = 0.5
+    values = torch.tensor([[0.1, -0.6, 0.67, -0.68, 2.0], [0.0, 1.0, -3.0, 0.5, 0.2]], dtype=torch.float64)
+    blocks = [
+        Block("tracks", values[:, :2, None], torch.zeros(2)),
+        Block("tracks", values[:, 2:, None], torch.zeros(3)),
+    ]
+    expected = torch.nn.functional.huber_loss(
+        values / sigma, torch.zeros_like(values), reduction="none", delta=1.345
+    ).mean(1)
+    torch.testing.assert_close(huber(blocks, {"tracks": sigma}), expected)
+    values[1, 3] = float("nan")
+    assert huber(blocks, {"tracks": sigma}).tolist() == [pytest.approx(float(expected[0])), float("inf")]

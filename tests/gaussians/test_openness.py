@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.gaussians.openness import LEAST, openness
+from gaussian_swaying.gaussians.openness import LEAST, _split, openness
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.leaves import LeavesScene
@@ -216,3 +216,19 @@ def test_wrong_shapes_are_named(name, shape):
     given = {"means": (4, 3), "normals": (4, 3), "log_scales": (4, 3), "areas": (4,), "opacity": (4,), name: shape}
     with pytest.raises(ValueError, match=rf"Expected `{name}` of shape .* but got"):
         openness(**{key: torch.ones(size) for key, size in given.items()})
+
+
+def test_depths_around_a_place_are_sums_over_its_own_column():
+    """Against a sum over all parts; many sheets and skins reach beyond the ends of their column."""
+    draw = torch.Generator().manual_seed(0)
+    key = (5 * torch.rand(60, generator=draw, dtype=torch.float64)).sort().values
+    at = (5 * torch.rand(40, generator=draw, dtype=torch.float64)).sort().values
+    sheet, skin = torch.rand(2, 40, generator=draw, dtype=torch.float64)
+    optical = torch.rand(60, generator=draw, dtype=torch.float64)
+    passed = torch.nn.functional.pad(optical.cumsum(0), (1, 0))
+    found = _split(key, at, passed, sheet, skin)
+    away, own = key - at[:, None], key.floor() == at.floor()[:, None]
+    before, behind = away < -sheet[:, None], away >= sheet[:, None]
+    near = (away >= -skin[:, None]) & (away < skin[:, None])
+    for one, where in zip(found, (before, ~before & ~behind, behind, near), strict=True):
+        torch.testing.assert_close(one, (optical * (own & where)).sum(-1))

@@ -17,6 +17,23 @@ def test_lines_are_spread_evenly():
     assert float(lines[:, 2].min()) > 0
 
 
+@pytest.mark.parametrize("count", [1, 7, 100])
+def test_lines_are_in_the_middle_of_bands_of_equal_area(count):
+    """The mean square of their heights is that of the midpoint rule with n intervals."""
+    found = spread_lines(count)[:, 2].square().mean()
+    assert float(found) == pytest.approx(1 / 3 - 1 / (12 * count**2), rel=1e-12)
+
+
+def test_no_two_lines_of_a_spiral_are_close():
+    """In a lattice of triangles with the area 2 pi / n for each line, neighbours are sqrt(4 pi / (sqrt(3) n)) apart.
+
+    With the golden angle the square of the least distance is two thirds of that; with other angles it is less.
+    """
+    lines = spread_lines(100)
+    apart = torch.cdist(lines, lines).fill_diagonal_(math.inf)
+    assert float(apart.amin()) ** 2 > 0.64 * 4 * math.pi / (math.sqrt(3) * 100)
+
+
 def test_axes_across_make_a_right_handed_frame():
     lines = torch.cat([spread_lines(50), torch.eye(3, dtype=torch.float64)])
     first, second = axes_across(lines)

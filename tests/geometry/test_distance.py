@@ -224,6 +224,15 @@ def test_distances_of_triangles_agree_with_samples():
     torch.testing.assert_close(found, sampled, atol=0.02, rtol=0)
 
 
+def test_the_distance_of_a_triangle_without_area_is_that_of_its_longest_side():
+    a, c = torch.tensor([0.0, 0.0, 0.0]).double(), torch.tensor([2.0, 0.0, 0.0]).double()
+    place = torch.tensor([[-3.0, 4.0, 0.0], [0.5, 0.0, 2.0], [2.0, -3.0, 4.0]], dtype=torch.float64)
+    between = torch.stack([a, 0.25 * c, c]).expand(3, 3, 3)
+    torch.testing.assert_close(triangle_distance(place, between), torch.tensor([5.0, 2.0, 5.0], dtype=torch.float64))
+    at_a_point = torch.zeros(3, 3, 3, dtype=torch.float64)
+    torch.testing.assert_close(triangle_distance(place, at_a_point), place.norm(dim=-1))
+
+
 def test_a_path_is_straight_between_its_keys():
     path = KeyedPath(
         [0.0, 1.0, 3.0], moves=[[0, 0, 0], [2, 0, 0], [2, 4, 0]], turns=[[0, 0, 0], [0, 0, 90], [0, 0, 90]]

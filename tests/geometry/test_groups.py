@@ -10,6 +10,10 @@ CASES = {
     "booleans": lambda: torch.rand(200, 5) > 0.5,
     "wide": lambda: torch.randint(-(2**62), 2**62, (300, 3))[torch.randint(300, (900,))],
     "half of the range of integers each": lambda: torch.randint(0, 2**31, (300, 4))[torch.randint(300, (900,))],
+    "an eighth of the range of integers each": lambda: torch.randint(0, 2**61, (300, 3))[torch.randint(300, (900,))],
+    "above int64 with the ranks of the first": lambda: torch.stack(
+        [torch.randint(0, 2**k, (300,)) for k in (61, 55)], -1
+    )[torch.randint(300, (900,))],
     "the ends of the range of integers": lambda: torch.tensor([[2**63 - 1, 0], [-(2**63), 1], [0, 1], [0, 1]]),
     "floating point": lambda: torch.randn(40, 3, dtype=torch.float64)[torch.randint(40, (300,))],
     "signed zeros": lambda: torch.tensor([[0.0, 1.0], [-0.0, 1.0], [-1.0, 0.0]]),

@@ -226,6 +226,30 @@ def test_moduli_bound_the_hessian(name, nu):
     assert float((speed / wave)[:mild].median()) > 0.7
 
 
+@pytest.mark.parametrize("nu", [0.1, 0.25, 0.4])
+@pytest.mark.parametrize("name", ["springs", "Hencky"])
+def test_moduli_of_stretches_are_those_of_the_hessian(name, nu):
+    """Both bounds are exact, down to their values at rest.
+
+    In principal axes H has the entries ii,jj and, for each pair, a block of ij,ij and ij,ji, whose sum and difference
+    are its eigenvalues. On m (x) N the entries ii,jj may be moved to the blocks: see ``stvk_hencky_moduli``.
+    """
+    law, (i, j) = LAWS[name], ((0, 0, 1), (1, 2, 2))
+    F = (4.8 * torch.rand(300, 3, dtype=torch.float64) - 2.8).exp().diag_embed()  # logarithms are continued below 0.05
+    mu, lam = _lame(len(F), nu)
+    hessian = _hessian(law, F, mu, lam, None)
+    entry = hessian.reshape(-1, 3, 3, 3, 3)
+    same, swapped, mixed = entry[:, i, j, i, j], entry[:, i, j, j, i], entry[:, i, i, j, j]
+    own = entry[:, range(3), range(3), range(3), range(3)]
+    fastest = torch.cat([own, same - swapped - mixed, same + swapped + mixed], -1).amax(-1).maximum(2 * mu + lam)
+    wave, bound = law.moduli(F, mu, lam)
+    largest = torch.linalg.eigvalsh(hessian)[:, -1].maximum(2 * mu + 3 * lam)
+    assert int((fastest > 1.1 * (2 * mu + lam)).sum()) > 30
+    # stretches that are alike by chance: rounding over their difference, or a divided difference
+    torch.testing.assert_close(wave, fastest, rtol=1e-7, atol=0)
+    torch.testing.assert_close(bound, largest, rtol=1e-7, atol=0)
+
+
 @pytest.mark.parametrize("name", list(LAWS))
 def test_moduli_at_rest(name, dtype):
     law = LAWS[name]
@@ -237,6 +261,16 @@ def test_moduli_at_rest(name, dtype):
     tol = 1e-4 if dtype == torch.float32 else 1e-8
     torch.testing.assert_close(wave, expected, rtol=tol, atol=0)
     torch.testing.assert_close(bound, 3 * lam + 2 * mu, rtol=tol, atol=0)
+
+
+@pytest.mark.parametrize("s", [1.05, 1.5, 3.0])
+def test_moduli_of_uniform_expansion_are_exact_for_fixed_corotated(s):
+    """F = s I along I and e (x) e: mu |F - R|^2 gives 2 mu, lambda / 2 (J - 1)^2 gives 5 s^4 - 2 s and s^4."""
+    mu, lam = _lame(1)
+    F = s * torch.eye(3, dtype=torch.float64)[None]
+    wave, bound = FixedCorotated().moduli(F, mu, lam)
+    torch.testing.assert_close(wave, 2 * mu + lam * s**4)
+    torch.testing.assert_close(bound, 2 * mu + lam * (5 * s**4 - 2 * s))
 
 
 def test_packed_snow_is_stiffer():

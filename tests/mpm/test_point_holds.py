@@ -16,7 +16,7 @@ from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.boundaries.plane import Plane
 from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MaterialPoints, MPMState, support_force
+from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, support_force
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 
 DX, STEP = 0.1, 0.045
@@ -549,3 +549,35 @@ def test_only_what_has_a_target_moves():
     assert Handle(TOP).moves
     assert not PinnedRegion(TOP).moves
     assert not PinnedPoints([[0, 0, 0]]).moves
+
+
+@pytest.mark.parametrize(
+    ("place", "massless", "first"),
+    [
+        # on the border of the cell with the nodes 2, 3 and 4, and e beyond: the largest weight at the fourth is
+        # e^2 / 2 times 0.75 for each other axis, and does not count below 1e-6
+        (2.5, (4,), 2),
+        (2.5 + math.sqrt(0.95e-6 / (0.5 * 0.75**2)), (4,), 2),
+        (2.5 + math.sqrt(1.05e-6 / (0.5 * 0.75**2)), (4,), 1),
+        (2.95, (), 2),
+        (2.95, (4,), 1),  # the cell before, though the place lies nearly half a cell beyond it
+        (2.95, (2,), 3),
+        (2.95, (2, 4), -1),  # beyond the cell before, the weight of its node 2 is -0.15: it does count
+    ],
+)
+def test_a_cell_beside_a_place_has_all_the_nodes_that_it_needs(place, massless, first):
+    """Along each axis in turn; the place lies at the middle of a cell along the other two."""
+    grid = GridSpec(0.5, (-1, 2, 0), (7, 6, 8))
+    for axis in range(3):
+        node = torch.full((3,), 3.0, dtype=torch.float64)
+        node[axis] = place
+        position = 0.5 * (node + torch.tensor(grid.offset))
+        index = torch.cartesian_prod(*(torch.arange(count) for count in grid.resolution))
+        massive = ~torch.isin(index[:, axis], torch.tensor(massless, dtype=torch.long))
+        found = int(point_holds.cells_of_places(position[None], grid, massive))
+        if first == -1:
+            assert found == -1
+        else:
+            expected = [2, 2, 2]
+            expected[axis] = first
+            assert index[found].tolist() == expected

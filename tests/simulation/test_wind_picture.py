@@ -6,6 +6,8 @@ import torch
 
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.simulation.preview.ticks import project
 from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.wind_picture import STEPS, draw_wind, streaks
 
@@ -30,6 +32,24 @@ def test_streaks_follow_the_wind(make_simulation):
     kept = drift.norm(dim=-1) < 10 * short * 5.0  # the others came in again at the other side
     assert float(kept.float().mean()) > 0.9
     torch.testing.assert_close(drift[kept], (short * torch.tensor([3.0, 0.0, 4.0])).double().expand_as(drift[kept]))
+
+
+@pytest.mark.parametrize(("distance", "angle", "height"), [(3.0, 40.0, 90), (7.0, 25.0, 300)])
+def test_streaks_fill_the_picture_and_are_an_eighth_of_it_long(make_simulation, distance, angle, height):
+    """Seen from the side, in a plane through the middle: an eighth of 1.15 widths, which leave no edge without air."""
+    simulation = make_simulation()
+    simulation.wind = WindField([5.0, 0.0, 0.0])
+    state, centre = simulation.start(), simulation.scene.center.double()
+    eye = centre - distance * torch.tensor([0.0, 1.0, 0.0])
+    camera = look_at_camera(eye.tolist(), centre.tolist(), (0.0, 0.0, 1.0), angle, 160, height, dtype=torch.float64)
+    places, _ = streaks(simulation, state, camera)
+    pixel, depth = project(places.reshape(-1, 3), camera)
+    torch.testing.assert_close(depth, torch.full_like(depth, distance), rtol=1e-5, atol=0)  # air in float32
+    pixel = pixel.view(len(places), -1, 2)
+    long = (pixel[:, -1] - pixel[:, 0]).norm(dim=-1)
+    torch.testing.assert_close(long, torch.full_like(long, 1.15 * 160 / 8), rtol=1e-5, atol=0)
+    assert bool((pixel[:, 0].amin(0) < 0).all())
+    assert bool((pixel[:, 0].amax(0) > torch.tensor([160, height])).all())
 
 
 def test_the_object_hides_what_is_behind_it(make_simulation):

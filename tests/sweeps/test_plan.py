@@ -2,6 +2,7 @@
 
 from argparse import ArgumentError
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -9,7 +10,8 @@ import yaml
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps import plan as plan_module
+from gaussian_swaying.sweeps.plan import Sweep, make_plan, parse_run, read_sweep
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,6 +48,27 @@ def test_splats_are_remembered_by_their_content(tmp_path, sweep_file, parser):
     plan = make_plan(read_sweep(sweep_file(tmp_path / "a.yaml", axes, 1)), parser)
     assert set(plan.splats) == set(axes["scene.ply"])
     assert len(set(plan.splats.values())) == 2
+
+
+@pytest.mark.parametrize(
+    ("runs", "seeds", "checked"),
+    [
+        (100, 100, range(100)),  # every value
+        (101, 101, (0, 40, 80)),  # of a number in each of so many runs, the first
+        (102, 101, range(101)),  # the last run has the number of the first
+    ],
+)
+def test_every_value_is_checked_but_not_hundreds_of_seeds(parser, monkeypatch, runs, seeds, checked):
+    told = []
+
+    def parse(parser, config, frames, run):
+        told.append(run)
+        return SimpleNamespace(scene=SimpleNamespace(ply=None))
+
+    monkeypatch.setattr(plan_module, "parse_run", parse)
+    values = [{"material.E": 1e3 * (1 + k // 40), "wind.seed": k % seeds} for k in range(runs)]
+    make_plan(Sweep([], values, {}), parser)
+    assert told == [values[k] for k in checked]
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "configs/sweep").glob("*.yaml")), ids=lambda path: path.stem)

@@ -24,6 +24,7 @@ from gaussian_swaying.training.surface_losses import (
     round_trip,
     sample,
     textured,
+    trust,
     warped_patches,
 )
 
@@ -134,6 +135,62 @@ def test_what_the_other_view_does_not_show_does_not_count():
         assert float(term(_inputs(other=other))) == 0.0
         assert float(term(_inputs(other=None))) == 0.0
         assert float(term(_inputs(shift=0.3))) == 0.0  # round trips are longer than `farthest`
+
+
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.5, 1.0])
+def test_a_round_trip_needs_a_surface_at_every_neighbour_of_its_pixel(share):
+    """To a view from the same place, where nothing is known beside the column 50, at a share of the way there."""
+    camera, plane = _camera(0.6), _plane(_camera(0.6))
+    known = plane.known.clone()
+    known[:, 51:] = False
+    there = OtherView(
+        _photo(0.6, 0.4), camera, SurfaceMaps(plane.normal, plane.unit, plane.distance, plane.depth, known)
+    )
+    pixel = torch.tensor([[50.5 + share, 90.5]], dtype=torch.float64)
+    apart, seen = round_trip(pixel, sample(plane.depth, pixel), camera, there)
+    assert bool(seen) == (share == 0.0)
+    if share == 0.0:
+        assert float(apart) < 1e-9
+
+
+def test_a_round_trip_needs_a_pixel_of_the_other_picture():
+    camera, pixel = _camera(0.6), torch.tensor([[50.5, 90.5]], dtype=torch.float64)
+    aside = look_at_camera((0.8, -1.6, 0.4), (1.4, 0.0, 0.4), (0.0, 0.0, 1.0), 30.0, SIZE, SIZE, dtype=torch.float64)
+    depth = sample(_plane(camera).depth, pixel)
+    assert not bool(round_trip(pixel, depth, camera, OtherView(_photo(0.6, 0.4), aside, _plane(aside)))[1])
+
+
+def test_round_trips_are_trusted_less_the_longer_they_are():
+    apart = torch.tensor([0.0, 0.5, 1.9, 2.1, 0.5], requires_grad=True)
+    weight = trust(apart, torch.tensor([True, True, True, True, False]), 2.0)
+    torch.testing.assert_close(weight, torch.tensor([1.0, math.exp(-0.5), math.exp(-1.9), 0.0, 0.0]))
+    assert not weight.requires_grad
+
+
+def test_only_patches_that_both_pictures_show_are_compared():
+    """A wall seen by two cameras side by side: one picture is the other moved by eight pixels, so that all is alike.
+
+    Patches at the edge leave the other picture, whose right half then loses its print.
+    """
+    camera = look_at_camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0, 64, 48, dtype=torch.float64)
+    step = 8 * 2.0 / float(camera.intrinsics[0, 0])
+    aside = look_at_camera((step, -2.0, 0.0), (step, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0, 64, 48, dtype=torch.float64)
+    wide = torch.rand(48, 72, 1, generator=torch.Generator().manual_seed(0)).double().expand(48, 72, 3)
+    own, moved = wide[:, :64], wide[:, 8:].clone()
+    depth = torch.full((48, 64, 1), 2.0, dtype=torch.float64)
+    unit = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(48, 64, 3)
+    wall = SurfaceMaps(unit, unit, -depth, depth, torch.ones_like(depth, dtype=torch.bool))
+    term = MultiViewPhotometricLoss(start=0, samples=10_000)
+
+    def loss(picture):
+        other = OtherView(picture, aside, wall)
+        return float(term(_inputs(image=own, target=own, camera=camera, surface=wall, other=other)))
+
+    assert loss(moved) < 1e-9
+    assert loss(moved.flip(1)) > 0.9  # nothing is alike
+    moved[:, 32:] = 0.5
+    # of the columns that are compared, up to half of the patch of the three at the border has no print
+    assert loss(moved) < 0.1
 
 
 def test_derivatives_against_finite_differences():

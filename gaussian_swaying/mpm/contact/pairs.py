@@ -42,7 +42,7 @@ def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tupl
     extent = float((place.amax(0) - low).amax())
     if not extent < float("inf"):
         raise FloatingPointError("The position of a place of the surface is NaN or infinite.")
-    size = max(reach, extent / 2.0**19)
+    size = max(reach, extent / 2.0**19)  # so that float32 rounds a place by a small part of a cell, and keys fit
     cell = ((place - low) / size).long() + 1
     _, ny, nz = (cell.amax(0) + 2).tolist()
     key, order = ((cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2]).sort(stable=True)

@@ -107,7 +107,7 @@ def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 
         substep=simulation.frame_dt / at_rest,
         substeps=round(steps),
         substep_seconds=seconds,
-        simulation_seconds=seconds * round(steps) * max(frames - 1, 0),
+        simulation_seconds=seconds * round(steps) * (frames - 1),
         picture_seconds=drawn,
         startup_seconds=startup_seconds + warm_up,
     )

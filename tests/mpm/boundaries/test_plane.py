@@ -26,6 +26,12 @@ def test_plane_velocity_kinds():
     assert plane_velocity(torch.zeros(1, 3), UP.float(), "separate", 0.5).tolist() == [[0, 0, 0]]
 
 
+@pytest.mark.parametrize("length", [1e-3, 1.0, 50.0])
+def test_the_length_of_the_normal_does_not_matter(length):
+    plane = Plane([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length])
+    torch.testing.assert_close(plane.normal, torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
+
+
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
 def test_plane_holds_a_falling_block_on_its_free_side(formulation, kind, block, run_for):

@@ -97,6 +97,18 @@ def test_files_are_written_beside_the_simulation_where_there_are_cores(monkeypat
     assert found == {2: 1 + 4, 4: 4 / 2 - 0.5}
 
 
+@pytest.mark.parametrize("frames", [1, 2, 101])
+def test_a_run_takes_as_many_substeps_as_it_has_frames_after_the_first(frames, monkeypatch):
+    """Of timed frames the median time of a substep, and the mean number of them."""
+    monkeypatch.setattr(cost_module, "_timed_frames", lambda *_: (0.5, [1e-3, 9e-3, 2e-3], [5001, 5002, 5007]))
+    monkeypatch.setattr(cost_module, "_picture_seconds", lambda *_: 0.25)
+    found = estimate_cost(flag("cpu"), frames, startup_seconds=3.0)
+    assert (found.substep_seconds, found.substeps, found.startup_seconds) == (2e-3, 5003, 3.5)
+    simulated = {1: 0.0, 2: 5003 * 2e-3, 101: 100 * 5003 * 2e-3}[frames]
+    assert found.simulation_seconds == pytest.approx(simulated, rel=1e-12)
+    assert found.total_seconds == pytest.approx(3.5 + simulated + 0.25 * frames)
+
+
 def flag(device):
     """A flag in code."""
     pole = PinnedRegion(Box([None] * 3, [0.06, None, None]))

@@ -12,7 +12,7 @@ from gaussian_swaying.cli.preview import _joined, build_options
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.preview.doubts import doubts, preview_command
-from gaussian_swaying.simulation.preview.hold import guess_hold
+from gaussian_swaying.simulation.preview.hold import guess_hold, hanging_cord
 from gaussian_swaying.simulation.preview.suggest import CELLS, suggest, visible_weight
 
 
@@ -237,3 +237,23 @@ def test_weak_guesses_print_the_commands_of_both():
     sure = suggest(splat(*man()).select(torch.arange(0, 7400, 5)), "+z")
     assert doubts(sure, options, defaults) == []
     assert preview_command(argparse.Namespace(scene="a.ply"), defaults) == "python tools/preview.py a.ply"
+
+
+@pytest.mark.parametrize(
+    ("body", "cord", "is_cord"),
+    [
+        (0.5, 0.039, True),  # thinner than 0.04 of the length
+        (0.5, 0.041, False),
+        (0.1, 0.024, True),  # and than a quarter of the widest part
+        (0.1, 0.026, False),
+    ],
+)
+def test_a_cord_is_thin_for_the_length_and_for_what_hangs_on_it(body, cord, is_cord):
+    """Two upright square bars, the upper one thin, 3 long together; of each, only the four edges."""
+    corners = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]], dtype=torch.float64)
+    height = torch.linspace(0, 3, 601, dtype=torch.float64)
+    width = 3 * torch.where(height > 1.2, cord, body)
+    points = torch.cat([(width[:, None, None] * corners), height[:, None, None].expand(-1, 4, 1)], -1).reshape(-1, 3)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    found = hanging_cord(points, torch.ones(len(points), dtype=torch.float64), up)
+    assert (found is not None) == is_cord

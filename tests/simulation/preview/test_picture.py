@@ -20,6 +20,9 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.preview.cost import estimate_cost
 from gaussian_swaying.simulation.preview.picture import (
     PINNED,
+    PUSHED,
+    Parts,
+    _tinted,
     box_edges,
     classify,
     mean_flow,
@@ -36,6 +39,19 @@ POLE = Box([None, None, None], [0.11, None, None])
 
 
 # ---- picture
+
+
+def test_tints_leave_three_tenths_of_the_colour_and_what_is_still_is_pale_and_grey():
+    """Black and white Gaussians: moving, pushed, pinned, both, and not simulated."""
+    moving, pushed, pinned = (torch.tensor(row) for row in ([1, 1, 1, 1, 0], [0, 1, 0, 1, 0], [0, 0, 1, 1, 0]))
+    none = torch.zeros(5, dtype=torch.bool)
+    parts = Parts(simulated=moving.bool(), carried=none, pinned=pinned.bool(), pushed=pushed.bool(), names=[])
+    push, pin = torch.tensor(PUSHED) / 255, torch.tensor(PINNED) / 255
+    for value in (0.0, 1.0):
+        own = torch.full((3,), value)
+        expected = [own, 0.3 * own + 0.7 * push, 0.3 * own + 0.7 * pin, 0.09 * own + 0.21 * push + 0.7 * pin]
+        pale = torch.full((3,), 0.5 + 0.4 * value)
+        torch.testing.assert_close(_tinted(own.expand(5, 3), parts), torch.stack([*expected, pale]))
 
 
 def test_projection_is_that_of_the_renderer():

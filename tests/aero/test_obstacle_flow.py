@@ -1,0 +1,78 @@
+"""Constants of the closed forms, against the laws and the measurements that they come from."""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.obstacle_flow import KARMAN_RATIO, carlson_rd, plane_wake, round_wake, vortex_street
+
+DOUBLE = torch.float64
+
+
+def test_the_rows_of_a_street_have_von_karmans_distance():
+    """Only rows with sinh(pi h / l) = 1 keep their places (Lamb 156); the ratio is rounded to three digits."""
+    assert math.asinh(1) / math.pi == pytest.approx(KARMAN_RATIO, abs=0.0005)
+
+
+@pytest.mark.parametrize("aside", [-0.09, -0.03, 0.0, 0.02, 0.05, 0.2])
+def test_the_velocity_of_a_street_is_the_slope_of_its_stream_function(aside):
+    """The one of the docstring, of two staggered rows, differentiated by torch; the mean over a length is taken off."""
+    width, strouhal = 0.1, 0.2
+    length = 0.86 * width / strouhal  # Roshko: the vortices drift at 0.86 of the flow, St U / d of them a second
+    circulation = 0.14 * math.sqrt(8) * length  # of a street that is as much slower than the flow
+    half = 0.5 * length * math.asinh(1) / math.pi
+    x = 0.25 + length * torch.arange(256, dtype=DOUBLE) / 256  # formed, as it is farther than two widths
+    place = torch.stack([x, torch.full_like(x, aside)]).requires_grad_()
+
+    def row(x, y):
+        return torch.log(torch.cosh(2 * math.pi * y / length) - torch.cos(2 * math.pi * x / length) + 0.3)
+
+    stream = row(place[0], place[1] - half) - row(place[0] + length / 2, place[1] + half)
+    (slope,) = torch.autograd.grad(circulation / (4 * math.pi) * stream.sum(), place)
+    expected = torch.stack([slope[1] - slope[1].mean(), -slope[0]], dim=-1)
+    expected = expected * torch.exp(-x / (30 * width))[:, None]
+    found = vortex_street(x, torch.full_like(x, aside), width, torch.zeros((), dtype=DOUBLE), strouhal)
+    assert float(expected.abs().max()) > 0.01
+    # the rounded ratio moves each row by 0.0002 l, so that the phase 2 pi y / l changes by 1.4e-3
+    torch.testing.assert_close(found, expected, rtol=0, atol=1.5e-3)
+
+
+def test_a_plane_wake_has_half_of_its_depth_where_it_was_measured():
+    """Wygnanski and others: at 0.29 sqrt(theta x) from its middle."""
+    width, drag = 0.3, 1.1
+    theta = 0.5 * drag * width
+    behind = torch.tensor([4.0, 9.0, 30.0], dtype=DOUBLE)
+    middle = plane_wake(behind, torch.zeros_like(behind), width, drag)
+    edge = plane_wake(behind, 0.29 * (theta * behind).sqrt(), width, drag)
+    torch.testing.assert_close(edge / middle, torch.full_like(behind, 0.5), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("behind", [1e-3, 0.1, 0.5])
+def test_a_plane_wake_takes_the_momentum_right_behind_the_body(behind):
+    """The integral of u (U - u): half of C_D times the width. The least wide wake takes it with its largest depth."""
+    y = torch.linspace(-3, 3, 20001, dtype=DOUBLE)
+    share = plane_wake(torch.full_like(y, behind), y, 0.3, 1.1)
+    assert float(torch.trapezoid(share * (1 - share), y)) == pytest.approx(0.5 * 1.1 * 0.3, rel=1e-9)
+    assert float(share.max()) == pytest.approx(math.sqrt(0.5))
+
+
+def test_a_round_wake_widens_by_a_twentieth():
+    """Bastankhah & Porté-Agel in gusty wind; its standard deviation from its value at a place and in its middle."""
+    behind, aside = torch.tensor([2.0, 6.0, 12.0], dtype=DOUBLE), torch.tensor(0.3, dtype=DOUBLE)
+    ratio = round_wake(behind, aside, 0.5, 0.47) / round_wake(behind, 0 * aside, 0.5, 0.47)
+    sigma = aside / (-2 * ratio.log()).sqrt()
+    torch.testing.assert_close(sigma.diff() / behind.diff(), torch.tensor([0.05, 0.05], dtype=DOUBLE))
+
+
+@pytest.mark.parametrize(("apart", "error"), [(0.5, 1e-14), (10, 1e-14), (1e12, 1e-14), (1e40, 1e-12)])
+def test_carlsons_integral_of_two_equal_arguments(apart, error):
+    """R_D(x, x, z) in closed form (DLMF 19.20.20, 19.2.18), with z = 1 + apart in units of x.
+
+    To some roundings; at 1e40 the first two terms of the series are 2.5e-8 and 2.2e-11, those left out 3.2e-13.
+    """
+    x = torch.tensor(0.7, dtype=DOUBLE)
+    found = float(carlson_rd(x, x, x * (1 + apart))) * 0.7**1.5
+    root = math.sqrt(apart)
+    expected = 3 * (math.asinh(root) / root - 1 / math.sqrt(1 + apart)) / apart
+    assert found == pytest.approx(expected, rel=error, abs=0)

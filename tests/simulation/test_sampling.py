@@ -1,0 +1,74 @@
+"""Groups of samples."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.simulation.sampling import Samples, grouped
+
+DOUBLE = torch.float64
+FRAME = SimFrame(torch.zeros(3, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 0.5)
+
+
+def _pairs():
+    """Eight samples in one cell, on one sheet, two by two at the same place."""
+    place = torch.tensor([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]], dtype=DOUBLE)
+    each = {name: torch.ones(8, dtype=DOUBLE) for name in ("body_area", "area", "volume", "E", "density", "thickness")}
+    return Samples(
+        position=place.repeat_interleave(2, 0),
+        normal=torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE).repeat(8, 1),
+        nu=torch.full((8,), 0.3, dtype=DOUBLE),
+        law_index=torch.zeros(8, dtype=torch.long),
+        surface=torch.ones(8, dtype=torch.bool),
+        **each,
+    )
+
+
+def test_like_samples_of_a_cell_are_one_group():
+    points, owner, _ = grouped(_pairs(), 1.0, 1, [], FRAME, DOUBLE)
+    assert owner.tolist() == [0] * 8
+    assert points.mass.tolist() == [8.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("E", 2.0),
+        ("nu", 0.4),
+        ("density", 2.0),
+        ("thickness", 2.0),
+        ("law_index", 1),
+        ("surface", False),
+        ("area", 0.0),
+    ],
+)
+def test_a_group_never_mixes_what_differs(name, value):
+    samples = _pairs()
+    odd = torch.arange(8) % 2 == 1
+    samples = dataclasses.replace(samples, **{name: getattr(samples, name).masked_fill(odd, value)})
+    points, owner, _ = grouped(samples, 1.0, 1, [], FRAME, DOUBLE)
+    assert len(points.mass) == 2
+    for point in (0, 1):
+        own = getattr(samples, name)[owner == point]
+        assert bool((own == own[0]).all())
+        assert len(own) == 4
+
+
+def test_areas_that_differ_share_a_group_if_all_feel_the_wind():
+    samples = dataclasses.replace(_pairs(), area=torch.linspace(0.1, 3.0, 8, dtype=DOUBLE))
+    points, owner, _ = grouped(samples, 1.0, 1, [], FRAME, DOUBLE)
+    assert owner.tolist() == [0] * 8
+    assert float(points.area) == pytest.approx(8 * 1.55)
+
+
+def test_a_group_ends_at_the_border_of_a_region():
+    """The frame has half a metre per unit: x = 1 m is 2 units."""
+    samples = _pairs()
+    pinned = Box([None] * 3, [2.0, None, None])
+    _, owner, _ = grouped(samples, 1.0, 1, [pinned], FRAME, DOUBLE)
+    left = samples.position[:, 0] < 1
+    assert len(owner.unique()) == 2
+    assert len(owner[left].unique()) == len(owner[~left].unique()) == 1
