@@ -296,4 +296,7 @@ class Stepping(nn.Module):
         """The state some substeps later, and the largest Courant number on the way."""
         progress = self.progress
         watch = None if progress is None else lambda done: progress.substep(done, steps)
-        return self.solver.watched_rollout(state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch)
+        # the end of a frame is checked with its measurements, as each check makes the host wait
+        return self.solver.watched_rollout(
+            state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch, check=False
+        )
