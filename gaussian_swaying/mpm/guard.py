@@ -16,6 +16,7 @@ from gaussian_swaying._checks import check_like, check_positive, check_shape
 from gaussian_swaying.mpm.forces import Force, split
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.mpm.timestep import check_pace
 
 
 def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int) -> int:
@@ -32,8 +33,8 @@ def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int) -> i
 
     Raises:
         TypeError: If the state is not an MPMState, ``dt`` is not a number or ``steps`` not a whole one.
-        ValueError: If ``dt`` is not positive, or so long that nothing is stable or an obstacle passes through the
-            material; if ``steps`` is negative; if the state is not of this body.
+        ValueError: If ``dt`` is not positive, or so long that nothing is stable; if ``steps`` is negative; if the state
+            is not of this body.
     """
     check_state(bound, state)
     if isinstance(dt, bool) or not isinstance(dt, Real):
@@ -120,9 +121,11 @@ def check_end(
         drag: Its resistance [kg/s], shape (..., P), or None.
 
     Raises:
-        ValueError: If a value that was given is NaN or infinite, or a particle left the grid.
+        ValueError: If a value that was given is NaN or infinite, a particle left the grid, or an obstacle jumped over
+            nodes.
         FloatingPointError: If a particle became NaN or infinite.
     """
+    check_pace(dt, bound.obstacle_cells(before, steps * dt), "dt")
     fields = {"position": after.position, "velocity": after.velocity, "deformation": after.F_elastic.flatten(-2)}
     sound = torch.stack([*(torch.isfinite(field).all() for field in fields.values()), ~after.lost.any()])
     if bool(sound.all()):

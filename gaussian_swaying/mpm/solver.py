@@ -23,7 +23,7 @@ from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
 from gaussian_swaying.mpm.recompute import rollout
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.mpm.timestep import fixed_substeps, look_marks, substeps_per_frame, work_done
+from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.triton.fused import Adjoint, Fused
@@ -282,17 +282,21 @@ class MPMSolver(nn.Module):
     def substeps(self, state: MPMState, frame_dt: float, cells: float | None = None) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
 
+        In ``updated``, obstacles count as moving material does, so that they meet every node on their way.
+
         Args:
             state: The state now.
             frame_dt: Length of the frame [s].
             cells: What :meth:`cells_per_second` says, if it is known; then the host need not wait.
 
         Raises:
-            ValueError: If the fixed substep is longer than the stable one; the message gives the limit.
+            ValueError: If the fixed substep is longer than the stable one, or takes an obstacle over nodes.
         """
+        driven = self.bound.obstacle_cells(state, frame_dt)
         if self.substep is not None:
+            check_pace(self.substep, driven, "solver.substep")
             return fixed_substeps(frame_dt, self.substep, self.stable_substep(state), self.dx)
-        longest = self.cfl / max(float(self.cells_per_second(state)) if cells is None else cells, 1e-30)
+        longest = self.cfl / max(float(self.cells_per_second(state)) if cells is None else cells, driven, 1e-30)
         return substeps_per_frame(frame_dt, damped_substep(longest, self.bound.viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:

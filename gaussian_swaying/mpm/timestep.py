@@ -135,6 +135,15 @@ def fixed_substeps(frame_dt: float, substep: float, limit: float, dx: float) -> 
     return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
 
 
+def check_pace(dt: float, cells: float, name: str) -> None:
+    """Raise ValueError if an obstacle that crosses so many cells per second jumps over nodes in ``dt`` [s]."""
+    if dt * cells > 1:
+        raise ValueError(
+            f"An obstacle moves by {dt * cells:.3g} cells in a substep of {dt:g} s, so it would pass through the "
+            f"material: lower `{name}` to at most {1 / cells:.3g} s."
+        )
+
+
 def kick_time(state: MPMState, dt: float) -> float:
     """How long forces act in a substep of ``dt`` [s] that starts at a state; see ``MPMSolver.step``."""
     return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt

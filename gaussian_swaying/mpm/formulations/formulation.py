@@ -17,6 +17,7 @@ from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
@@ -279,6 +280,22 @@ class Formulation(ABC):
         body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
         speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
         return cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach()
+
+    def obstacle_cells(self, state: MPMState, seconds: float) -> float:
+        """How many cells the fastest obstacle that acts on nodes crosses per second, in some seconds from a state on.
+
+        Such an obstacle stops the nodes that it meets, and would jump over those between two substeps. The host waits
+        if there is one that moves.
+        """
+        pairs = zip(self.body.boundaries, self.kinds, strict=True)
+        moving = [b for b, kind in pairs if kind == "nodes" and isinstance(b, Obstacle) and not b.still]
+        if not moving:
+            return 0.0
+        time = float(state.time)
+        place = state.position.detach()
+        away = [float((place - b.pose(state.time)[0].to(place)).norm(dim=-1).amax()) for b in moving]
+        speeds = [b.fastest(far, time, time + seconds) for b, far in zip(moving, away, strict=True)]
+        return max(speeds) / self.settings.dx
 
     def viscous_time(self, state: MPMState | None) -> float:
         """The stiffness damping [s], times the factor by which stretch stiffens the viscous stress."""
