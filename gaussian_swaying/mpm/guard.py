@@ -137,8 +137,12 @@ def check_end(
             f"nothing acts on it: call `solver.fit_grid(state, {steps * dt:g})` before the rollout, with a `margin` of "
             "some cells if the wind or a boundary drives the material."
         )
-    given = [("position of particle", before.position), ("velocity of particle", before.velocity)]
-    given += [("displacement of node", before.node_displacement), ("velocity of node", before.node_velocity)]
+    given: list[tuple[str, Tensor | None]] = [("position of particle", before.position)]
+    given += [
+        ("velocity of particle", before.velocity),
+        ("displacement of node", before.node_displacement),
+        ("velocity of node", before.node_velocity),
+    ]
     given += [("`force` on particle", force), ("`drag` of particle", drag), *_loads(forces, before, dt, steps)]
     for name, value in given:
         if value is not None and not bool(torch.isfinite(value).all()):

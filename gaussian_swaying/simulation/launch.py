@@ -54,7 +54,7 @@ class Launched:
         if self._error is not None:
             raise self._error
         simulation, solver, margin = self._simulation, self._simulation.solver, 0
-        with self._explained():
+        with simulation.turn, self._explained():
             for retry in range(MAX_RETRIES + 1):
                 cfl, outrun = self._measurement.cfl, self._measurement.outran
                 too_long = solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * solver.cfl)
