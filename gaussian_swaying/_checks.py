@@ -78,3 +78,25 @@ def check_finite(name: str, tensor: Tensor) -> None:
     if VALUE_CHECKS and not bool(torch.isfinite(tensor).all()):
         count = int((~torch.isfinite(tensor)).sum())
         raise ValueError(f"Expected `{name}` to be finite, but {count} of its values are NaN or infinite.")
+
+
+def check_like(name: str, tensor: Tensor, like: Tensor) -> None:
+    """Check that a tensor has the precision and lies on the device of the material.
+
+    Args:
+        name: Name of the argument, for the message.
+        tensor: Tensor to check.
+        like: A tensor of the material.
+
+    Raises:
+        TypeError: If its dtype is another one.
+        ValueError: If it lies on another device.
+    """
+    if tensor.dtype != like.dtype:
+        found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, like.dtype))
+        raise TypeError(f"Expected `{name}` in {wanted}, as the material is, but got {found}: convert it with `.to`.")
+    if tensor.device != like.device:
+        raise ValueError(
+            f"Expected `{name}` on {like.device}, where the material is, but it is on {tensor.device}: move it with "
+            "`.to`."
+        )

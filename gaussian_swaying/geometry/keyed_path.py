@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -71,11 +72,13 @@ def _vectors(keys: Sequence[Sequence[float]], count: int) -> Tensor:
     return torch.tensor(keys, dtype=torch.float64) if keys else torch.zeros(count, 3, dtype=torch.float64)
 
 
-def fastest(times: Tensor, values: Tensor) -> float:
-    """Largest rate of values (K, 3) between keys."""
+def fastest(times: Tensor, values: Tensor, start: float = -math.inf, end: float = math.inf) -> float:
+    """Largest rate of values (K, 3) between keys, of those intervals that reach into the time from start to end [s]."""
     if len(times) < 2:
         return 0.0
-    return float((values.diff(dim=0).norm(dim=-1) / times.diff()).amax())
+    meets = (times[1:] > start) & (times[:-1] < end)
+    rate = values.diff(dim=0).norm(dim=-1) / times.diff()
+    return float(torch.where(meets, rate, 0.0).amax())
 
 
 def between(times: Tensor, values: Tensor, time: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_shape
+from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying._graphs import Recordable, tensors_in
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.state import MPMState
@@ -178,16 +178,23 @@ def split(found: Given, force: Force, state: MPMState) -> tuple[Tensor, Tensor |
     """Split the result of a force into the force and its resistance or None, in the dtype of the state.
 
     Raises:
-        TypeError: If it returned no tensor.
-        ValueError: If its shape is wrong.
+        TypeError: If it returned no tensor, or one of complex numbers.
+        ValueError: If its shape or its device is wrong.
     """
     value, drag = found if isinstance(found, tuple) else (found, None)
-    name, particles = type(force).__name__, state.position.shape[-2]
-    check_shape(f"force of {name}", value, particles, 3)
+    name, like = type(force).__name__, state.position
+    check_shape(f"force of {name}", value, like.shape[-2], 3)
     if drag is not None:
-        check_shape(f"resistance of {name}", drag, particles)
-        drag = drag.to(state.position.dtype)
-    return value.to(state.position.dtype), drag
+        check_shape(f"resistance of {name}", drag, like.shape[-2])
+        drag = _converted(f"resistance of {name}", drag, like)
+    return _converted(f"force of {name}", value, like), drag
+
+
+def _converted(name: str, value: Tensor, like: Tensor) -> Tensor:
+    """Real numbers in the dtype of the state."""
+    value = value if value.is_complex() else value.to(like.dtype)
+    check_like(name, value, like)
+    return value
 
 
 def added(parts: Sequence[tuple[Tensor | None, Tensor | None]]) -> tuple[Tensor | None, Tensor | None]:

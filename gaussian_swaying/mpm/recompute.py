@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -28,6 +29,41 @@ def leaves_of(state: MPMState) -> list[Tensor]:
                 seen.add(following)
                 pending.append(following)
     return found
+
+
+def rollout(
+    substep: Callable[[MPMState, int], MPMState],
+    state: MPMState,
+    steps: int,
+    checkpoint: int,
+    watch: Callable[[int], None] | None,
+) -> MPMState:
+    """Several substeps; ``checkpoint`` and ``watch`` as in ``MPMSolver.rollout``.
+
+    Args:
+        substep: Advances a state by one substep; called with the state and the number of the substep.
+        state: Where to start.
+        steps: Number of substeps.
+        checkpoint: How many states apart are kept for the backward pass; 0 for all.
+        watch: Called after each substep.
+
+    Returns:
+        The state at the end.
+    """
+
+    def advance(state: MPMState, first: int, count: int) -> MPMState:
+        for k in range(first, first + count):
+            state = substep(state, k)
+            if watch is not None and checkpoint <= 0:
+                watch(k + 1)
+        return state
+
+    if checkpoint <= 0 or not torch.is_grad_enabled():
+        return advance(state, 0, steps)
+    for first in range(0, steps, checkpoint):
+        count = min(checkpoint, steps - first)
+        state = recompute(partial(advance, first=first, count=count), state)
+    return state
 
 
 def recompute(advance: Advance, state: MPMState) -> MPMState:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_shape, check_vector
+from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.body import Body
 from gaussian_swaying.mpm.boundaries.boundary import Boundary
@@ -21,9 +20,10 @@ from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.forces import Force, Forces, added, as_forces, divide, split, tensors_of
 from gaussian_swaying.mpm.formulations import FORMULATIONS
 from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings
-from gaussian_swaying.mpm.recompute import recompute
+from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
+from gaussian_swaying.mpm.recompute import rollout
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.mpm.timestep import look_marks, substeps_per_frame, work_done
+from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.triton.fused import Adjoint, Fused
@@ -89,23 +89,12 @@ class MPMSolver(nn.Module):
     ) -> None:
         super().__init__()
         check_choice("transfer", transfer, TRANSFERS)
-        check_positive("dx", dx)
         check_choice("formulation", formulation, tuple(FORMULATIONS))
-        check_positive("damping", damping, allow_zero=True)
-        check_positive("stiffness_damping", stiffness_damping, allow_zero=True)
         check_positive("cfl", cfl)
         if substep is not None:
             check_positive("substep", substep)
-        check_positive("max_nodes", max_nodes)
-        self.settings = Settings(
-            dx=float(dx),
-            gravity=check_vector("gravity", gravity),
-            damping=float(damping),
-            stiffness_damping=float(stiffness_damping),
-            max_nodes=int(max_nodes),
-            mls=mls,
-            deterministic=deterministic,
-        )
+        gravity = check_vector("gravity", gravity)
+        self.settings = Settings(dx, gravity, damping, stiffness_damping, max_nodes, mls, deterministic)
         self.formulation, self.cfl, self.substep, self.transfer = formulation, float(cfl), substep, transfer
         FORMULATIONS[formulation].check_settings(self.settings)
         self.boundaries = nn.ModuleList(boundaries)
@@ -269,19 +258,19 @@ class MPMSolver(nn.Module):
             The state, with the device and dtype of ``points``.
 
         Raises:
-            TypeError: If ``points`` is not a MaterialPoints.
-            ValueError: If a pin holds nothing, the grid is too large, ``velocity`` has the wrong shape, or a plastic
-                law or a fluid is used with the ``total`` formulation.
+            TypeError: If ``points`` is not a MaterialPoints, or ``velocity`` has another dtype.
+            ValueError: If there are no points, a pin holds nothing, the grid is too large, ``velocity`` has the wrong
+                shape or is not finite, or a plastic law or a fluid is used with the ``total`` formulation.
         """
         if not isinstance(points, MaterialPoints):
             raise TypeError(f"Expected `points` to be a MaterialPoints, but got {type(points).__name__}.")
+        if velocity is None:
+            velocity = torch.zeros_like(points.position)
+        check_rest(points, velocity)
         self._framed = None if frame is None else tuple(b.in_frame(frame) for b in self._conditions())
         self._bound = None
         self.to(points.position.device)  # the solver moves to the device of its material
         self._bind(points, surface)
-        if velocity is None:
-            velocity = torch.zeros_like(points.position)
-        check_shape("velocity", velocity, points.count, 3)
         return self.bound.first_state(velocity.expand_as(points.position), margin)
 
     # ---- time
@@ -293,24 +282,21 @@ class MPMSolver(nn.Module):
     def substeps(self, state: MPMState, frame_dt: float, cells: float | None = None) -> int:
         """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
 
+        In ``updated``, obstacles count as moving material does, so that they meet every node on their way.
+
         Args:
             state: The state now.
             frame_dt: Length of the frame [s].
             cells: What :meth:`cells_per_second` says, if it is known; then the host need not wait.
 
         Raises:
-            ValueError: If the fixed substep is longer than the stable one; the message gives the limit.
+            ValueError: If the fixed substep is longer than the stable one, or takes an obstacle over nodes.
         """
+        driven = self.bound.obstacle_cells(state, frame_dt)
         if self.substep is not None:
-            limit = self.stable_substep(state)
-            if self.substep > limit * (1 + 1e-6):
-                raise ValueError(
-                    f"The fixed `substep` of {self.substep:g} s is longer than the stable one of {limit:.4g} s (at dx "
-                    f"= {self.dx:g} m and this material): lower it, or set it to null for the adaptive substep."
-                )
-            steps = substeps_per_frame(frame_dt, self.substep, exact=True)
-            return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
-        longest = self.cfl / max(float(self.cells_per_second(state)) if cells is None else cells, 1e-30)
+            check_pace(self.substep, driven, "solver.substep")
+            return fixed_substeps(frame_dt, self.substep, self.stable_substep(state), self.dx)
+        longest = self.cfl / max(float(self.cells_per_second(state)) if cells is None else cells, driven, 1e-30)
         return substeps_per_frame(frame_dt, damped_substep(longest, self.bound.viscous_time(state)), exact=False)
 
     def cfl_number(self, state: MPMState, dt: float) -> Tensor:
@@ -372,17 +358,22 @@ class MPMSolver(nn.Module):
 
         Returns:
             The state ``dt`` later.
+
+        Raises:
+            TypeError: As in :meth:`rollout`.
+            ValueError: As in :meth:`rollout`; on a GPU, the next rollout finds what is wrong with the new state.
         """
-        if force is not None:
-            check_shape("force", force, self.points.count, 3)
-        if drag is not None:
-            check_shape("drag", drag, self.points.count)
+        check_begin(self.bound, state, dt, 1)
+        check_load(self.bound, force, drag)
         acting = as_forces(forces)
+        waits = not state.position.is_cuda
         if force is None and drag is None:
-            return self.rollout(state, dt, 1, acting)
+            return self.rollout(state, dt, 1, acting, check=waits)
         found = [split(part(state), part, state) for part in acting]
-        force, drag = added([(force, drag), *found])
-        return self._step(state, dt, force, drag)
+        end = self._step(state, dt, *added([(force, drag), *found]))
+        if waits:
+            check_end(self.bound, state, end, dt, 1, acting, force, drag)
+        return end
 
     def _step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
         """One substep with a given force and drag."""
@@ -400,6 +391,7 @@ class MPMSolver(nn.Module):
         forces: Forces | None = None,
         checkpoint: int = 0,
         watch: WatchFunction | None = None,
+        check: bool = True,
     ) -> MPMState:
         """Advance by several substeps.
 
@@ -420,11 +412,34 @@ class MPMSolver(nn.Module):
                 each time they are called with the same state.
             watch: Called from time to time with the number of substeps that are done, or queued on a GPU; not with
                 ``checkpoint``.
+            check: Whether to check the state at the end (one GPU synchronisation). Without, ``state.lost`` says what
+                left the grid, and what diverged is NaN.
 
         Returns:
             The state ``steps * dt`` later.
+
+        Raises:
+            TypeError: If the state is not an MPMState, ``dt`` is not a number or ``steps`` not a whole one.
+            ValueError: If ``dt`` or ``steps`` is out of range, if the state is not of this solver, if a value that was
+                given is NaN or infinite, or if a particle left the grid of ``updated``; see :meth:`fit_grid`.
+            FloatingPointError: If a particle became NaN or infinite.
         """
-        acting = as_forces(forces)
+        acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps)
+        end = self._rollout(state, dt, steps, acting, checkpoint, watch)
+        if check:
+            check_end(self.bound, state, end, dt, steps, acting)
+        return end
+
+    def _rollout(
+        self,
+        state: MPMState,
+        dt: float,
+        steps: int,
+        acting: Sequence[Force],
+        checkpoint: int = 0,
+        watch: WatchFunction | None = None,
+    ) -> MPMState:
+        """As :meth:`rollout`, without checks."""
         adjoint = self._adjoint_for(state, acting)
         if adjoint is not None:
             return adjoint.rollout(state, dt, steps, acting, checkpoint, watch)
@@ -433,23 +448,11 @@ class MPMSolver(nn.Module):
             return fused.rollout(state, dt, steps, acting, watch=watch)[0]
         sources = [force.during(state.time, dt, steps) for force in acting]
 
-        def force_at(state: MPMState, k: int) -> tuple[Tensor | None, Tensor | None]:
+        def substep(state: MPMState, k: int) -> MPMState:
             pairs = zip(sources, acting, strict=True)
-            return added([split(source(state, k), force, state) for source, force in pairs])
+            return self._step(state, dt, *added([split(source(state, k), force, state) for source, force in pairs]))
 
-        def advance(state: MPMState, first: int, count: int) -> MPMState:
-            for k in range(first, first + count):
-                state = self._step(state, dt, *force_at(state, k))
-                if watch is not None and checkpoint <= 0:
-                    watch(k + 1)
-            return state
-
-        if checkpoint <= 0 or not torch.is_grad_enabled():
-            return advance(state, 0, steps)
-        for first in range(0, steps, checkpoint):
-            count = min(checkpoint, steps - first)
-            state = recompute(partial(advance, first=first, count=count), state)
-        return state
+        return rollout(substep, state, steps, checkpoint, watch)
 
     def watched_rollout(
         self,
@@ -459,6 +462,7 @@ class MPMSolver(nn.Module):
         forces: Forces | None = None,
         looks: int = 8,
         watch: WatchFunction | None = None,
+        check: bool = True,
     ) -> tuple[MPMState, Tensor]:
         """Advance by several substeps and check the Courant number on the way, as material may stiffen or soften.
 
@@ -469,22 +473,25 @@ class MPMSolver(nn.Module):
             forces: As in :meth:`rollout`.
             looks: Number of checks, about evenly spaced, the last one at the end; fewer in short rollouts.
             watch: As in :meth:`rollout`.
+            check: As in :meth:`rollout`, which names the errors.
 
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
         """
-        marks, acting = look_marks(steps, looks), as_forces(forces)
-        if self.stiffness_damping == 0:
-            fused = self._fused_for(state, acting)
-            if fused is not None and fused.watches:
-                state, cells = fused.rollout(state, dt, steps, acting, looks=marks, watch=watch)
-                return state, dt * cells
-        seen = []
-        for first, last in pairwise([0, *marks]):
-            part = None if watch is None else lambda done, before=first: watch(before + done)
-            state = self.rollout(state, dt, last - first, acting, watch=part)
-            seen.append(self.cfl_number(state, dt))
-        return state, torch.stack(seen).amax()
+        acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps)
+        marks, end, seen = look_marks(steps, looks), state, []
+        fused = self._fused_for(state, acting) if self.stiffness_damping == 0 else None
+        if fused is not None and fused.watches:
+            end, cells = fused.rollout(state, dt, steps, acting, looks=marks, watch=watch)
+            seen.append(dt * cells)
+        else:
+            for first, last in pairwise([0, *marks]):
+                part = None if watch is None else lambda done, before=first: watch(before + done)
+                end = self._rollout(end, dt, last - first, acting, watch=part)
+                seen.append(self.cfl_number(end, dt))
+        if check:
+            check_end(self.bound, state, end, dt, steps, acting)
+        return end, torch.stack(seen).amax()
 
     def energies(self, state: MPMState) -> dict[str, Tensor]:
         """Kinetic, elastic and gravitational energy [J], each of shape (...) over the batch."""

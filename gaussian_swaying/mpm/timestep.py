@@ -17,6 +17,13 @@ from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.laws.shared import lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 
+MAX_CFL = 2.0
+"""Courant number above which waves cross more than two cells in a substep and nothing is stable.
+
+Inside a body with evenly spread points, a wave along an axis is unstable from 1.63 on, as the largest frequency of the
+splines with lumped masses is sqrt(3/2) c / dx.
+"""
+
 
 def wave_speed(
     points: MaterialPoints,
@@ -105,6 +112,36 @@ def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
             "material, raise its density or the grid spacing `dx`, or shorten the frame."
         )
     return max(1, round(ratio) if exact else math.ceil(ratio - 1e-6))
+
+
+def fixed_substeps(frame_dt: float, substep: float, limit: float, dx: float) -> int:
+    """Number of equal substeps in a frame for a fixed substep.
+
+    Args:
+        frame_dt: Length of a frame [s].
+        substep: The fixed substep [s].
+        limit: The stable one [s].
+        dx: Grid spacing [m], for the message.
+
+    Raises:
+        ValueError: If it is longer than the stable one; the message gives the limit.
+    """
+    if substep > limit * (1 + 1e-6):
+        raise ValueError(
+            f"The fixed `substep` of {substep:g} s is longer than the stable one of {limit:.4g} s (at dx "
+            f"= {dx:g} m and this material): lower it, or set it to null for the adaptive substep."
+        )
+    steps = substeps_per_frame(frame_dt, substep, exact=True)
+    return steps if frame_dt / steps <= limit * (1 + 1e-6) else steps + 1
+
+
+def check_pace(dt: float, cells: float, name: str) -> None:
+    """Raise ValueError if an obstacle that crosses so many cells per second jumps over nodes in ``dt`` [s]."""
+    if dt * cells > 1:
+        raise ValueError(
+            f"An obstacle moves by {dt * cells:.3g} cells in a substep of {dt:g} s, so it would pass through the "
+            f"material: lower `{name}` to at most {1 / cells:.3g} s."
+        )
 
 
 def kick_time(state: MPMState, dt: float) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import pickle
 import re
 from pathlib import Path
 from typing import Any
@@ -58,3 +59,21 @@ def check_seal(path: Path) -> None:
         raise ValueError("it has no checksum at its end, so it is incomplete or was not written by this package")
     if sha256(path, size).encode() != found[1]:
         raise ValueError("its checksum does not match its content, so it is damaged")
+
+
+def load_sealed(path: Path, map_location: Any = "cpu") -> Any:
+    """Read what :func:`save_sealed` wrote; no code in the file is executed.
+
+    Args:
+        path: The file.
+        map_location: Device of its tensors, as for ``torch.load``.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: As in :func:`check_seal`, and if the file holds anything but tensors, numbers and text.
+    """
+    check_seal(path)
+    try:
+        return torch.load(path, map_location=map_location, weights_only=True)
+    except pickle.UnpicklingError:  # PyTorch's own message says how to execute what is in the file
+        raise ValueError("it holds more than tensors, numbers and text, which is never loaded") from None

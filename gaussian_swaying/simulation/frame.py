@@ -41,12 +41,13 @@ class Frame:
     def gaussians(self) -> DeformedGaussians:
         """All Gaussians in scene units: means, covariances, normals, and colours as the camera sees them."""
         painter = self.simulation.painter
-        if self.simulation.editor.version != self._version:
-            raise RuntimeError(
-                f"An edit has changed the colours since frame {self.index}: read `gaussians` or `render()` of a frame "
-                "before the next one."
-            )
-        return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
+        with self.simulation.turn:
+            if self.simulation.editor.version != self._version:
+                raise RuntimeError(
+                    f"An edit has changed the colours since frame {self.index}: read `gaussians` or `render()` of a "
+                    "frame before the next one."
+                )
+            return painter.shade(painter.deformed(self.state), painter.camera_at(self.index))
 
     def render(self, camera: str = "") -> RenderOutput:
         """Render the frame.

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying._graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.timestep import MAX_CFL
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, Measurement
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 MAX_RETRIES = 4
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
-MAX_CFL = 2.0  # above it, waves cross more than two cells in a substep and nothing is stable
 
 
 class Launched:
@@ -54,7 +54,7 @@ class Launched:
         if self._error is not None:
             raise self._error
         simulation, solver, margin = self._simulation, self._simulation.solver, 0
-        with self._explained():
+        with simulation.turn, self._explained():
             for retry in range(MAX_RETRIES + 1):
                 cfl, outrun = self._measurement.cfl, self._measurement.outran
                 too_long = solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * solver.cfl)

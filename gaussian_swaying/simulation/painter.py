@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._graphs import RECORDED, Replayed, fingerprint
+from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import rotate_sh
 from gaussian_swaying.gaussians.model import DeformedGaussians
@@ -64,6 +65,8 @@ class Painter(nn.Module):
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
         self.background: Tensor
         self._renderer = renderer
+        self.turn = Turn()
+        """Held while a simulation is stepped or drawn, by one thread at a time."""
         self._moved, self._coloured = Replayed(), Replayed()
         self._still: dict[str, tuple[tuple[object, ...], Camera]] = {}  # cameras of the last frame that do not move
 
@@ -83,6 +86,7 @@ class Painter(nn.Module):
     def renderer(self, renderer: Renderer) -> None:
         self._renderer = renderer
 
+    @in_turn
     def camera_at(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, on the device and in the precision of the Gaussians; one copy, without waiting for it.
 
@@ -129,6 +133,7 @@ class Painter(nn.Module):
                     f"units): move it out with `{field}.init_args.radius` or `eye`."
                 )
 
+    @in_turn
     def deformed(self, state: MPMState) -> DeformedGaussians:
         """The Gaussians of a state, in scene units, with the rotations that their colours need."""
         scene, turned = self.scene, self.scene.model.view_dependent
@@ -144,6 +149,7 @@ class Painter(nn.Module):
         means, covariances, normals = found[:3]
         return DeformedGaussians(means, covariances, normals, found[3] if turned else scene.rest().rotations)
 
+    @in_turn
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
         """Shaded colours, shape (N, 3): harmonics evaluated in the rest frame of each patch, times the shading."""
         means, shader = gaussians.means, self.shader
@@ -173,11 +179,13 @@ class Painter(nn.Module):
         """The same Gaussians with their colours as a camera sees them."""
         return replace(gaussians, colors=self.colors(gaussians, camera))
 
+    @in_turn
     def draw(self, gaussians: DeformedGaussians, colours: Tensor, camera: Camera) -> RenderOutput:
         """Draw Gaussians in scene units."""
         opacity = self.scene.model.opacity()
         return self.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera, self.background)
 
+    @in_turn
     def render(self, state: MPMState, frame: int, name: str = "") -> RenderOutput:
         """The picture of a state from the camera of a frame.
 

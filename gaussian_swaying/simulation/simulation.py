@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._turns import in_turn
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.patches import deform_patch
@@ -64,7 +65,8 @@ if TYPE_CHECKING:
 class Simulation(Stepping):
     """A splat in the wind. The constructor is the schema of the YAML; every component also works on its own.
 
-    Positions and regions are given in scene units and axes; velocities, gravity and light in metres, z up.
+    Positions and regions are given in scene units and axes; velocities, gravity and light in metres, z up. Threads that
+    share a simulation take turns.
 
     Args:
         scene: Where the Gaussians come from and which of them move. In Python also a file, Gaussians or a scene made in
@@ -246,6 +248,7 @@ class Simulation(Stepping):
 
     # ---- frames
 
+    @in_turn
     def frames(self, count: int) -> Iterator[Frame]:
         """Simulate from rest, frame by frame. Timed edits act between frames, as in :meth:`run`.
 
@@ -255,8 +258,8 @@ class Simulation(Stepping):
             count: Number of frames, the first at rest.
 
         Returns:
-            The frames. Read a frame before the next one: an edit changes the scene for all of them. One loop at a time:
-            starting again ends the loop before.
+            The frames. Read a frame before the next one: an edit changes the scene for all of them. One loop at a time,
+            in whatever thread: starting again ends the loop before.
 
         Raises:
             SimulationDiverged: If the simulation diverges.
@@ -278,28 +281,34 @@ class Simulation(Stepping):
                 time, so that the GPU does not wait for the host, and what is assigned between two frames applies from
                 the next but one on.
         """
-        started = self._started
+        return self._loop(self._started, state, first, count, drawn)
+
+    def _loop(
+        self, started: int, state: MPMState, first: int, count: int, drawn: torch.cuda.Stream | None
+    ) -> Iterator[Frame]:
         launched: Launched | None = None
         for index in range(first, count):
-            if self._started != started:
-                raise RuntimeError(
-                    "This simulation was started again, so the earlier loop over its frames cannot go on: finish one "
-                    "loop before the next, or make a Simulation for each."
-                )
-            if index == 0:
-                health = diagnose(self.solver, state, 0, 0.0)
-            else:
-                if launched is None:
-                    self._begin(index)
-                state, health = self.advance(state) if launched is None else launched.finish()
-                if drawn is not None:  # the frame before may still be drawn from memory that is now free
-                    torch.cuda.current_stream(self.device).wait_stream(drawn)
-                state = self.edit_due(state)
-            if drawn is not None and index + 1 < count:
-                drawn.wait_stream(torch.cuda.current_stream(self.device))
-                self._begin(index + 1)
-                launched = self.launch(state)
-            yield Frame(self, index, state, health, self.editor.version)
+            with self.turn:
+                if self._started != started:
+                    raise RuntimeError(
+                        "This simulation was started again, so the earlier loop over its frames cannot go on: finish "
+                        "one loop before the next, or make a Simulation for each."
+                    )
+                if index == 0:
+                    health = diagnose(self.solver, state, 0, 0.0)
+                else:
+                    if launched is None:
+                        self._begin(index)
+                    state, health = self.advance(state) if launched is None else launched.finish()
+                    if drawn is not None:  # the frame before may still be drawn from memory that is now free
+                        torch.cuda.current_stream(self.device).wait_stream(drawn)
+                    state = self.edit_due(state)
+                if drawn is not None and index + 1 < count:
+                    drawn.wait_stream(torch.cuda.current_stream(self.device))
+                    self._begin(index + 1)
+                    launched = self.launch(state)
+                frame = Frame(self, index, state, health, self.editor.version)
+            yield frame
 
     def _begin(self, index: int) -> None:
         if self.progress is not None:
@@ -307,6 +316,7 @@ class Simulation(Stepping):
 
     # ---- what is measured
 
+    @in_turn
     def wind_pressure(self, state: MPMState) -> Tensor:
         """Force of the wind per area of the Gaussians as they are now [Pa], shape (N,); 0 for those without wind."""
         scene = self.scene
@@ -334,6 +344,7 @@ class Simulation(Stepping):
 
     # ---- the run
 
+    @in_turn
     def run(
         self,
         output: str | os.PathLike[str],

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._files import kind_of
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.runs.seal import check_seal, save_sealed
+from gaussian_swaying.runs.seal import load_sealed, save_sealed
 from gaussian_swaying.training.densification import PARAMETERS
 
 _FIELDS = {"densification", "kind", "scene_scale", "sh_degree", "seed", "random", "seen"}
@@ -33,8 +33,7 @@ def read_training_checkpoint(path: Path, map_location: Any = "cpu") -> dict[str,
     if kind_of(path) is None:
         raise ValueError(f"The checkpoint {path} does not exist: give another `--ckpt_path`.")
     try:
-        check_seal(path)
-        held = torch.load(path, map_location=map_location, weights_only=True)
+        held = load_sealed(path, map_location)
         if not isinstance(held, dict) or not isinstance(held.get("splat_training"), dict):
             raise ValueError("it is not a checkpoint of this package")
         missing = _FIELDS - set(held["splat_training"])

@@ -355,12 +355,13 @@ def test_what_leaves_the_grid_is_lost(kernel_device):
         return state
 
     def run(solver, state):
-        states = [solver.rollout(state, DT, 1), solver.rollout(state, DT, 4)]
+        states = [solver.rollout(state, DT, steps, check=False) for steps in (1, 4)]
         assert states[0].lost.tolist() == [False] * 19 + [True] * 3 + [False, True]
         assert states[1].lost.tolist() == [False] * 19 + [True] * 5
         assert float(states[1].velocity[-1].abs().max()) == 0.0
         assert torch.equal(states[1].position[-5:-2], state.position[-5:-2])
-        states.append(solver.rollout(states[1].replace(grid=GridSpec(DX, (-1, -6, -1), (9, 12, 9))), DT, 1))
+        roomy = states[1].replace(grid=GridSpec(DX, (-1, -6, -1), (9, 12, 9)))
+        states.append(solver.rollout(roomy, DT, 1, check=False))
         assert torch.equal(states[2].lost, states[1].lost)  # though most are back
         return states
 
@@ -1398,7 +1399,9 @@ def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, tr
     broken[5, 1] = value
     with torch.no_grad():
         for _ in range(2):
-            end = solver.rollout(start.replace(**{name: broken}), DT, steps)
+            end = solver.rollout(start.replace(**{name: broken}), DT, steps, check=False)
+    with pytest.raises((FloatingPointError, ValueError), match=r"NaN or infinite|left the grid"):
+        solver.rollout(start.replace(**{name: broken}), DT, steps)
     with pytest.raises(SimulationDiverged, match=r"particle .* (NaN or infinite|left the grid|object sizes)") as found:
         check_state(solver, end)
     if name == "position":  # it has affected no other particle

@@ -52,7 +52,7 @@ def test_limit_is_sharp_for_one_particle():
         basis = bspline_stencil(position, state.grid).basis[0]
         mode = torch.zeros_like(state.node_velocity)
         mode[bspline_stencil(position, state.grid).node] = 1e-9 * (basis[1:4] / basis[0]).T
-        end = solver.rollout(state.replace(node_velocity=mode), factor * limit, 400)
+        end = solver.rollout(state.replace(node_velocity=mode), factor * limit, 400, check=False)
         strain = float((end.F_elastic - torch.eye(3, dtype=torch.float64)).abs().max())
         assert (strain < 1e-6) == stable, (factor, strain)
 
@@ -63,7 +63,7 @@ def test_updated_is_unstable_well_above_the_limit():
     state = solver.init_state(points)
     state = state.replace(affine=1e-6 * torch.eye(3, dtype=torch.float64)[None])
     for factor, stable in ((0.98, True), (2.0, False)):
-        end = solver.rollout(state, factor * solver.stable_substep(), 400)
+        end = solver.rollout(state, factor * solver.stable_substep(), 400, check=False)
         strain = float((end.F_elastic - torch.eye(3, dtype=torch.float64)).abs().max())
         assert (strain < 1e-5) == stable, (factor, strain)
 

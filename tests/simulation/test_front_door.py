@@ -6,6 +6,7 @@ import inspect
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -382,6 +383,65 @@ def test_one_loop_at_a_time():
     list(simulation.frames(2))
     with pytest.raises(RuntimeError, match="started again"):
         next(first)
+
+
+def _in_four_threads(work):
+    """What ``work(k)`` returns or raises in four threads that begin together, and change places all the time."""
+    begin, found, before = threading.Barrier(4), [None] * 4, sys.getswitchinterval()
+
+    def one(k):
+        begin.wait()
+        try:
+            found[k] = work(k)
+        except Exception as error:
+            found[k] = error
+
+    threads = [threading.Thread(target=one, args=(k,)) for k in range(4)]
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(before)
+    return found
+
+
+def test_four_threads_that_step_a_new_simulation_take_turns():
+    """Each has a state of its own; all end where one thread alone does, to the bit."""
+
+    def march(simulation):
+        state = simulation.start()
+        for _ in range(2):
+            state, _ = simulation.advance(state)
+        return state.position, simulation.painter.render(state, 2).color
+
+    expected = march(_flag())
+    for _ in range(3):
+        simulation = _flag()
+        for position, picture in _in_four_threads(lambda _, simulation=simulation: march(simulation)):
+            assert torch.equal(position, expected[0])
+            assert torch.equal(picture, expected[1])
+
+
+def test_of_four_threads_that_loop_over_frames_one_goes_on():
+    """The others are told so: a loop that was started later ended theirs."""
+    simulation = _flag()
+    found = _in_four_threads(lambda _: [frame.render().color for frame in simulation.frames(3)][-1])
+    refused = [error for error in found if isinstance(error, RuntimeError)]
+    assert len(refused) == 3
+    assert all("was started again" in str(error) for error in refused)
+    (picture,) = (one for one in found if isinstance(one, torch.Tensor))
+    *_, last = _flag().frames(3)
+    assert torch.equal(picture, last.render().color)
+
+
+def test_four_threads_that_run_a_simulation_take_turns(tmp_path):
+    simulation = _flag(recorder=Recorder(images=False, video=False))
+    found = _in_four_threads(lambda k: simulation.run(tmp_path / str(k), 2, progress=False))
+    assert [summary["status"] for summary in found] == ["complete"] * 4
+    assert len({(tmp_path / f"{k}/diagnostics.csv").read_bytes() for k in range(4)}) == 1
 
 
 def test_a_coefficient_changed_in_place_is_felt():

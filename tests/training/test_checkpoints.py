@@ -1,6 +1,7 @@
 """Checkpoints of a training that are damaged or something else are refused in one sentence."""
 
 import random
+import traceback
 
 import pytest
 import torch
@@ -64,3 +65,11 @@ def test_something_else_with_a_right_checksum(file):
     for other in ([1], {}, {"splat_training": 3}, _held() | {"state_dict": None}):
         _refused(save(other), other)
     assert [path.name for path in file.parent.iterdir()] == ["step.ckpt"]
+
+
+def test_no_advice_to_execute_the_code_in_a_file(file):
+    """PyTorch's own message names the argument that would."""
+    SealedCheckpoints().save_checkpoint(_held() | {"hyper_parameters": random.Random(0)}, str(file))
+    with pytest.raises(ValueError, match=r"more than tensors, numbers and text, which is never loaded") as caught:
+        SealedCheckpoints().load_checkpoint(str(file))
+    assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 
 import torch
@@ -81,9 +82,13 @@ class Obstacle(Boundary):
         """Whether it never moves."""
         return self.path is None
 
-    def fastest(self, farthest: float) -> float:
-        """Bound of its speed [m/s] at places up to ``farthest`` [m] from its centre."""
-        return fastest(self.times, self.shifts) + fastest(self.times, self.turns) * farthest
+    def fastest(self, farthest: float, start: float = -math.inf, end: float = math.inf) -> float:
+        """Bound of its speed [m/s] at places up to ``farthest`` [m] from its centre, while it acts in a time [s]."""
+        start, end = max(start, self.start), min(end, self.end)
+        if not start < end:
+            return 0.0
+        turning = fastest(self.times, self.turns, start, end)
+        return fastest(self.times, self.shifts, start, end) + (turning * farthest if turning else 0.0)
 
     def pose(self, time: Tensor) -> tuple[Tensor, Tensor]:
         """Its centre [m], shape (3,), and its rotation, shape (3, 3), at a time [s]; float64."""

@@ -6,18 +6,21 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import check_positive
 from gaussian_swaying.geometry.linalg import symmetric_eigenvalues
 from gaussian_swaying.mpm.body import Body, Held
 from gaussian_swaying.mpm.boundaries.boundary import Nodes
 from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
-from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, wave_speed
+from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, scatter
 
 if TYPE_CHECKING:
@@ -35,6 +38,12 @@ class Settings:
     max_nodes: int
     mls: bool
     deterministic: bool
+
+    def __post_init__(self) -> None:
+        for name in ("dx", "damping", "stiffness_damping", "max_nodes"):
+            value = getattr(self, name)
+            check_positive(name, value, allow_zero=name.endswith("damping"))
+            object.__setattr__(self, name, int(value) if name == "max_nodes" else float(value))
 
 
 class Formulation(ABC):
@@ -266,11 +275,37 @@ class Formulation(ABC):
         limit = stable_limit(body.points, dx, F, internal, spatial=spatial, laws=body.laws)
         return damped_substep(float(limit.detach().amin()), self.viscous_time(state))
 
+    @cached_property
+    def longest_substep(self) -> float:
+        """Substep [s] above which nothing is stable, at rest (one GPU synchronisation, the first time)."""
+        body = self.body
+        identity = torch.eye(3, dtype=body.points.mass.dtype, device=body.points.mass.device)
+        F = identity.expand(*body.points.mass.shape, 3, 3)
+        speed = wave_speed(body.points, F, body.laws.initial_internal(), laws=body.laws).detach()
+        limit = MAX_CFL * self.settings.dx / max(float(speed.amax()), 1e-30)
+        return damped_substep(limit, self.settings.stiffness_damping)
+
     def cells_per_second(self, state: MPMState) -> Tensor:
         """How many cells the fastest wave crosses per second, a scalar tensor."""
         body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
         speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
         return cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach()
+
+    def obstacle_cells(self, state: MPMState, seconds: float) -> float:
+        """How many cells the fastest obstacle that acts on nodes crosses per second, in some seconds from a state on.
+
+        Such an obstacle stops the nodes that it meets, and would jump over those between two substeps. The host waits
+        if there is one that moves.
+        """
+        pairs = zip(self.body.boundaries, self.kinds, strict=True)
+        moving = [b for b, kind in pairs if kind == "nodes" and isinstance(b, Obstacle) and not b.still]
+        if not moving:
+            return 0.0
+        time = float(state.time)
+        place = state.position.detach()
+        away = [float((place - b.pose(state.time)[0].to(place)).norm(dim=-1).amax()) for b in moving]
+        speeds = [b.fastest(far, time, time + seconds) for b, far in zip(moving, away, strict=True)]
+        return max(speeds) / self.settings.dx
 
     def viscous_time(self, state: MPMState | None) -> float:
         """The stiffness damping [s], times the factor by which stretch stiffens the viscous stress."""

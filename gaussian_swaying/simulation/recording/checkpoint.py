@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.runs.seal import check_seal, save_sealed
+from gaussian_swaying.runs.seal import load_sealed, save_sealed
 from gaussian_swaying.simulation.diagnostics import entry_names
 
 _FIELDS = {"frame": int, "state": dict, "log": list, "config": str, "wall_s": dict}
@@ -57,8 +57,7 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
     if not path.exists():
         raise ValueError(f"There is nothing to resume in {path.parent}: it has no {path.name}; leave out --resume.")
     try:
-        check_seal(path)
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint = load_sealed(path)
         if not isinstance(checkpoint, dict):
             raise ValueError("it has no fields")
         for name, kind in _FIELDS.items():

@@ -137,6 +137,57 @@ def test_a_fast_sheet_does_not_pass_a_thin_rod(sheet, scene, march):
         assert float(arm.norm(dim=-1).min()) > 0.02
 
 
+def _flying_ball(sheet, speed=1e4, turns=(), **settings):
+    """A ball that crosses a free sheet within one frame of 4e-5 s, in ``updated``; it was still before."""
+    times, moves = [0.0, 1.0, 1.0 + 0.4 / speed], [[0, 0, -0.2], [0, 0, -0.2], [0, 0, 0.2]]
+    ball = BallObstacle([0.1, 0.1, 0.0], 0.18, friction=0.0, path=KeyedPath(times, moves, list(turns)))
+    points = sheet(11, 11)
+    solver = MPMSolver(dx=0.044, formulation="updated", gravity=(0, 0, 0), boundaries=[ball], **settings)
+    state = solver.init_state(points)
+    return solver, state, state.replace(time=state.time + 1.0)
+
+
+def test_a_ball_at_ten_kilometres_a_second_does_not_pass_a_sheet(sheet):
+    """The sheet flies before it; with the substep of the material, at rest, it was on the other side at once."""
+    solver, still, state = _flying_ball(sheet)
+    frame = 4e-5
+    assert solver.substeps(still, frame) == 1  # no obstacle moves yet
+    assert solver.bound.obstacle_cells(still, frame) == 0.0
+    steps = solver.substeps(state, frame)
+    assert solver.bound.obstacle_cells(state, frame) == pytest.approx(1e4 / 0.044)
+    assert steps == math.ceil(1e4 * frame / 0.044 / solver.cfl)
+    end = solver.rollout(solver.fit_grid(state, frame, margin=10), frame / steps, steps)
+    hit = (state.position - state.position.mean(0))[:, :2].norm(dim=-1) < 0.05
+    assert float(end.position[hit, 2].min()) > 0.2  # ahead of its centre
+    away = (end.position - torch.tensor([0.1, 0.1, 0.2], dtype=torch.float64)).norm(dim=-1)
+    assert float(away.min()) > 0.18 - 0.044  # outside, to a cell
+    through = solver.rollout(solver.fit_grid(state, frame, margin=10), frame, 1, check=False)
+    assert float(through.position[hit, 2].max()) < 0.1  # the ball is past them
+    assert solver.bound.obstacle_cells(end.replace(time=end.time + frame), frame) == 0.0  # its motion is over
+
+
+def test_substeps_in_which_an_obstacle_would_jump_are_refused(sheet):
+    solver, still, state = _flying_ball(sheet)
+    solver.rollout(still, 4e-5, 2)
+    for call in (lambda: solver.step(state, 4e-5), lambda: solver.rollout(state, 4e-5, 2)):
+        with pytest.raises(
+            ValueError, match=r"moves by 9.09 cells in a substep of 4e-05 s.* lower `dt` to at most 4.4e-06"
+        ):
+            call()
+    fixed, _, state = _flying_ball(sheet, substep=4e-5)
+    with pytest.raises(
+        ValueError, match=r"An obstacle moves by 9.09 cells .* lower `solver.substep` to at most 4.4e-06"
+    ):
+        fixed.substeps(state, 4e-4)
+
+
+def test_an_obstacle_that_turns_counts_at_the_farthest_place(sheet):
+    """180 degrees in 0.4 s, at the corner of the sheet, and the way of its centre."""
+    turning, _, state = _flying_ball(sheet, 1.0, [[0, 0, 0], [0, 0, 0], [0, 0, 180]])
+    far = math.hypot(0.1, 0.1, 0.2)
+    assert turning.bound.obstacle_cells(state, 0.1) == pytest.approx((1.0 + math.pi / 0.4 * far) / 0.044)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

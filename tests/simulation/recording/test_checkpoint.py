@@ -7,6 +7,7 @@ import math
 import pickle
 import random
 import shutil
+import traceback
 
 import pytest
 import torch
@@ -224,7 +225,24 @@ def test_a_checkpoint_executes_no_code(tmp_path, run):
     held = read_checkpoint(folder / "checkpoint.pt")
     held["wall_s"]["fuse"] = Fuse(tmp_path / "burnt")
     write_checkpoint(folder / "checkpoint.pt", _with_lines(held))
-    assert "cannot be read as a checkpoint" in _refused(resume, folder, "a fuse")
+    sentence = _refused(resume, folder, "a fuse")
+    assert "cannot be read as a checkpoint (it holds more than tensors, numbers and text, which is never" in sentence
+    assert not (tmp_path / "burnt").exists()
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("bare", [False, True])
+def test_no_advice_to_execute_the_code_in_a_file(tmp_path, bare):
+    """PyTorch's message names the argument that would; neither the error nor what is printed of its causes does."""
+    file, held = tmp_path / "checkpoint.pt", {"fuse": Fuse(tmp_path / "burnt")}
+    if bare:  # a pickle as it is, not in the archive of `torch.save`
+        file.write_bytes(pickle.dumps(held))
+        seal(file)
+    else:
+        write_checkpoint(file, held)
+    with pytest.raises(ValueError, match="more than tensors, numbers and text") as caught:
+        read_checkpoint(file)
+    assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))
     assert not (tmp_path / "burnt").exists()
 
 
