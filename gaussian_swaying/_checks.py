@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+MOST_FRAMES = 10_000_000
+"""Frames of a run at most: more than four days of simulated time at 25 frames per second."""
 VALUE_CHECKS = os.environ.get("GAUSSIAN_SWAYING_CHECKS", "0") == "1"
 
 
@@ -62,6 +64,14 @@ def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None
     wanted = "not be negative" if allow_zero else "be positive"
     if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")
+
+
+def check_frames(name: str, count: Any) -> int:
+    """Return a number of frames, or raise an error that names the field."""
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_FRAMES:
+        shown = f"{count:.6g}" if isinstance(count, int) and abs(count) > MOST_FRAMES else repr(count)
+        raise ValueError(f"Expected `{name}` to be a whole number from 1 to {MOST_FRAMES:,}, but got {shown}.")
+    return count
 
 
 def check_poisson_ratio(name: str, value: float) -> None:

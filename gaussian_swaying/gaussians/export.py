@@ -422,7 +422,7 @@ def _pxr(name: str) -> Any:
         return import_module(f"pxr.{name}")
     except ImportError as error:
         raise ImportError(
-            "USD files need usd-core: install gaussian-swaying[usd], or choose another format."
+            "USD files need usd-core: run pip install 'gaussian-swaying[usd]', or choose another format.", name="pxr"
         ) from error
 
 

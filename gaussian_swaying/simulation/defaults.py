@@ -132,13 +132,6 @@ def check_types(given: Mapping[str, Any]) -> None:
                 raise TypeError(f"Expected `{name}` to be a list of {_LISTS[name].__name__}, but it has {part!r}.")
 
 
-def check_count(name: str, count: Any) -> int:
-    """Return a number of frames, or raise an error that names the field."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"Expected `{name}` to be a whole number of at least 1, but got {count!r}.")
-    return count
-
-
 _KINDS: dict[str, tuple[type, ...]] = {
     "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
     "material": (Material,),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.patches import deform_patch
@@ -41,7 +41,6 @@ from gaussian_swaying.simulation.defaults import (
     as_scene,
     as_solver,
     as_wind,
-    check_count,
     check_types,
     resolve_device,
 )
@@ -258,7 +257,7 @@ class Simulation(Stepping):
             SimulationDiverged: If the simulation diverges.
             ValueError: As in :meth:`start`.
         """
-        check_count("count", count)
+        check_frames("count", count)
         return self.frames_from(self.start(), 0, count)
 
     def frames_from(
@@ -357,5 +356,5 @@ class Simulation(Stepping):
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         self.recorder = recorder or self.recorder
-        count = self.frames_wanted if frames is None else check_count("frames", frames)
+        count = self.frames_wanted if frames is None else check_frames("frames", frames)
         return run(self, Path(output), count, resume, dict(settings or {}), progress)

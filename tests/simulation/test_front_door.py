@@ -492,7 +492,7 @@ def test_an_argument_of_another_kind_is_named(given, words):
         Simulation(**({"scene": FlagScene(spacing=0.1), "device": "cpu"} | given))
 
 
-@pytest.mark.parametrize("count", [0, -1, 2.5, True])
+@pytest.mark.parametrize("count", [0, -1, 2.5, True, 10**30])
 def test_a_number_of_frames_is_checked_at_once(count):
     with pytest.raises(ValueError, match="`count`"):
         _flag().frames(count)
