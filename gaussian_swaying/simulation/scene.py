@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -393,7 +394,7 @@ class SimulatedScene(nn.Module):
         """The Gaussians at rest."""
         means = self.model.means.detach()
         eye = self.identity.expand(len(means), 3, 3)
-        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye)
+        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye, model=self.model)
 
     def deformed(self, state: MPMState, rotations: bool = True) -> DeformedGaussians:
         """The Gaussians moved by the material: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
@@ -422,14 +423,11 @@ class SimulatedScene(nn.Module):
             move, F = self.frame.displacement_to_scene(move.to(kind)), self.frame.gradient_to_scene(F.to(kind))
             moved = own[0] + move, *deform_all(F, *own[1:], rotations, self.max_stretch, solid)
         means, covariances, normals, turns = moved
-        if self.all_move:
-            return DeformedGaussians(means, covariances, normals, rest.rotations if turns is None else turns)
-        return DeformedGaussians(
-            rest.means.index_copy(0, index, means),
-            rest.covariances.index_copy(0, index, covariances),
-            rest.normals.index_copy(0, index, normals),
-            rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
-        )
+        parts: dict[str, Any] = {"means": means, "covariances": covariances, "normals": normals}
+        parts |= {} if turns is None else {"rotations": turns}
+        if not self.all_move:
+            parts = {name: getattr(rest, name).index_copy(0, index, part) for name, part in parts.items()}
+        return replace(rest, **parts)
 
     def surface(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Position [m], shape (S, 3), and F, shape (S, 3, 3), of the places that a trajectory records.
