@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from gaussian_swaying._checks import check_vector
+from gaussian_swaying._checks import VectorLike, check_vector
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
@@ -31,7 +31,7 @@ from gaussian_swaying.simulation.scene import Material, Scene
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
-    WindLike = WindField | SpatialWind | Sequence[float]
+    WindLike = WindField | SpatialWind | VectorLike
     DeviceLike = torch.device | str
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
@@ -114,7 +114,7 @@ def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
         return wind.in_frame(frame)
     if isinstance(wind, SpatialWind):
         return wind
-    return WindField([0.0, 0.0, 0.0] if wind is None else list(check_vector("wind", wind)))
+    return WindField() if wind is None else WindField(flow_rows("wind", [wind])[0])
 
 
 def check_types(given: Mapping[str, Any]) -> None:

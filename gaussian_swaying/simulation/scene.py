@@ -34,7 +34,7 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.followers import Followers, GridFollowers, PointFollowers, on_material
-from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.material import Material, MaterialRegion, with_gradients
 from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
 from gaussian_swaying.simulation.touching import still_distance, surface_of
 
@@ -299,7 +299,7 @@ class SimulatedScene(nn.Module):
         if by_grid:
             chosen_samples, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, self.frame, dtype)
             patches = shared_wind(samples, owner, parent)
-        self.points = chosen_samples.points(scene.layers, laws, dtype)
+        self.points = with_gradients(chosen_samples.points(scene.layers, laws, dtype), material)
         self.on_surface = int(chosen_samples.surface.sum())
         self.filled = len(chosen_samples.surface) - self.on_surface
         self.patches = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], self.points.count)

@@ -316,8 +316,8 @@ class Simulation(Stepping):
 
     def force_scale(self) -> float:
         """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
-        speed = float(torch.linalg.vector_norm(self.flows(), dim=-1).amax())
-        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).abs().sum())
+        speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
+        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).detach().abs().sum())
         return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
 
     def flows(self) -> Tensor:
