@@ -51,7 +51,9 @@ def _flag(**changes):
 
 
 @pytest.mark.parametrize(
-    ("example", "output"), EXAMPLES, ids=["three lines", "sequence", "by hand", "wind", "forces", "supports", "batches", "gradient"]
+    ("example", "output"),
+    EXAMPLES,
+    ids=["three lines", "sequence", "by hand", "wind", "forces", "supports", "batches", "gradient"],
 )
 def test_examples_of_the_page_print_what_it_shows(example, output, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
