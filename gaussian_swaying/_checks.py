@@ -5,11 +5,19 @@ they run only when the environment variable ``GAUSSIAN_SWAYING_CHECKS`` is 1 (th
 """
 
 import os
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+if TYPE_CHECKING:
+    Number = float | Tensor
+    VectorLike = Sequence[Number] | Tensor
+else:  # what a YAML file can contain; in Python also tensors, which may require a gradient
+    Number, VectorLike = float, Sequence[float]
+MOST_FRAMES = 10_000_000
+"""Frames of a run at most: more than four days of simulated time at 25 frames per second."""
 VALUE_CHECKS = os.environ.get("GAUSSIAN_SWAYING_CHECKS", "0") == "1"
 
 
@@ -38,8 +46,29 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
         raise ValueError(f"Expected `{name}` of shape ({expected}{comma}), but got {actual}.")
 
 
+def requires_grad(value: Any) -> bool:
+    """Whether a value is a tensor that requires a gradient."""
+    return isinstance(value, Tensor) and value.requires_grad
+
+
+def check_plain(name: str, value: Any) -> None:
+    """Raise ValueError if a value that becomes plain numbers, or one of its items, requires a gradient."""
+    items = value if isinstance(value, Iterable) and not isinstance(value, Tensor | str | bytes) else [value]
+    if any(map(requires_grad, items)):
+        raise ValueError(
+            f"Expected `{name}` without a gradient, which would be lost: give plain numbers (`tensor.detach()`); "
+            "docs/python.md lists what keeps its gradient."
+        )
+
+
+def number_of(value: Any) -> Any:
+    """The value of a tensor with one element as a float, without its gradient; anything else as it is."""
+    return float(value.detach()) if isinstance(value, Tensor) and value.numel() == 1 else value
+
+
 def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
     """Return ``value`` as a tuple of ``length`` finite floats, or raise an error that names the field."""
+    check_plain(name, value)
     items = value.tolist() if isinstance(value, Tensor) else value
     if isinstance(items, (str, bytes)) or not hasattr(items, "__len__"):
         raise TypeError(f"Expected `{name}` to be a list of {length} numbers, but got {value!r}.")
@@ -59,9 +88,18 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 def check_positive(name: str, value: float, *, allow_zero: bool = False) -> None:
     """Raise ValueError unless ``value`` is a finite number above zero (or at least zero, with ``allow_zero``)."""
+    check_plain(name, value)
     wanted = "not be negative" if allow_zero else "be positive"
     if not (value >= 0 if allow_zero else value > 0) or value == float("inf"):
         raise ValueError(f"Expected `{name}` to {wanted} and finite, but got {value}.")
+
+
+def check_frames(name: str, count: Any) -> int:
+    """Return a number of frames, or raise an error that names the field."""
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= MOST_FRAMES:
+        shown = f"{count:.6g}" if isinstance(count, int) and abs(count) > MOST_FRAMES else repr(count)
+        raise ValueError(f"Expected `{name}` to be a whole number from 1 to {MOST_FRAMES:,}, but got {shown}.")
+    return count
 
 
 def check_poisson_ratio(name: str, value: float) -> None:

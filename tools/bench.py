@@ -8,7 +8,7 @@
 ``python tools/bench.py points``     error and time against points per cell; writes docs/results/points_<device>.json
 ``python tools/bench.py backward``   cost of gradients in `total`; writes docs/results/backward_<device>.json
 ``python tools/bench.py gradients``  memory of gradients, and tools/fit_flag.py; writes docs/results/gradients_cpu.json
-``python tools/bench.py train``      training on a capture and a generated flag; writes docs/results/train_cuda.json
+``python tools/bench.py train``      training on a capture and a generated flag; writes docs/results/train_<device>.json
 ``python tools/bench.py surfaces``   tilts of trained normals; writes docs/results/surfaces_<device>.json
 ``python tools/bench.py flags``      the flag benchmark; writes docs/results/flags_<device>.json
 ``python tools/bench.py pins``       how a held edge is modelled; writes docs/results/pins_<device>.json

@@ -83,7 +83,7 @@ class CarriedField(WindEffect):
             raise ValueError(f"Expected `table` of shape (X, Y, Z, 3), at least 2 each, but got {tuple(table.shape)}.")
         self.spacing = check_vector("spacing", spacing)
         self.origin, self.wraps = check_vector("origin", origin), wraps
-        self.scale, self.tilted = float(scale), bool(tilted)
+        self.scale, self.tilted = check_vector("scale", [scale], 1)[0], bool(tilted)
         self.register_buffer("table", table, persistent=False)
         self.register_buffer("axes", torch.eye(3, dtype=torch.float64), persistent=False)
         sides = torch.tensor([n * h for n, h in zip(table.shape[:3], self.spacing, strict=True)], dtype=torch.float64)

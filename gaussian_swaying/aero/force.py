@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_shape
+from gaussian_swaying._checks import Number, check_choice, check_plain, check_positive, check_shape, number_of
 from gaussian_swaying.aero.patches import PatchSums, grouped_force
 
 LAWS = ("paper", "projected", "linear")
@@ -133,7 +133,7 @@ class AeroForce(nn.Module):
     """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
 
     The paper's coefficients are visual parameters. For comparison, a flat plate across the flow has a C_D of about 1.2,
-    and skin friction is about 0.005.
+    and skin friction is about 0.005. In Python the three coefficients may be tensors, which keep their gradient.
 
     Args:
         C_D: Drag coefficient.
@@ -157,9 +157,9 @@ class AeroForce(nn.Module):
 
     def __init__(
         self,
-        C_D: float = 0.5,
-        C_F: float = 0.4,
-        C_L: float = 0.01,
+        C_D: Number = 0.5,
+        C_F: Number = 0.4,
+        C_L: Number = 0.01,
         air_density: float = 1.225,
         law: str = "paper",
         lift_direction: str = "side",
@@ -171,17 +171,19 @@ class AeroForce(nn.Module):
         check_choice("law", law, LAWS)
         check_choice("drag_step", drag_step, ("explicit", "semi_implicit"))
         check_choice("lift_direction", lift_direction, ("side", "lift"))
-        for name, value in (("C_D", C_D), ("C_F", C_F), ("air_density", air_density)):
+        for name, value in (("C_D", number_of(C_D)), ("C_F", number_of(C_F)), ("air_density", air_density)):
             check_positive(name, value, allow_zero=True)
-        if not abs(C_L) < float("inf"):
+        if not abs(number_of(C_L)) < float("inf"):
             raise ValueError(f"Expected `C_L` to be finite, but got {C_L}.")
+        check_plain("max_area_ratio", max_area_ratio)
         if max_area_ratio is not None and not max_area_ratio > 0:
             raise ValueError(
                 f"Expected `max_area_ratio` to be positive, or null for no cap on the area, but got {max_area_ratio}."
             )
         # float64 scalars: they neither lower the precision of a float64 run nor raise that of a float32 run
         for name, value in (("C_D", C_D), ("C_F", C_F), ("C_L", C_L)):
-            self.register_buffer(name, torch.tensor(float(value), dtype=torch.float64))
+            given = value.reshape(()).double() if isinstance(value, Tensor) and value.requires_grad else float(value)
+            self.register_buffer(name, torch.as_tensor(given, dtype=torch.float64))
         self.C_D: Tensor
         self.C_F: Tensor
         self.C_L: Tensor
@@ -192,12 +194,15 @@ class AeroForce(nn.Module):
     @property
     def idle(self) -> bool:
         """Whether the force is zero in any wind, so that it need not be computed."""
-        return self.air_density == 0 or not any(float(c) for c in (self.C_D, self.C_F, self.C_L))
+        coefficients = (self.C_D, self.C_F, self.C_L)
+        needed = any(float(c.detach()) or c.requires_grad for c in coefficients)
+        return self.air_density == 0 or not needed
 
     @property
     def mostly_linear(self) -> bool:
         """Whether less than 5 % of the force depends on the side of the patch that the flow meets."""
-        sided = float(self.C_L.abs()) / max(float(self.C_D + self.C_F + self.C_L.abs()), 1e-30)
+        drag, friction, lift = (float(c.detach()) for c in (self.C_D, self.C_F, self.C_L.abs()))
+        sided = lift / max(drag + friction + lift, 1e-30)
         return self.law != "paper" and not self.unit_tangent and sided < 0.05
 
     def rate(self, speed: Tensor, area: Tensor, mass: Tensor) -> Tensor:

@@ -108,9 +108,9 @@ class RecordedWind(WindEffect):
         super().__init__()
         grid = read_grid(path)
         self.path, self.origin = str(path), list(check_vector("origin", origin))
-        self.scale, self.repeat = float(scale), bool(repeat)
+        self.scale, self.repeat = check_vector("scale", [scale], 1)[0], bool(repeat)
         times = torch.from_numpy(grid.times)
-        begin = float(times[0]) if start is None else float(start)
+        begin = float(times[0]) if start is None else check_vector("start", [start], 1)[0]
         step = float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else 1.0
         check_positive("the step of time", step)
         self.period = float(times[-1] - times[0]) + step

@@ -16,7 +16,15 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import (
+    VectorLike,
+    check_choice,
+    check_plain,
+    check_positive,
+    check_vector,
+    number_of,
+    requires_grad,
+)
 from gaussian_swaying._graphs import Recordable
 from gaussian_swaying.aero.effects import Moment, WindEffect
 from gaussian_swaying.aero.lookup import picked
@@ -108,6 +116,7 @@ class SineSway(Modulation):
         super().__init__()
         check_positive("amplitude", amplitude, allow_zero=True)
         check_positive("period", period)
+        check_plain("phase", phase)
         self.amplitude, self.period, self.phase = float(amplitude), float(period), float(phase)
 
     def forward(self, velocity: Tensor, time: Tensor, seed: int, stream: int) -> Tensor:
@@ -167,7 +176,7 @@ class FlowKey:
 
     Args:
         time: Time from which the flow holds [s].
-        flow: Air velocity [m/s], z up.
+        flow: Air velocity [m/s], z up; in Python also a tensor, as in a :class:`WindField`.
     """
 
     time: float
@@ -194,11 +203,35 @@ class SpatialWind(Recordable, nn.Module, ABC):
         """
 
 
+def flow_rows(name: str, flows: Sequence[VectorLike]) -> Tensor:
+    """Flows [m/s] as one tensor, shape (K, 3), float64, with the gradients that are required.
+
+    Args:
+        name: Name of the argument, for messages.
+        flows: K flows, each a tensor of shape (3,), or three numbers of which some may be tensors.
+    """
+    rows = [_row(name, flow) for flow in flows]
+    if any(isinstance(row, Tensor) for row in rows):
+        return torch.stack([torch.as_tensor(row, dtype=torch.float64) for row in rows])
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _row(name: str, flow: VectorLike) -> Tensor | tuple[float, ...]:
+    """Three plain numbers, or a tensor (3,) if a gradient is required."""
+    if isinstance(flow, Tensor):
+        plain = check_vector(name, flow.detach())
+        return flow.double() if flow.requires_grad else plain
+    if isinstance(flow, list | tuple) and any(map(requires_grad, flow)):
+        check_vector(name, [number_of(part) for part in flow])
+        return torch.stack([torch.as_tensor(part, dtype=torch.float64).reshape(()) for part in flow])
+    return check_vector(name, flow)
+
+
 class WindField(nn.Module):
     """Air velocity over time; the same everywhere in the scene, unless it has effects.
 
     Args:
-        flow: Steady air velocity [m/s], z up.
+        flow: Steady air velocity [m/s], z up. In Python also a tensor of shape (3,), which keeps its gradient.
         schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time. Or
             the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
             interpolation.
@@ -216,7 +249,7 @@ class WindField(nn.Module):
 
     def __init__(
         self,
-        flow: Sequence[float] = (0.0, 0.0, 0.0),
+        flow: VectorLike = (0.0, 0.0, 0.0),
         schedule: list[FlowKey] | str | None = None,
         interpolation: str = "step",
         modulations: Sequence[Modulation] = (),
@@ -227,23 +260,23 @@ class WindField(nn.Module):
         check_choice("interpolation", interpolation, ("step", "linear"))
         if isinstance(schedule, str):
             schedule, interpolation = list(map(FlowKey, *read_anemometer(schedule))), "linear"
-        keys = schedule or [FlowKey(0.0, list(flow))]
+        keys = schedule or [FlowKey(0.0, flow)]  # type: ignore[arg-type]
         times = [float(key.time) for key in keys]
         if any(a >= b for a, b in pairwise(times)):
             raise ValueError(f"Expected the times of `schedule` to increase, but got {times}.")
         name = "schedule.flow" if schedule else "flow"
-        flows = [check_vector(name, key.flow) for key in keys]
+        flows = flow_rows(name, [key.flow for key in keys])
         self.register_buffer("times", torch.tensor(times, dtype=torch.float64))
-        self.register_buffer("flows", torch.tensor(flows, dtype=torch.float64))
+        self.register_buffer("flows", flows)
         self.times: Tensor
         self.flows: Tensor
         self.interpolation, self.seed = interpolation, int(seed)
         self.modulations = nn.ModuleList(modulations)
         self.effects = nn.ModuleList(effects)
         self._in_metres = False  # whether `in_frame` made it
-        moving = [row for row in flows if any(row)]
+        moving = [row.detach() for row in flows if bool(row.any())]
         for effect in effects:
-            effect.along(torch.tensor(moving[0] if moving else [0.0] * 3, dtype=torch.float64))
+            effect.along(moving[0] if moving else torch.zeros(3, dtype=torch.float64))
 
     @property
     def uniform(self) -> bool:

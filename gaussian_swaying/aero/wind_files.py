@@ -18,6 +18,9 @@ from gaussian_swaying._inputs import check_regular, read_arrays
 LARGEST = 1 << 32
 """Largest file of a wind [bytes]."""
 
+LONGEST_STEP = 1e6
+"""Largest step of a grid [m], and the inverse of the smallest; no wind is known on finer or coarser ones."""
+
 _METRES = ("", "m", "meter", "meters", "metre", "metres")
 _SPEEDS = ("", "m/s", "ms-1", "ms^-1", "ms**-1", "meterspersecond", "metrespersecond")
 
@@ -76,12 +79,13 @@ def read_bts(path: str | os.PathLike[str]) -> TurbSimWind:
     kind, nz, ny, towers, nt, dz, dy, dt, speed, hub, bottom, *scales, letters = head.unpack_from(data)
     start = head.size + letters
     count = nt * (ny * nz + towers) * 3
-    sizes = (nz >= 1, ny >= 2, nt >= 2, towers >= 0, letters >= 0, dz > 0, dy > 0, dt > 0, speed > 0)
+    sizes = (nz >= 1, ny >= 2, nt >= 2, towers >= 0, letters >= 0, dt > 0, speed > 0, _is_step(dz), _is_step(dy))
     slopes = np.array(scales[::2], dtype=np.float64)
-    if not all(sizes) or not (np.isfinite(scales).all() and slopes.all()) or len(data) != start + 2 * count:
+    finite = np.isfinite([*scales, dt, speed, hub, bottom]).all()
+    if not all(sizes) or not (finite and slopes.all()) or len(data) != start + 2 * count:
         raise ValueError(
-            f"{path} is damaged: its header says {ny} x {nz} points and {nt} times, which does not fit its "
-            f"{len(data):,} bytes; run TurbSim again."
+            f"{path} is damaged: its header says {ny} x {nz} points, {dy:g} m and {dz:g} m apart, and {nt} times, "
+            f"which does not fit its {len(data):,} bytes or is no grid; run TurbSim again."
         )
     raw = np.frombuffer(data, "<i2", count, start).reshape(nt, -1, 3)[:, : ny * nz].reshape(nt, nz, ny, 3)
     velocity = ((raw - np.array(scales[1::2])) / slopes).astype(np.float32).transpose(0, 2, 1, 3)
@@ -114,7 +118,12 @@ def read_grid(path: str | os.PathLike[str]) -> GridWind:
 
 
 def _checked(path: Path, axes: dict[str, np.ndarray], velocity: np.ndarray) -> GridWind:
-    times = np.asarray(axes.get("time", [0.0]), dtype=np.float64)
+    axes = {name: _numbers(path, name, axis) for name, axis in axes.items()}
+    times = axes.get("time", np.zeros(1))
+    if len(times) == 0:
+        raise ValueError(f"`time` in {path} is empty: save at least one field.")
+    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+        raise ValueError(f"Expected `time` in {path} to rise, without NaN: sort the fields by time.")
     if "time" not in axes:
         velocity = velocity[None] if velocity.ndim == 4 else velocity
     shape = (len(times), *(len(axes[name]) for name in "xyz"), 3)
@@ -125,23 +134,41 @@ def _checked(path: Path, axes: dict[str, np.ndarray], velocity: np.ndarray) -> G
         )
     first, spacing = [], []
     for name in "xyz":
-        axis = np.asarray(axes[name], dtype=np.float64)
-        steps = np.diff(axis)
-        if len(axis) < 2 or not (steps > 0).all() or np.ptp(steps) > 1e-3 * steps.mean():
+        axis = axes[name]
+        with np.errstate(over="ignore", invalid="ignore"):
+            steps = np.diff(axis)
+            rises = len(axis) > 1 and bool((steps > 0).all() and np.isfinite(steps).all())
+            step = float(steps.mean()) if rises else 0.0
+        if not rises or np.ptp(steps) > 1e-3 * step:
             raise ValueError(
                 f"Expected `{name}` in {path} to rise in equal steps, with at least two values: interpolate the wind "
                 "to a regular grid first."
             )
+        if not _is_step(step):
+            raise ValueError(f"The steps of `{name}` in {path} are {step:.3g} m: save its places in metres.")
         first.append(float(axis[0]))
-        spacing.append(float(steps.mean()))
-    if len(times) > 1 and not (np.diff(times) > 0).all():
-        raise ValueError(f"Expected `time` in {path} to rise: sort the fields by time.")
+        spacing.append(step)
+    if velocity.dtype.kind not in "iuf":
+        raise ValueError(f"The velocity in {path} is not made of numbers: save it as float32.")
+    with np.errstate(over="ignore"):
+        velocity = velocity.astype(np.float32)
     if not np.isfinite(velocity).all():
         count = int((~np.isfinite(velocity)).sum())
         raise ValueError(f"{count} velocities in {path} are NaN or infinite: fill them first.")
-    return GridWind(
-        velocity.astype(np.float32), (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2]), times
-    )
+    return GridWind(velocity, (first[0], first[1], first[2]), (spacing[0], spacing[1], spacing[2]), times)
+
+
+def _is_step(length: float) -> bool:
+    """Whether a side of a cell [m] is one that a wind can have."""
+    return bool(1 / LONGEST_STEP <= length <= LONGEST_STEP)
+
+
+def _numbers(path: Path, name: str, axis: np.ndarray) -> np.ndarray:
+    """An axis as float64, shape (N,)."""
+    axis = np.asarray(axis)
+    if axis.ndim != 1 or axis.dtype.kind not in "iuf":
+        raise ValueError(f"Expected `{name}` in {path} to be a list of numbers: save it as an array of one dimension.")
+    return axis.astype(np.float64)
 
 
 def _read_netcdf(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -240,6 +267,8 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
         if match and name in known:
             if _plain(match[2] or known[name]) not in (_plain(known[name]), "°" if name == "direction" else ""):
                 raise _unit(path, name, match[2], known[name])
+            if name in columns:
+                raise ValueError(f"{path} has two columns `{name}`: remove or rename one.")
             columns[name] = number
     polar = "speed" in columns
     needed = ("time", "speed", "direction") if polar else ("time", "u", "v")

@@ -19,6 +19,7 @@ from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
@@ -58,7 +59,14 @@ def cleaned(cloud: GaussianCloud) -> GaussianCloud:
     )
 
 
-def export_cloud(path: str | os.PathLike[str], cloud: GaussianCloud, format: str = "ply") -> None:
+def export_cloud(
+    path: str | os.PathLike[str],
+    cloud: GaussianCloud | DeformedGaussians,
+    format: str | None = None,
+    fps: float = 25.0,
+    metres_per_unit: float = 1.0,
+    rotation: Tensor | None = None,
+) -> None:
     """Write Gaussians in one of several formats; the file gets its name only when it is complete.
 
     - ``ply``: as 3DGS stores them, with normals, see :func:`~gaussian_swaying.gaussians.ply.write_ply`.
@@ -70,23 +78,28 @@ def export_cloud(path: str | os.PathLike[str], cloud: GaussianCloud, format: str
 
     Args:
         path: File to write; an existing one is replaced.
-        cloud: Gaussians to write, see :func:`cleaned`.
-        format: One of the above.
+        cloud: Gaussians to write, see :func:`cleaned`; also those of a frame of a simulation.
+        format: One of the above; by default that of the name's ending, see :func:`format_of`.
+        fps: Frames per second, for USD.
+        metres_per_unit: Length of a scene unit [m], for USD.
+        rotation: Rotation from scene directions to z up, shape (3, 3), for USD; the scene's z is up if None.
 
     Raises:
         FileNotFoundError: If the folder does not exist.
-        ValueError: If the format is none of these, or no Gaussian is left.
+        ValueError: If the format is none of these or the ending unknown, or no Gaussian is left.
         ImportError: If the format is ``usd`` and usd-core is not installed.
 
     Warns:
         UserWarning: If Gaussians were left out because they are not finite.
     """
+    format = format_of(path) if format is None else format
     check_choice("format", format, tuple(SUFFIXES))
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written because {path.parent} is not a folder; create it first.")
+    cloud = cloud.to_cloud() if isinstance(cloud, DeformedGaussians) else cloud
     if format == "usd":
-        write_usd(path, [cloud])
+        write_usd(path, [cloud], fps, metres_per_unit=metres_per_unit, rotation=rotation)
         return
     kept = _kept(path, cloud)
     if format == "ply":
@@ -137,11 +150,7 @@ def convert(
     if not target.parent.is_dir():
         raise FileNotFoundError(f"{target} cannot be written because {target.parent} is not a folder; create it first.")
     if not source.is_dir():
-        cloud = read_gaussians(source)
-        if format == "usd":
-            write_usd(target, [cloud], fps, metres_per_unit=metres_per_unit, rotation=rotation)
-        else:
-            export_cloud(target, cloud, format)
+        export_cloud(target, read_gaussians(source), format, fps, metres_per_unit, rotation)
         return
     files = sorted(source.glob("*.ply"))
     if format != "usd" or not files:
@@ -422,7 +431,7 @@ def _pxr(name: str) -> Any:
         return import_module(f"pxr.{name}")
     except ImportError as error:
         raise ImportError(
-            "USD files need usd-core: install gaussian-swaying[usd], or choose another format."
+            "USD files need usd-core: run pip install 'gaussian-swaying[usd]', or choose another format.", name="pxr"
         ) from error
 
 

@@ -12,10 +12,10 @@ from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
 from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale
 from gaussian_swaying.geometry.patches import deform_all, smallest_axis_normal
 
 
@@ -29,6 +29,7 @@ class DeformedGaussians:
         normals: Unit normals F^-T N, shape (..., N, 3).
         rotations: Rotation of each Gaussian from rest, the polar factor of F, shape (..., N, 3, 3).
         colors: Colours as a camera sees them, shape (..., N, 3); None before they are shaded.
+        model: The Gaussians at rest, which have the opacities and harmonics; None if they are not known.
     """
 
     means: Tensor
@@ -36,6 +37,28 @@ class DeformedGaussians:
     normals: Tensor
     rotations: Tensor
     colors: Tensor | None = None
+    model: GaussianSurfaceModel | None = None
+
+    @torch.no_grad()
+    def to_cloud(self) -> GaussianCloud:
+        """The Gaussians in storage form, detached, with harmonics rotated with the patches.
+
+        Raises:
+            ValueError: If ``model`` is not known, or there are several scenes.
+        """
+        if self.model is None:
+            raise ValueError("These Gaussians have no opacities: set `model` to the GaussianSurfaceModel at rest.")
+        check_shape("means", self.means, None, 3, batches=False)
+        rest = self.model.to_cloud()
+        quats, scales = covariance_to_quat_scale(self.covariances)
+        return GaussianCloud(
+            means=self.means.detach(),
+            quats=quats,
+            scales=scales,
+            opacities=rest.opacities,
+            sh=rotate_sh(rest.sh, self.rotations),
+            normals=self.normals.detach(),
+        )
 
 
 class GaussianSurfaceModel(nn.Module):
@@ -160,4 +183,4 @@ class GaussianSurfaceModel(nn.Module):
         check_shape("deformation_gradient", deformation_gradient, len(self), 3, 3)
         covariances, normals, rotations = deform_all(deformation_gradient, self.covariance(), self.normals())
         assert rotations is not None
-        return DeformedGaussians(position, covariances, normals, rotations)
+        return DeformedGaussians(position, covariances, normals, rotations, model=self)

@@ -22,6 +22,8 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REQUIRED = (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS)
+FARTHEST = 1e12
+"""Largest coordinate of a centre [scene units]: its square is finite in float32, and a grid can count its cells."""
 OPAQUE_LOGIT = 16.0  # of an opacity of 1: its sigmoid is 1 - 1.1e-7, the largest opacity below 1 in float32
 
 
@@ -77,6 +79,7 @@ def read_ply(path: str | os.PathLike[str]) -> GaussianCloud:
 
     opacities = _read_opacities(path, data)
     means, quats, scales = columns(_MEANS), columns(_QUATS), columns(_SCALES)
+    check_places(path, means)
     check_sizes_and_rotations(path, scales, quats)
     sh = columns(_DC)[:, None, :]
     if rest:
@@ -125,6 +128,12 @@ def write_ply(path: str | os.PathLike[str], cloud: GaussianCloud) -> None:
     rows = table.astype("<f4", copy=False).view([(name, "<f4") for name in names]).reshape(count)
     with atomic(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+
+
+def check_places(path: Path, means: np.ndarray) -> None:
+    """Raise ValueError if a finite centre (N, 3) is too far away to compute with."""
+    far = (np.abs(means) > FARTHEST).any(axis=1)
+    _reject(path, far, f"property `x`, `y` or `z` is beyond ±{FARTHEST:g}", "remove them or train again")
 
 
 def check_sizes_and_rotations(path: Path, scales: np.ndarray, quats: np.ndarray) -> None:

@@ -38,6 +38,7 @@ class KeyedPath:
 
     def __post_init__(self) -> None:
         times = [float(t) for t in self.times]
+        check_vector("times", times, len(times))
         if not times or any(b <= a for a, b in pairwise(times)):
             raise ValueError(f"Expected `times` of the path to rise, with at least one, but got {self.times}.")
         for name in ("moves", "turns"):

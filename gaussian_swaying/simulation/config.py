@@ -14,6 +14,7 @@ from types import UnionType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from gaussian_swaying import _program as program
+from gaussian_swaying._checks import check_frames
 from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
 from gaussian_swaying.captures.capture_camera import CaptureCamera
@@ -193,8 +194,7 @@ def check_settings(schema: type, settings: Namespace) -> None:
             raise ValueError(
                 f"Expected `{name}` to contain fields, such as those that --help-all lists, but got {settings[name]!r}."
             )
-    if settings.frames < 1:
-        raise ValueError(f"Expected `frames` to be at least 1, but got {settings.frames}.")
+    check_frames("frames", settings.frames)
 
 
 def config_text(parser: ArgumentParser, settings: Namespace) -> str:

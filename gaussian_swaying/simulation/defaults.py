@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from gaussian_swaying._checks import check_vector
+from gaussian_swaying._checks import VectorLike, check_vector
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
@@ -33,7 +33,7 @@ from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 
 if TYPE_CHECKING:
     SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
-    WindLike = WindField | SpatialWind | Sequence[float]
+    WindLike = WindField | SpatialWind | VectorLike
     DeviceLike = torch.device | str
 else:  # what a YAML file can contain: the annotations of the constructor are its schema
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
@@ -117,7 +117,7 @@ def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
         return wind.in_frame(frame)
     if isinstance(wind, SpatialWind):
         return wind
-    return WindField([0.0, 0.0, 0.0] if wind is None else list(check_vector("wind", wind)))
+    return WindField() if wind is None else WindField(flow_rows("wind", [wind])[0])
 
 
 def as_camera(
@@ -156,13 +156,6 @@ def check_types(given: Mapping[str, Any]) -> None:
         for part in value if name in _LISTS and isinstance(value, list | tuple) else ():
             if not isinstance(part, _LISTS[name]) and not (name == "forces" and callable(part)):
                 raise TypeError(f"Expected `{name}` to be a list of {_LISTS[name].__name__}, but it has {part!r}.")
-
-
-def check_count(name: str, count: Any) -> int:
-    """Return a number of frames, or raise an error that names the field."""
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"Expected `{name}` to be a whole number of at least 1, but got {count!r}.")
-    return count
 
 
 _KINDS: dict[str, tuple[type, ...]] = {

@@ -175,6 +175,12 @@ class SceneEditor:
             ValueError: If there are none.
         """
         scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
+        given = (scene.points.youngs_modulus, scene.points.poisson_ratio, scene.points.mass)
+        if edit.of_material and any(value.requires_grad for value in given):
+            raise ValueError(
+                "`edits` of the material would lose the gradient of `material`: leave them out, or give the material "
+                "without a gradient."
+            )
         if region is None:
             particles = torch.ones_like(scene.points.mass, dtype=torch.bool)
             gaussians = torch.zeros_like(means[:, 0], dtype=torch.bool).index_fill(0, scene.moving, True)

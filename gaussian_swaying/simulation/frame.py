@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -66,3 +68,19 @@ class Frame:
             gaussians = painter.shade(gaussians, painter.camera_at(self.index, camera))
         assert gaussians.colors is not None
         return painter.draw(gaussians, gaussians.colors, painter.camera_at(self.index, camera))
+
+    def save(self, path: str | os.PathLike[str], format: str | None = None) -> None:
+        """Write the Gaussians of the frame as a splat, in scene units; USD in metres with z up.
+
+        Args:
+            path: File to write, such as 0001.ply; an existing one is replaced.
+            format: As in :func:`~gaussian_swaying.gaussians.export.export_cloud`; by default that of the ending: .ply,
+                .compressed.ply, .splat, or .usdc, .usd and .usda.
+
+        Raises:
+            FileNotFoundError: If the folder does not exist.
+            ValueError: If the ending or the format is unknown, or no Gaussian is finite.
+            ImportError: If the format is USD and usd-core is not installed.
+        """
+        place, fps = self.simulation.scene.frame, 1 / self.simulation.frame_dt
+        export_cloud(path, self.gaussians, format, fps, place.metres_per_unit, place.rotation)

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from gaussian_swaying._checks import check_choice, check_poisson_ratio, check_positive
+from torch import Tensor
+
+from gaussian_swaying._checks import (
+    Number,
+    check_choice,
+    check_plain,
+    check_poisson_ratio,
+    check_positive,
+    number_of,
+    requires_grad,
+)
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.state import MaterialPoints
 
 
 @dataclass
@@ -45,11 +56,13 @@ class Material:
         law: Constitutive law, for example ``Sand`` (see :data:`gaussian_swaying.mpm.laws.LAWS`); fixed corotated
             elasticity if null. Plastic laws need ``solver.formulation: updated``.
         regions: Parts with a different material; later entries win.
+
+    In Python, ``E``, ``nu`` and ``density`` may be tensors of one number that require a gradient.
     """
 
-    E: float = 1e5
-    nu: float = 0.3
-    density: float = 200.0
+    E: Number = 1e5
+    nu: Number = 0.3
+    density: Number = 200.0
     thickness: float = 0.01
     volume: str = "patch"
     law: ConstitutiveLaw | None = None
@@ -57,10 +70,40 @@ class Material:
 
     def __post_init__(self) -> None:
         check_choice("material.volume", self.volume, ("patch", "cell"))
+        for name in DIFFERENTIABLE:
+            value = getattr(self, name)
+            if isinstance(value, Tensor) and value.numel() != 1:
+                raise ValueError(
+                    f"Expected `material.{name}` to be one number, but got a tensor of shape {tuple(value.shape)}: use "
+                    "`material.regions` for parts, or MaterialPoints with an MPMSolver for a value at every point."
+                )
+            if requires_grad(value) and any(getattr(entry, name) is not None for entry in self.regions):
+                raise ValueError(
+                    f"`material.{name}` requires a gradient, but `material.regions` gives it too: remove it there."
+                )
         entries: list[Material | MaterialRegion] = [self, *self.regions]
         for entry in entries:
+            given = {name: getattr(entry, name) for name in ("E", "nu", "density", "thickness")}
+            if entry is self:
+                given |= {name: number_of(given[name]) for name in DIFFERENTIABLE}
             for name in ("E", "density", "thickness"):
-                if getattr(entry, name) is not None:
-                    check_positive(f"material.{name}", getattr(entry, name))
-            if entry.nu is not None:
-                check_poisson_ratio("material.nu", entry.nu)
+                if given[name] is not None:
+                    check_positive(f"material.{name}", given[name])
+            if given["nu"] is not None:
+                check_plain("material.nu", given["nu"])
+                check_poisson_ratio("material.nu", given["nu"])
+
+
+DIFFERENTIABLE = ("E", "nu", "density")
+"""What of a :class:`Material` may require a gradient."""
+
+
+def with_gradients(points: MaterialPoints, material: Material) -> MaterialPoints:
+    """Material points that depend on the tensors of their material that require a gradient, with the same values."""
+    for name, field_name in (("E", "youngs_modulus"), ("nu", "poisson_ratio"), ("density", "mass")):
+        value = getattr(material, name)
+        if requires_grad(value):
+            change = (value - value.detach()).reshape(()).to(points.mass)  # zero, with a slope of one
+            change = change * points.volume if name == "density" else change
+            points = replace(points, **{field_name: getattr(points, field_name) + change})
+    return points

@@ -1,19 +1,17 @@
-"""Pictures of a simulated scene: cameras, colours, renders, and export of the Gaussians as a splat."""
+"""Pictures of a simulated scene: cameras, colours and renders."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying._turns import Turn, in_turn
-from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.harmonics import rotate_sh
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -146,8 +144,8 @@ class Painter(nn.Module):
             return [found.means, found.covariances, found.normals, *([found.rotations] if turned else [])]
 
         found = self._moved((fingerprint([scene]), state.grid), moved, given)
-        means, covariances, normals = found[:3]
-        return DeformedGaussians(means, covariances, normals, found[3] if turned else scene.rest().rotations)
+        parts: dict[str, Any] = dict(zip(("means", "covariances", "normals", "rotations"), found, strict=False))
+        return replace(scene.rest(), **parts)
 
     @in_turn
     def colors(self, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
@@ -241,19 +239,6 @@ class Painter(nn.Module):
     def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
         """Blend any three values of each Gaussian."""
         return self.renderer(gaussians.means, gaussians.covariances, self.scene.model.opacity(), values, camera)
-
-    def cloud(self, gaussians: DeformedGaussians) -> GaussianCloud:
-        """Deformed Gaussians in storage form, with harmonics rotated with the patches."""
-        cloud = self.scene.model.to_cloud()
-        quats, scales = covariance_to_quat_scale(gaussians.covariances)
-        return GaussianCloud(
-            means=gaussians.means,
-            quats=quats,
-            scales=scales,
-            opacities=cloud.opacities,
-            sh=rotate_sh(cloud.sh, gaussians.rotations),
-            normals=gaussians.normals,
-        )
 
     def depth_range(self, frame: int, name: str) -> tuple[float, float]:
         """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""

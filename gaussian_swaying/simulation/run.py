@@ -271,7 +271,7 @@ class Run:
                 self.picture(state, gaussians, frame, name)
         with walls("writing"):
             if exporting:
-                recorder.write_splat(frame, self.painter.cloud(gaussians), self.simulation.scene.frame)
+                recorder.write_splat(frame, gaussians.to_cloud(), self.simulation.scene.frame)
             if recorder.trajectory:
                 recorder.write_trajectory(frame, *self.simulation.scene.surface(state))
             if recorder.nodes and state.node_displacement is not None:

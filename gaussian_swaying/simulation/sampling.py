@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import number_of
 from gaussian_swaying.aero.patches import joined_directions, second_moments
 from gaussian_swaying.gaussians.filling import Filling
 from gaussian_swaying.gaussians.grouping import grid_groups
@@ -120,7 +121,7 @@ def sample_object(
         body_area, area = (torch.cat([part, part.new_zeros(inside)]) for part in (body_area, area))
         surface = torch.cat([surface, torch.zeros(inside, dtype=torch.bool)])
     where = frame.point_to_scene(position)
-    properties = {name: torch.full_like(area, getattr(material, name)) for name in _PROPERTIES}
+    properties = {name: torch.full_like(area, number_of(getattr(material, name))) for name in _PROPERTIES}
     laws, index = [material.law or FixedCorotated()], torch.zeros(len(position), dtype=torch.long)
     for entry in material.regions:
         inside_region = entry.region.contains(where)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +34,7 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.simulation.extent import check_extent
 from gaussian_swaying.simulation.followers import Followers, GridFollowers, PointFollowers, on_material
-from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.material import Material, MaterialRegion, with_gradients
 from gaussian_swaying.simulation.sampling import Samples, grouped, sample_object, shared_wind
 from gaussian_swaying.simulation.touching import still_distance, surface_of
 
@@ -296,7 +297,7 @@ class SimulatedScene(nn.Module):
         if by_grid:
             chosen_samples, owner, parent = grouped(samples, dx, scene.points_per_cell, apart, self.frame, dtype)
             patches = shared_wind(samples, owner, parent)
-        self.points = chosen_samples.points(scene.layers, laws, dtype)
+        self.points = with_gradients(chosen_samples.points(scene.layers, laws, dtype), material)
         self.on_surface = int(chosen_samples.surface.sum())
         self.filled = len(chosen_samples.surface) - self.on_surface
         self.patches = Patches(patches[0].to(dtype), patches[1].to(dtype), patches[2], self.points.count)
@@ -391,7 +392,7 @@ class SimulatedScene(nn.Module):
         """The Gaussians at rest."""
         means = self.model.means.detach()
         eye = self.identity.expand(len(means), 3, 3)
-        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye)
+        return DeformedGaussians(means, self.rest_covariances, self.rest_normals, eye, model=self.model)
 
     def deformed(self, state: MPMState, rotations: bool = True) -> DeformedGaussians:
         """The Gaussians moved by the material: x, F A Fᵀ, F⁻ᵀN (paper, "Surface Formulation").
@@ -420,14 +421,11 @@ class SimulatedScene(nn.Module):
             move, F = self.frame.displacement_to_scene(move.to(kind)), self.frame.gradient_to_scene(F.to(kind))
             moved = own[0] + move, *deform_all(F, *own[1:], rotations, self.max_stretch, solid)
         means, covariances, normals, turns = moved
-        if self.all_move:
-            return DeformedGaussians(means, covariances, normals, rest.rotations if turns is None else turns)
-        return DeformedGaussians(
-            rest.means.index_copy(0, index, means),
-            rest.covariances.index_copy(0, index, covariances),
-            rest.normals.index_copy(0, index, normals),
-            rest.rotations if turns is None else rest.rotations.index_copy(0, index, turns),
-        )
+        parts: dict[str, Any] = {"means": means, "covariances": covariances, "normals": normals}
+        parts |= {} if turns is None else {"rotations": turns}
+        if not self.all_move:
+            parts = {name: getattr(rest, name).index_copy(0, index, part) for name, part in parts.items()}
+        return replace(rest, **parts)
 
     def surface(self, state: MPMState) -> tuple[Tensor, Tensor]:
         """Position [m], shape (S, 3), and F, shape (S, 3, 3), of the places that a trajectory records.

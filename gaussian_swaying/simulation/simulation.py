@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._turns import in_turn
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
@@ -43,7 +43,6 @@ from gaussian_swaying.simulation.defaults import (
     as_scene,
     as_solver,
     as_wind,
-    check_count,
     check_types,
     resolve_device,
 )
@@ -265,7 +264,7 @@ class Simulation(Stepping):
             SimulationDiverged: If the simulation diverges.
             ValueError: As in :meth:`start`.
         """
-        check_count("count", count)
+        check_frames("count", count)
         return self.frames_from(self.start(), 0, count)
 
     def frames_from(
@@ -331,8 +330,8 @@ class Simulation(Stepping):
 
     def force_scale(self) -> float:
         """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
-        speed = float(torch.linalg.vector_norm(self.flows(), dim=-1).amax())
-        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).abs().sum())
+        speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
+        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).detach().abs().sum())
         return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
 
     def flows(self) -> Tensor:
@@ -372,5 +371,5 @@ class Simulation(Stepping):
             ValueError: If the output cannot be written or resumed, or the camera lies inside the object.
         """
         self.recorder = recorder or self.recorder
-        count = self.frames_wanted if frames is None else check_count("frames", frames)
+        count = self.frames_wanted if frames is None else check_frames("frames", frames)
         return run(self, Path(output), count, resume, dict(settings or {}), progress)

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying._checks import number_of
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
@@ -59,7 +60,7 @@ def variant(
     if (material.E, material.nu, material.density) != known:
         solver = _shallow(first.solver)
         mass = points.mass * (material.density / given.density)
-        E, nu = torch.full_like(mass, material.E), torch.full_like(mass, material.nu)
+        E, nu = (torch.full_like(mass, number_of(value)) for value in (material.E, material.nu))
         own = MaterialPoints(points.position, mass, points.volume, E, nu, points.laws, points.law_index)
         solver.init_state(own, frame=first.scene.frame)
         other._modules["solver"] = solver

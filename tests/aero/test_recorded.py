@@ -79,12 +79,40 @@ def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path
         ({"time": np.array([1.0, 0.0, 2.0])}, "`time` in .* to rise"),
         ({"y": np.linspace(0, 1, 4)}, r"shape \(3, 4, 3, 2, 3\), but its axes .* need \(3, 4, 4, 2, 3\)"),
         ({"velocity": np.full((3, 4, 3, 2, 3), np.nan)}, "216 velocities"),
+        ({"velocity": np.full((3, 4, 3, 2, 3), 1e39)}, "216 velocities"),
+        ({"velocity": np.full((3, 4, 3, 2, 3), "5")}, "not made of numbers"),
+        ({"time": np.zeros(0), "velocity": np.zeros((0, 4, 3, 2, 3))}, "`time` in .* is empty: save at least one"),
+        ({"time": np.array([0.0, 1.0, np.inf])}, "`time` in .* to rise, without NaN"),
+        ({"x": np.array([0.0, 1.0, 2.0, np.inf])}, "`x` in .* to rise in equal steps"),
+        ({"x": np.array([-1e308, 0.0, 1e308, np.inf])}, "`x` in .* to rise in equal steps"),
+        ({"z": np.array([-1e308, 1e308])}, "`z` in .* to rise in equal steps"),
+        ({"z": np.array([0.0, np.inf])}, "`z` in .* to rise in equal steps"),
+        ({"x": 1e-300 * np.arange(4)}, "steps of `x` in .* are 1e-300 m: save its places in metres"),
+        ({"x": 1e300 * np.arange(4)}, "steps of `x` in .* are 1e[+]300 m"),
+        ({"y": np.zeros((3, 1))}, "`y` in .* to be a list of numbers"),
         ({"units": "knots"}, "`velocity` in .* is in 'knots', not in m/s"),
     ],
 )
 def test_a_grid_that_does_not_fit_is_refused(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):
         read_grid(_npz(tmp_path / "w.npz", **changes))
+
+
+def test_a_single_time_that_is_nan_is_refused(tmp_path):
+    path = _npz(tmp_path / "w.npz", time=np.array([np.nan]), velocity=np.zeros((1, 4, 3, 2, 3)))
+    with pytest.raises(ValueError, match=r"`time` in .* to rise, without NaN"):
+        RecordedWind(path)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_numbers_of_a_recorded_wind_are_finite(tmp_path, value):
+    path = _npz(tmp_path / "w.npz")
+    with pytest.raises(ValueError, match="`scale` to be finite, but got"):
+        RecordedWind(path, scale=value)
+    with pytest.raises(ValueError, match="`start` to be finite, but got"):
+        RecordedWind(path, start=value)
+    with pytest.raises(ValueError, match="`scale` to be finite, but got"):
+        FrozenWind(_bts(tmp_path / "w.bts")[0], scale=value)
 
 
 def test_other_files_are_refused(tmp_path):
@@ -230,7 +258,8 @@ def test_turbsim_checks_its_wind(tmp_path):
     path, _ = _bts(tmp_path / "w.bts")
     with pytest.raises(ValueError, match=r"is 8 m/s, but `wind.flow` has 6 m/s: set it to 8 m/s"):
         WindField([6.0, 0.0, 0.0], effects=[FrozenWind(path)])
-    for changes, words in (({"cut": 2}, "is damaged"), ({"dt": 0.0}, "is damaged"), ({"kind": 3}, "not a full-field")):
+    damaged = [{"cut": 2}, {"dt": 0.0}, {"dt": math.inf}, {"dz": math.inf}, {"dy": 1e-30}, {"bottom": math.nan}]
+    for changes, words in (*((change, "is damaged") for change in damaged), ({"kind": 3}, "not a full-field")):
         path, _ = _bts(tmp_path / "bad.bts", **changes)
         with pytest.raises(ValueError, match=words):
             read_bts(path)
@@ -257,6 +286,8 @@ def test_an_anemometer(tmp_path):
     [
         ("time,u [km/h],v\n0,1,2\n", r"`u` in .* is in 'km/h', not in m/s"),
         ("time [ms],u,v\n0,1,2\n", r"`time` in .* is in 'ms', not in s"),
+        ("time,u,v,u\n0,1,2,3\n", "has two columns `u`: remove or rename one"),
+        ("time,u,v,U [m/s]\n0,1,2,3\n", "has two columns `u`: remove or rename one"),
         ("u,v\n1,2\n", r"has no column `time \[s\]`"),
         ("time,speed\n1,2\n", r"has no column `direction \[deg\]`"),
         ("time,u,v\n0,1,2\n1,,2\n", "Line 3 of .* has no number"),

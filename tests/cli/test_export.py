@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,16 @@ def test_a_file_and_a_sentence(tmp_path, capsys):
     assert error.startswith("error: ")
     assert "none.ply does not exist" in error
     assert error.count("\n") == 1
+
+
+def test_usd_without_its_library_is_not_called_a_bug(tmp_path, capsys, monkeypatch):
+    for name in ("pxr", "pxr.Usd"):
+        monkeypatch.setitem(sys.modules, name, None)
+    write_ply(tmp_path / "flag.ply", FlagScene(spacing=0.1).generate())
+    assert _main()([str(tmp_path / "flag.ply"), str(tmp_path / "a.usdc")]) == 2
+    sentence = "error: USD files need usd-core: run pip install 'gaussian-swaying[usd]', or choose another format.\n"
+    assert capsys.readouterr().err == sentence
+    assert not (tmp_path / "a.usdc").exists()
 
 
 def _run(folder, **changes):

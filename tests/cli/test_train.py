@@ -78,8 +78,19 @@ CONFIGS_DEFAULT = ROOT / "configs/train/default.yaml"
 
 
 def test_there_are_configurations():
-    assert {path.stem for path in CONFIGS} >= {"default", "7k", "flag", "fox", "quick_cpu"}
+    assert {path.stem for path in CONFIGS} >= {"default", "7k", "flag", "fox", "photos_cpu", "quick_cpu"}
     assert yaml.safe_load(CONFIGS_DEFAULT.read_text())["trainer"]["max_steps"] == 60_000
+
+
+def test_the_recipe_for_photos_runs_on_a_capture(capture, tmp_path, capsys):
+    """A few images: points at which the photos agree, and a splat at the end."""
+    given = ["--data.init_args.path", str(capture), "--data.init_args.downscale", "2"]
+    given += ["--data.init_args.point_count", "200", "--trainer.max_steps", "4", "--trainer.val_check_interval", "4"]
+    given += ["--trainer.default_root_dir", str(tmp_path), "--trainer.enable_progress_bar", "false"]
+    assert main(["fit", "--config", "photos_cpu", *given]) == 0
+    assert "next: " in capsys.readouterr().out
+    assert len(read_ply(tmp_path / "point_cloud.ply")) == 200
+    assert (tmp_path / "panels" / "val_00_000004.png").exists()
 
 
 def test_the_quick_training(tmp_path, monkeypatch, capsys):

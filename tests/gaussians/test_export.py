@@ -249,7 +249,7 @@ def test_usd_without_its_library_is_one_sentence(tmp_path, monkeypatch):
 
     for name in ("pxr", "pxr.Usd"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(ImportError, match=r"USD files need usd-core: install gaussian-swaying\[usd\]"):
+    with pytest.raises(ImportError, match=r"USD files need usd-core: run pip install 'gaussian-swaying\[usd\]'"):
         export_cloud(tmp_path / "a.usdc", _cloud(4), "usd")
 
 

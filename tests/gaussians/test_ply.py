@@ -254,6 +254,15 @@ def test_double_beyond_float32(tmp_path):
     _assert_rejected(_write(tmp_path / "bad.ply", columns), "property `y` is NaN or infinite for 1 of 5")
 
 
+@pytest.mark.parametrize("value", [9e37, 1e13])
+def test_two_outliers(tmp_path, value):
+    """Their squares overflow, and a grid cannot count its cells: the preview ended in an error of linear algebra."""
+    columns = _columns()
+    columns["x"][1], columns["z"][3] = value, -value
+    path = _write(tmp_path / "bad.ply", columns)
+    _assert_rejected(path, "`x`, `y` or `z` is beyond ±1e+12 for 2 of 5 Gaussians, first at index 1", "remove them")
+
+
 @pytest.mark.parametrize("value", [-200.0, 100.0])
 def test_absurd_scale(tmp_path, value):
     columns = _columns()

@@ -1,5 +1,6 @@
 """Signed distances of solids, against brute force and exact values."""
 
+import math
 import os
 
 import pytest
@@ -252,6 +253,9 @@ def test_a_path_is_straight_between_its_keys():
     [
         ({"times": [1.0, 1.0]}, "`times` of the path to rise"),
         ({"times": []}, "at least one"),
+        ({"times": [math.nan]}, "`times` to be finite"),
+        ({"times": [0.0, math.nan, 1.0]}, "`times` to be finite"),
+        ({"times": [0.0, math.inf]}, "`times` to be finite"),
         ({"times": [0.0, 1.0], "moves": [[0, 0, 0]]}, "`moves` of the path to have one entry"),
     ],
 )

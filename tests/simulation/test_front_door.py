@@ -52,9 +52,12 @@ def _flag(**changes):
 
 
 @pytest.mark.parametrize(
-    ("example", "output"), EXAMPLES, ids=["three lines", "by hand", "wind", "forces", "supports", "batches"]
+    ("example", "output"),
+    EXAMPLES,
+    ids=["three lines", "sequence", "by hand", "wind", "forces", "supports", "batches", "gradient"],
 )
-def test_examples_of_the_page_print_what_it_shows(example, output, capsys):
+def test_examples_of_the_page_print_what_it_shows(example, output, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     exec(compile(example, "docs/python.md", "exec"), {})
     printed, number = capsys.readouterr().out, r"[+-]?\d+\.\d+"
     assert re.sub(number, "#", printed) == re.sub(number, "#", output)
@@ -64,7 +67,7 @@ def test_examples_of_the_page_print_what_it_shows(example, output, capsys):
 
 
 def test_the_page_has_an_example_for_each_heading():
-    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 6
+    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 8
 
 
 def test_a_file_its_gaussians_and_what_made_them_are_the_same(tmp_path):
@@ -552,7 +555,7 @@ def test_an_argument_of_another_kind_is_named(given, words):
         Simulation(**({"scene": FlagScene(spacing=0.1), "device": "cpu"} | given))
 
 
-@pytest.mark.parametrize("count", [0, -1, 2.5, True])
+@pytest.mark.parametrize("count", [0, -1, 2.5, True, 10**30])
 def test_a_number_of_frames_is_checked_at_once(count):
     with pytest.raises(ValueError, match="`count`"):
         _flag().frames(count)

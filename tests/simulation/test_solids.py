@@ -122,7 +122,7 @@ def test_the_filling_is_neither_drawn_nor_exported(tmp_path):
     count = len(scene.simulated)
     assert len(deformed.means) == count == len(scene.model.means)
     torch.testing.assert_close(deformed.means, scene.model.means + shift[:count])
-    assert len(simulation.painter.cloud(deformed)) == count
+    assert len(deformed.to_cloud()) == count
     # a point that fills can be anywhere: the picture is the same
     other = state.replace(position=torch.cat([state.position[:count], state.position[count:] + 0.3]))
     assert torch.equal(simulation.painter.render(state, 0).color, simulation.painter.render(other, 0).color)

@@ -15,6 +15,7 @@ NAMES = (
     "contact.md",
     "fit.md",
     "flag_benchmark.md",
+    "from_photos.md",
     "gallery.md",
     "live.md",
     "many.md",

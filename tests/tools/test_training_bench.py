@@ -62,6 +62,24 @@ def test_the_page_shows_every_row_that_did_not_fail():
     assert "| flag, all losses: PSNR of at least 35 dB | 25.0 dB | no |" in tables.goal_table(result)
 
 
+def test_the_recipe_for_a_cpu_is_a_row_of_its_page():
+    row = {"photos": 43, "width": 90, "height": 160, "steps": 1000, "gaussians": 12345, "psnr_db": 26.04, "ssim": 0.814}
+    lines = tables.photos(_result(photos={"photos_cpu": row | {"processor_s": 270.0, "threads": 1}}))
+    assert lines[-1] == "| 43 | 90 x 160 | 1,000 | 12,345 | 26.0 | 0.81 | 4.5 | 1 |"
+
+
+def test_the_recipe_is_measured_with_its_own_number_of_images(tmp_path, monkeypatch):
+    asked = []
+
+    def run(config, more, steps, folder, look):
+        asked.append((config, more, steps))
+        return {"psnr_db": 26.0, "seconds": 3.0, "seconds_with_files": 4.0, "memory_bytes": None}
+
+    monkeypatch.setattr(training, "lightning_run", run)
+    assert training.photos_run("fox", tmp_path, None) == {"psnr_db": 26.0}
+    assert asked == [("photos_cpu", ["--data.init_args.path=fox"], 1000)]
+
+
 def test_the_page_has_a_picture_of_each_row():
     text = (DOCS / "training.md").read_text()
     for name, (title, _) in training.FLAG_ROWS.items():

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_vector
+from gaussian_swaying._checks import check_frames, check_vector
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.simulation.physgaussian.boundaries import Turned, boundary_settings
 from gaussian_swaying.simulation.physgaussian.camera_settings import camera_settings
@@ -62,7 +62,7 @@ def convert(
     grid_lim, n_grid = take.positive("grid_lim", 2.0), take.whole("n_grid", 50)
     dx = grid_lim / n_grid
     substep, frame_dt = take.positive("substep_dt", 1e-4), take.positive("frame_dt", 1e-2)
-    frames = take.whole("frame_num", 100)
+    frames = check_frames("frame_num", take.whole("frame_num", 100))
     notes.add(
         f"`substep_dt`: the substep is adaptive instead of {substep:g} s, which is only used for damping and impulses; "
         f"--solver.substep {substep:g} fixes it, and is refused unless it is stable."

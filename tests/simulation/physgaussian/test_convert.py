@@ -817,6 +817,7 @@ def test_defaults_are_physgaussians(tmp_path):
         ({"E": "stiff"}, "Expected `E` of .* to be a number, but got 'stiff'"),
         ({"E": -1}, "Expected `E` to be positive"),
         ({"n_grid": 50.5}, "`n_grid` of .* whole number"),
+        ({"frame_num": 1e30}, r"`frame_num` to be a whole number from 1 to 10,000,000, but got 1e\+30"),
         ({"material": "rubber"}, "Expected `material` to be one of jelly, metal"),
         ({"material": "metal"}, "Expected `yield_stress` of metal to be positive"),
         ({"sim_area": [0, 1]}, "Expected `sim_area` to have 6 numbers"),

@@ -1,10 +1,12 @@
 """Formats in which a run leaves its Gaussians."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.gaussians.export import read_usd_frame
+from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, read_usd_frame
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.simulation.recording import recorder as recorder_module
@@ -24,6 +26,54 @@ def test_small_formats(format, suffix, size, make_simulation, tmp_path):
     assert files[0].read_bytes() != files[1].read_bytes()
     assert size is None or files[0].stat().st_size == size
     assert tmp_path / "run" / format in simulation.files
+
+
+@pytest.mark.parametrize(("format", "suffix"), [(k, v) for k, v in SUFFIXES.items() if k != "usd"])
+def test_a_frame_saves_what_a_run_writes(format, suffix, make_simulation, tmp_path):
+    """By the ending, by the option, and its Gaussians alone; frames whose Gaussians are turned and stretched."""
+    recorder = Recorder(ply_every=1, export_format=format, **QUIET)
+    make_simulation().run(tmp_path / "run", 3, progress=False, recorder=recorder)
+    for frame in make_simulation().frames(3):
+        frame.save(tmp_path / f"{frame.index:05d}{suffix}")
+        frame.save(tmp_path / "other", format=format)
+        export_cloud(tmp_path / f"again{suffix}", frame.gaussians)
+        expected = (tmp_path / "run" / format / f"{frame.index:05d}{suffix}").read_bytes()
+        assert (tmp_path / f"{frame.index:05d}{suffix}").read_bytes() == expected
+        assert (tmp_path / "other").read_bytes() == (tmp_path / f"again{suffix}").read_bytes() == expected
+
+
+def test_a_frame_is_saved_as_usd_in_metres(make_simulation, tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    scene = {"up": [0.0, 1.0, 0.0], "metres_per_unit": 2.0}
+    (frame,) = make_simulation(scene=scene, pinned=False).frames(1)
+    frame.save(tmp_path / "one.usda")
+    recorder = Recorder(ply_every=1, export_format="usd", **QUIET)
+    make_simulation(scene=scene, pinned=False).run(tmp_path / "run", 1, progress=False, recorder=recorder)
+    stages = [Usd.Stage.Open(str(tmp_path / name)) for name in ("one.usda", "run/animation.usdc")]
+    assert [UsdGeom.GetStageMetersPerUnit(stage) for stage in stages] == [2.0, 2.0]
+    assert [stage.GetFramesPerSecond() for stage in stages] == [25.0, 25.0]
+    turned = [
+        np.array(UsdGeom.Xformable(s.GetPrimAtPath("/World/Gaussians")).ComputeLocalToWorldTransform(0)) for s in stages
+    ]
+    np.testing.assert_array_equal(*turned)
+    for name, array in read_usd_frame(tmp_path / "one.usda", 0).items():
+        np.testing.assert_array_equal(array, read_usd_frame(tmp_path / "run/animation.usdc", 0)[name])
+
+
+def test_a_frame_that_cannot_be_saved(make_simulation, tmp_path):
+    (frame,) = make_simulation().frames(1)
+    with pytest.raises(ValueError, match=r"Cannot tell the format of .*frame\.obj: .*\.splat"):
+        frame.save(tmp_path / "frame.obj")
+    with pytest.raises(ValueError, match=r"`format` to be one of ply, compressed_ply, splat, usd"):
+        frame.save(tmp_path / "frame.ply", format="obj")
+    with pytest.raises(FileNotFoundError, match="is not a folder; create it first"):
+        frame.save(tmp_path / "none" / "0001.ply")
+    alone = replace(frame.gaussians, model=None)
+    with pytest.raises(ValueError, match="have no opacities: set `model`"):
+        export_cloud(tmp_path / "a.ply", alone)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_film_in_usd(make_simulation, tmp_path):

@@ -78,7 +78,7 @@ def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, mo
             raise OSError("No space left on device")
 
         monkeypatch.setattr(plyfile.PlyData, "write", fail)
-        write = lambda: recorder.write_ply(1, lambda p: write_ply(p, simulation.painter.cloud(simulation.scene.rest())))  # noqa: E731
+        write = lambda: recorder.write_ply(1, lambda p: write_ply(p, simulation.scene.rest().to_cloud()))  # noqa: E731
     else:
         write = lambda: recorder.write_summary({"a": object()})  # noqa: E731
 

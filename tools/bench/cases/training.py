@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from einops import rearrange
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
@@ -33,8 +34,8 @@ from gaussian_swaying.validation.surface_quality import surface_quality
 ROOT = Path(__file__).resolve().parents[3]
 Row = dict[str, Any]
 
-SECTIONS = ("pair", "variants", "flag")
-"""What ``bench.py train`` measures."""
+SECTIONS = ("pair", "variants", "flag", "photos")
+"""What ``bench.py train`` measures; ``photos`` is the recipe for a CPU, which is measured there alone."""
 
 _NO_SURFACE = {"anisotropy": 0.0, "entropy": 0.0, "size": 0.0}
 _MCMC = [f"--config={ROOT}/configs/train/mcmc.yaml"]
@@ -291,6 +292,29 @@ def run(name: str, path: str, steps: int, folder: Path, picture: Path | None = N
     return lightning_run("fox", [*at, *more], steps, folder)
 
 
+def photos_run(path: str, folder: Path, picture: Path | None) -> Row:
+    """The recipe of configs/train/photos_cpu.yaml: what it reaches, and the processor time of all of it."""
+    steps = yaml.safe_load((ROOT / "configs/train/photos_cpu.yaml").read_text())["trainer"]["max_steps"]
+
+    def look(model: GaussianSurfaceModel, data: CaptureDataModule) -> Row:
+        spent = time.process_time() - begin
+        views = data.test_dataloader().dataset
+        camera = views[0].camera
+        if picture is not None:
+            from imageio.v3 import imwrite
+
+            drawn = [panel(model, make_renderer(model.means.device), view.camera, view.image) for view in views]
+            imwrite(picture, (torch.cat(drawn) * 255).round().to(torch.uint8).numpy())
+        photos = {"photos": len(data.capture.split("train")), "width": camera.width, "height": camera.height}
+        return photos | {"processor_s": spent, "threads": torch.get_num_threads()}
+
+    begin = time.process_time()
+    row = lightning_run("photos_cpu", [f"--data.init_args.path={path}"], steps, folder, look)
+    for name in ("seconds", "seconds_with_files", "memory_bytes"):  # a CPU may be shared: its own time is shown
+        del row[name]
+    return row
+
+
 def _visible(gpu: int) -> str:
     """The value of CUDA_VISIBLE_DEVICES for one of the GPUs that this process sees."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES", "")
@@ -337,8 +361,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--capture", help="folder of photos for configs/train/fox.yaml")
     command.add_argument("--flag", default="outputs/captures/flag_800", help="folder of the generated flag's photos")
     command.add_argument(
-        "--only", default=",".join(SECTIONS), help=f"some of {', '.join(SECTIONS)}, separated by commas"
+        "--only", default="pair,variants,flag", help=f"some of {', '.join(SECTIONS)}, separated by commas"
     )
+    command.add_argument("--views", help="picture of the held-out photos beside what `photos` drew, not in the docs")
     command.add_argument(
         "--variants", default=",".join(FOX_VARIANTS), help="variants of the capture, separated by commas"
     )
@@ -355,7 +380,7 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
     wanted = options.only.split(",")
     if unknown := set(wanted) - set(SECTIONS):
         raise SystemExit(f"--only takes {', '.join(SECTIONS)}, not {', '.join(sorted(unknown))}")
-    if {"pair", "variants"} & set(wanted) and not options.capture:
+    if {"pair", "variants", "photos"} & set(wanted) and not options.capture:
         raise SystemExit("the capture is missing: pass its folder with --capture, or skip it with --only flag")
 
     def keep(section: str) -> Callable[[str, Row], None]:
@@ -367,6 +392,9 @@ def measure(options: argparse.Namespace, result: Row, save: Callable[[Row], None
 
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
+        if "photos" in wanted:
+            row = photos_run(options.capture, folder / "photos", options.views and Path(options.views))
+            keep("photos")("photos_cpu", row)
         if "pair" in wanted:
             run("bare", options.capture, 60, folder / "warm")  # loads the kernels
             run("lightning", options.capture, 60, folder / "warm")

@@ -61,14 +61,14 @@ def goals(result: Row) -> list[tuple[str, str, bool]]:
     return found
 
 
-@table(PAGE, "training.goals", "train_*")
+@table(PAGE, "training.goals", "train_cuda")
 def goal_table(result: Row) -> list[str]:
     """The device, and the goals."""
     rows = [[goal, measured, yes_no(reached)] for goal, measured, reached in goals(result)]
     return [source(result), "", *grid(["goal", "measured", "reached"], rows)]
 
 
-@table(PAGE, "training.capture", "train_*")
+@table(PAGE, "training.capture", "train_cuda")
 def capture(result: Row) -> list[str]:
     """The bare loop, Lightning, and the variants."""
     rows = [
@@ -92,7 +92,7 @@ def spread(result: Row, name: str) -> str:
     return f"{max(values) - min(values):.2f} dB"
 
 
-@table(PAGE, "training.gains", "train_*")
+@table(PAGE, "training.gains", "train_cuda")
 def gains(result: Row) -> list[str]:
     """The variants measured as the bare loop was, sorted by their gain over the mean of its runs."""
     bare = [row["psnr_db"] for row in result.get("pair", {}).get("bare", [])]
@@ -102,7 +102,7 @@ def gains(result: Row) -> list[str]:
     return [f"- {found[name]:+.2f} dB {name}" for name in sorted(found, key=lambda name: -found[name])]
 
 
-@table(PAGE, "training.flag", "train_*")
+@table(PAGE, "training.flag", "train_cuda")
 def flag(result: Row) -> list[str]:
     """The effect of each surface loss on a flag whose surface is known."""
     found = {name.removeprefix("flag:"): row for name, row in result.get("flag", {}).items() if "failed" not in row}
@@ -122,3 +122,23 @@ def flag(result: Row) -> list[str]:
         if (row := found.get(name)) is not None
     ]
     return grid(head, rows)
+
+
+@table("from_photos.md", "training.photos", "train_cpu")
+def photos(result: Row) -> list[str]:
+    """What the recipe for a CPU reaches on a capture."""
+    head = ["photos", "size", "images", "Gaussians", "PSNR [dB]", "SSIM", "processor time [min]", "threads"]
+    rows = [
+        [
+            str(row["photos"]),
+            f"{row['width']} x {row['height']}",
+            f"{row['steps']:,}",
+            f"{row['gaussians']:,}",
+            f"{row['psnr_db']:.1f}",
+            f"{row['ssim']:.2f}",
+            f"{row['processor_s'] / 60:.1f}",
+            str(row["threads"]),
+        ]
+        for row in result["photos"].values()
+    ]
+    return [source(result), "", *grid(head, rows)]
