@@ -153,7 +153,8 @@ def kick_time(state: MPMState, dt: float) -> float:
 def work_done(state: MPMState, after: MPMState, dt: float, force: Tensor, drag: Tensor | None) -> Tensor:
     """Work of the external force up to the end of a substep [J].
 
-    It is computed at the mean velocity, which gives exactly what the step adds to the kinetic energy.
+    It is computed at the mean velocity, which gives exactly what the step adds to the kinetic energy; with ``drag``,
+    which acts at the nodes before boundaries do, to first order in the substep.
     """
     if drag is not None:
         force = force - drag[..., None] * (after.velocity - state.velocity)

@@ -203,7 +203,7 @@ def free_block(
 
     Returns:
         ``error`` (the largest change of the mean energy, relative to the first mean), ``kept`` (last mean over the
-        first), ``rise`` (largest growth from one mean to the next, relative), ``growth`` (the largest energy at the end
+        first), ``last_J`` (last mean [J]), ``rise`` (largest growth from one mean to the next, relative), ``growth`` (the largest energy at the end
         of any frame over the first one, less 1), ``swing`` (the bound omega dt / 2 of that for symplectic Euler),
         ``linear`` and ``angular`` (largest relative change of the momenta) and the common quantities.
     """
@@ -230,6 +230,7 @@ def free_block(
     return run.result(
         float((mean / mean[0] - 1).abs().max()),
         kept=float(mean[-1] / mean[0]),
+        last_J=float(mean[-1]),
         rise=float((mean[1:] / mean[:-1] - 1).max()) if len(mean) > 1 else 0.0,
         growth=float(energy.max() / energy[0] - 1),
         swing=0.5 * omega * float(run.state.time) / run.substeps,

@@ -20,6 +20,11 @@ from gaussian_swaying.gaussians.filling import (
 
 H = 0.05  # m, cells
 
+# How far the surface may lie off, on average over a closed body [cells]. The depth behind a plane is right to 0.05
+# (test_depth_below_a_plane). A blur of the standard deviation w = 1.0, the depth of a sheet of these Gaussians, moves a
+# curved one by w² (1 / R1 + 1 / R2) / 2: 0.1 for a ball of ten cells and 0.13 for a tube of three and that depth.
+OFF = 0.18
+
 
 def _discs(normals, sigma):
     """Covariances of flat discs across the normals."""
@@ -209,10 +214,10 @@ def _total_volume(filling):
 @pytest.mark.parametrize("name", _bodies())
 @pytest.mark.parametrize("per_cell", [1, 8])
 def test_volume_against_the_closed_form(name, per_cell):
-    """A cell of the surface may count or not: half a cell on all of it bounds the error."""
+    """The mean depth of the surface is right to a part of a cell."""
     points, normals, volume, area = _bodies()[name]
     filling = _fill(points, normals, particles_per_cell=per_cell)
-    assert abs(_total_volume(filling) - volume) < 0.5 * H * area
+    assert abs(_total_volume(filling) - volume) < OFF * H * area
     assert float(filling.volume.min()) > 0
     assert float(filling.volume.max()) <= H**3 / per_cell * (1 + 1e-12)
     # all Gaussians lie on the surface, so all have a share
@@ -271,9 +276,10 @@ def test_which_gaussians_are_on_the_surface():
     deep = 0.5 - both[0].norm(dim=-1)
     assert bool(filling.on_surface[deep < 0.5 * H].all())
     assert not bool(filling.on_surface[deep > 2 * H].any())
-    # the splat is solid already: few points are added, and all volume is shared
-    assert abs(_total_volume(filling) - math.pi / 6) < 0.5 * H * math.pi
-    assert float(filling.gaussian_volume.sum()) > 0.5 * _total_volume(filling)
+    # the median Gaussian now lies inside, where cells are denser: the sheet counts as 0.13 cells deeper (1.06, not 0.94)
+    assert abs(_total_volume(filling) + 0.13 * H * math.pi - math.pi / 6) < OFF * H * math.pi
+    # only elements of the outer half cell, 3 H / 2 R of the ball, can be without a Gaussian
+    assert float(filling.gaussian_volume.sum()) > (1 - 3 * H / (2 * 0.5)) * _total_volume(filling)
 
 
 def test_a_torn_surface_is_outvoted():
@@ -281,7 +287,7 @@ def test_a_torn_surface_is_outvoted():
     points, normals = _ball(0.5, 0.5 * H)
     keep = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[: len(points) // 4]
     filling = _fill(points[keep], normals[keep])
-    assert abs(_total_volume(filling) - math.pi / 6) < 0.5 * H * math.pi
+    assert abs(_total_volume(filling) - math.pi / 6) < OFF * H * math.pi
 
 
 def test_open_surfaces_enclose_nothing():

@@ -23,7 +23,8 @@ def test_announced_and_taken_times_stand_side_by_side(tmp_path):
     assert found["frames"] == 3
     assert found["ratio"] == pytest.approx(found["announced_s"] / found["process_s"])
     assert 0 < found["announced_s"] < 60  # of three frames, not of all
-    assert found["announced_substeps"] == pytest.approx(found["substeps"], rel=0.5)
+    # the preview times two to nine of the first frames, as fast as the machine is: 12 substeps each, 14.7 over nine
+    assert found["substeps"] <= found["announced_substeps"] <= 1.25 * found["substeps"]
     assert "nothing.yaml" in previews.announced_and_taken("x", ["--config", "nothing.yaml"], files, "cpu")["failed"]
 
 

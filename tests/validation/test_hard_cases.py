@@ -20,7 +20,7 @@ from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import FlowKey, GaussianGust, Modulation, SineSway, UniformGust, WindField
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.geometry.linalg import determinant, singular_values
+from gaussian_swaying.geometry.linalg import determinant, matmul3, singular_values
 from gaussian_swaying.geometry.regions import Box, Everything
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 from gaussian_swaying.mpm.boundaries.handle import Handle
@@ -47,11 +47,6 @@ from gaussian_swaying.simulation.simulation import Simulation
 FORMULATIONS = ["total", "updated"]
 UP = (0.0, 0.0, -9.8)
 CFL = 0.2
-
-# Symplectic Euler keeps a shadow energy, which differs from the true one by at most a share omega dt / 2 of it; with
-# omega dt = 2 at cfl = 0.47 that share is cfl / 0.47. The energy of a free body stays within the ratio of the two ends.
-SHARE = CFL / 0.47
-SHADOW = (1 + SHARE) / (1 - SHARE)
 
 # A plane stops the lattice nodes at or behind it, the first of them up to a cell behind; a particle half a cell behind
 # that one has no moving node left in its support (`total`: nodes act at the centre of their mass, within that support).
@@ -140,13 +135,49 @@ def _shear(position, rate=5.0):
     return torch.stack([rate * x[:, 2], torch.zeros_like(x[:, 0]), -0.5 * rate * x[:, 0]], -1)
 
 
+class _Log(list):
+    """The health of each frame, with potential energies at the time of the velocities; ``slack`` is explained there."""
+
+    slack = 0.0
+
+
+def _add(log, simulation, state, health):
+    r"""Append a health to a log, with the energy that symplectic Euler keeps.
+
+    Its velocities are half a substep before the places. Its shadow Hamiltonian (Hairer, Lubich & Wanner, Geometric
+    Numerical Integration, IX.3: kick, then drift) is
+
+    .. math:: E + \tfrac{\Delta t}{2}\, v \cdot F
+        + \tfrac{\Delta t^2}{12} \bigl(v \cdot V'' v + F \cdot M^{-1} F\bigr) + O(\Delta t^3)
+
+    The first two terms alone are constant where the forces are linear, and gain exactly the work of the wind; they are
+    logged. Forces that are not linear change the last one, and the first two by as much the other way. Its largest
+    value so far is the ``slack`` of the log [J]. What a plane, a transfer or plastic flow takes is lost for good.
+    """
+    solver, dt = simulation.solver, state.substep or simulation.frame_dt / simulation.substeps(state)
+    points, F = solver.points, state.F_elastic
+    rate = state.affine if solver.neighbours_fixed else matmul3(state.affine, F)
+    stress = solver.laws.pk1(F, state.internal)
+    power = float((points.volume * (stress * rate).sum((-1, -2))).double().sum())
+    weight = float((points.mass[:, None] * state.velocity).double().sum(0) @ torch.tensor(solver.gravity).double())
+    elastic, potential = health.elastic - 0.5 * dt * power, health.potential + 0.5 * dt * weight
+    log.append(dataclasses.replace(health, elastic=elastic, potential=potential))
+    density = [solver.laws.energy(F + side * dt * rate, state.internal).double() for side in (-1, 0, 1)]
+    curved = float((points.volume * (density[0] - 2 * density[1] + density[2])).abs().sum())
+    after = solver.step(state, dt)
+    names = ("velocity", "affine", *(["node_velocity"] if solver.neighbours_fixed else []))
+    kicked = state.replace(**{name: getattr(after, name) - getattr(state, name) for name in names})
+    log.slack = max(log.slack, (curved + 2 * float(solver.energies(kicked)["kinetic"])) / 12)
+
+
 def _advance(simulation, frames, state=None):
     """The state after some frames and the health of all, the first one included; whatever diverges is raised."""
     state = simulation.start() if state is None else state
-    log = [diagnose(simulation.solver, state, 0, 0.0)]
+    log = _Log()
+    _add(log, simulation, state, diagnose(simulation.solver, state, 0, 0.0))
     for _ in range(frames):
         state, health = simulation.advance(state)
-        log.append(health)
+        _add(log, simulation, state, health)
         assert all(math.isfinite(value) for value in health.as_dict().values())
         assert health.lost == 0
     return state, log
@@ -156,23 +187,36 @@ def _energy(health):
     return health.kinetic + health.elastic + health.potential
 
 
-def _gain(log):
-    """The most that the mechanical energy ever lay above that of the start and the work of the wind since [J]."""
-    work = list(itertools.accumulate(health.wind_work for health in log))
-    return max(_energy(health) - _energy(log[0]) - done for health, done in zip(log, work, strict=True))
+def _excess(log):
+    """How far the mechanical energy lies above that of the start and the work of the wind since, at each frame [J]."""
+    work = itertools.accumulate(health.wind_work for health in log)
+    return [_energy(health) - _energy(log[0]) - done for health, done in zip(log, work, strict=True)]
 
 
-def _rise(log):
-    """By how much the energy of a body that nobody pushes ever exceeded an earlier one, as a ratio."""
-    energy = [_energy(health) for health in log]
-    return max(later / min(energy[: k + 1]) for k, later in enumerate(energy))
+def _margin(log):
+    """The slack of the log, and the rounding of float32 that each substep may add to the energy."""
+    largest = max(health.kinetic + health.elastic for health in log)
+    return log.slack + sum(health.substeps for health in log) * 2**-23 * largest
+
+
+def _assert_no_gain(log, since=0, beyond=0.0):
+    """At no frame there is more energy than at any earlier one, but for what the wind gave (and `beyond`)."""
+    excess = _excess(log)[since:]
+    lowest = itertools.accumulate(excess, min)
+    assert max(now - least for now, least in zip(excess, lowest, strict=True)) <= _margin(log) + beyond
+
+
+def _assert_balanced(simulation, log):
+    """The energy is that of the start and the work of the wind; `updated` may lose some in its transfers."""
+    _assert_no_gain(log)
+    if simulation.solver.neighbours_fixed:
+        assert min(_excess(log)) >= -_margin(log)
 
 
 def _assert_conserved(simulation, log):
-    """No more energy than at the start but for the shadow, and the momentum of the start to round-off of float32."""
-    start = _energy(log[0])
-    assert max(_energy(health) for health in log) <= SHADOW * start
-    mass = float(simulation.solver.points.mass.sum())
+    """The energy and momentum of the start."""
+    _assert_balanced(simulation, log)
+    mass, start = float(simulation.solver.points.mass.sum()), _energy(log[0])
     for name in ("momentum_x", "momentum_y", "momentum_z"):
         # each of a few thousand substeps rounds a momentum of that of the whole body by eps at most
         bound = sum(health.substeps for health in log) * 2**-23 * math.sqrt(2 * mass * start)
@@ -207,13 +251,13 @@ def test_contrasts_within_one_body(case, formulation):
     _assert_conserved(simulation, log)
     points, laws = simulation.solver.points, simulation.solver.laws
     # energy density >= K / 2 (J - 1)² for a solid with lambda > 0, and mu (a - 1)² for any
-    paid = SHADOW * _energy(log[0]) / points.volume
+    paid = (_energy(log[0]) + _margin(log)) / points.volume
     stretch = singular_values(state.F_elastic)
     assert bool(((stretch - 1).abs().amax(-1) <= (paid / laws.mu).sqrt()).all())
     if case == "nu 0.499":
         assert bool(((determinant(state.F_elastic) - 1).abs() <= (2 * paid / laws.lam).sqrt()).all())
-    # as a whole it goes on as it was thrown: no particle outruns the fastest one by an elastic stretch of its size
-    assert log[-1].displacement_max < 2 * float(_shear(position).norm(dim=-1).max()) * frame_dt * frames
+    # a velocity that is linear in the place is largest at the corners, and stress only holds them back
+    assert log[-1].displacement_max < float(_shear(position).norm(dim=-1).max()) * frame_dt * frames
 
 
 # ---- inverted elements
@@ -233,7 +277,7 @@ def test_an_inverted_body_turns_back(law):
     assert bool((determinant(state.F_elastic) < 0).all())
     state, log = _advance(simulation, 25, state)
     assert bool((determinant(state.F_elastic) > 0).all())
-    assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
+    _assert_no_gain(log)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -253,8 +297,7 @@ def test_a_deeply_inverted_body_does_not_gain_energy(seed):
     moved = nodes @ torch.diag(torch.tensor([-1.6, 0.1, -0.1])) + noise
     state = simulation.solver.step(state.replace(node_displacement=moved), 1e-7)
     _, log = _advance(simulation, 150, state)
-    share = 0.1 / 0.47
-    assert _rise(log) <= (1 + share) / (1 - share)
+    _assert_no_gain(log)
 
 
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
@@ -276,7 +319,7 @@ def test_inverted_particles_of_updated_flatten(law):
     assert bool((after[inverted].abs() < before[inverted].abs()).all())
     assert bool((after[~inverted] > 0).all())
     assert _energy(log[-1]) < _energy(log[0])
-    assert _gain(log) <= (SHADOW - 1) * _energy(log[0])
+    _assert_no_gain(log)
 
 
 # ---- impacts
@@ -307,7 +350,7 @@ def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
     plane = Plane([0, 0, 0], [0, 0, 1])
     simulation = _simulation(points, [plane], formulation=formulation, frame_dt=2e-3, gravity=UP)
     state, log = _advance(simulation, 6, _throw(simulation, [0.0, 0.0, -50.0]))
-    assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
+    _assert_no_gain(log)
     mass = float(points.mass.sum())
     assert abs(log[-1].momentum_z) <= 50.0 * mass
     assert log[-1].momentum_z > -0.1 * 50.0 * mass  # it has been stopped
@@ -324,7 +367,7 @@ def test_a_snowball_on_a_wall(kind):
     simulation = _simulation(_points(x, density=400.0, law=Snow()), [wall], formulation="updated", frame_dt=4e-3)
     state, log = _advance(simulation, 6, _throw(simulation, [20.0, 0.0, 0.0]))
     assert _energy(log[-1]) < 0.9 * _energy(log[0])
-    assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
+    _assert_no_gain(log)
     assert min(health.J_min for health in log) > 0
     assert (
         float(simulation.scene.frame.point_to_scene(state.position)[:, 0].max()) < 0.25 + REACH * simulation.solver.dx
@@ -343,9 +386,7 @@ def test_a_sheet_of_one_layer_and_some_cells_thick(cells, formulation):
     _, log = _advance(simulation, 5)
     work = sum(health.wind_work for health in log)
     assert work > 0
-    assert _gain(log) <= SHARE * work
-    if formulation == "total":
-        assert _energy(log[-1]) >= (1 - SHARE) * work
+    _assert_balanced(simulation, log)
     assert log[-1].torn == 0
 
 
@@ -403,22 +444,39 @@ def test_a_body_within_one_cell(side, formulation):
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_chain_of_stiff_and_soft_links_hangs(formulation):
-    """Let go at once it stretches twice the static sum of weight / (E A), at most: one particle carries one link."""
+    """Let go at once it swings as its five free links do, in `total` to rounding.
+
+    Each particle lies in the middle of a cell of its own length and shares its mass and the spring E A / h between the
+    nodes at its ends; the pin holds those of the last one. The links are linear (fixed corotated, nu = 0).
+    """
     links, h = 6, 0.05
     position = _lattice(1, 1, links, spacing=h)
     stiffness = torch.tensor([5e5, 5e4] * (links // 2))
     points = _points(position, youngs_modulus=stiffness, poisson_ratio=0.0)
-    pin = PinnedRegion(Box([None, None, 0.26], [None, None, None]), held_share=0.2)
+    pin = PinnedRegion(Box([None, None, 0.26], [None, None, None]), "nodes", held_share=0.2)
     # dx = h: neighbours share nodes, and a link is as long as a cell
     simulation = _simulation(points, [pin], formulation=formulation, dx=h, gravity=UP)
     state, log = _advance(simulation, 15)
-    weight = 9.8 * points.mass.cumsum(0)  # what hangs at each link, itself included
-    static = float((weight * h / (stiffness * h**2)).sum())
-    longest = max(health.displacement_max for health in log)
-    assert longest <= 2 * static
-    assert longest > 0.2 * static
+    spring, each, steps = stiffness[:-1].double() * h, float(points.mass[0]), sum(health.substeps for health in log)
+    assert {health.substeps for health in log[1:]} == {steps // 15}  # no substep changed
+    mass = torch.full((links,), each, dtype=torch.float64)
+    mass[0] /= 2
+    way, speed = torch.zeros(2, links, dtype=torch.float64)
+    expected = []
+    for k in range(steps):
+        pull = torch.nn.functional.pad(spring * way.diff(), (1, 1))  # of each link; none below the first node
+        speed = speed + 0.15 / steps * (pull.diff() / mass - 9.8)
+        speed[-1] = 0
+        way = way + 0.15 / steps * speed
+        if (k + 1) % (steps // 15) == 0:
+            expected.append(float((0.5 * (way[:-1] + way[1:])).abs().max()))
+    moved = [health.displacement_max for health in log[1:]]
+    # float32 rounds the displacement in each substep. In `updated` points move within their stencils by this share of a
+    # cell, and as much of their mass and force goes to other nodes
+    error = steps * 2**-24 * max(expected) if formulation == "total" else max(expected) / h * max(expected)
+    assert moved == pytest.approx(expected, abs=error)
     assert bool(torch.isfinite(state.position).all())
-    assert _gain(log) <= SHARE * 9.8 * float(points.mass.sum()) * 2 * static
+    _assert_balanced(simulation, log)
 
 
 # ---- storms
@@ -437,9 +495,12 @@ def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
     _, log = _advance(simulation, 4)
     work = sum(health.wind_work for health in log)
     assert work > 0
-    assert _gain(log) <= SHARE * work
-    # drag ends where the sheet moves with the air: kinetic energy at twice the wind would need a slingshot
-    assert max(health.kinetic for health in log) <= 0.5 * float(simulation.solver.points.mass.sum()) * 200.0**2
+    if drag_step == "explicit":
+        _assert_balanced(simulation, log)
+    else:  # its work is known less well: docs/limits.md, where this share is, measured at 0.098
+        _assert_no_gain(log, beyond=0.12 * work)
+    # drag ends where the sheet moves with the air, and within the 0.04 s it is still on its way out
+    assert max(health.kinetic for health in log) <= 0.5 * float(simulation.solver.points.mass.sum()) * 99.6**2
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -448,9 +509,8 @@ def test_gusts_that_turn_round_every_frame(formulation):
     keys = [FlowKey(0.04 * k, [0.0, 12.0 * (-1) ** k, 0.0]) for k in range(25)]
     simulation = _flag(WindField(schedule=keys), formulation, width=0.4)
     _, log = _advance(simulation, 25)
-    paid = sum(abs(health.wind_work) for health in log)
-    assert paid > 0
-    assert _gain(log) <= SHARE * paid
+    assert sum(abs(health.wind_work) for health in log) > 0
+    _assert_balanced(simulation, log)
     # quasi-steady drag can take a free patch no farther than the wind goes in a frame
     assert max(health.displacement_max for health in log) < 12.0 * 0.04
     assert log[-1].torn == 0
@@ -531,7 +591,7 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
     pressed = simulation.scene.frame.point_to_scene(state.position)[:, 2]
     assert float(pressed.max() - pressed.min()) < 0.15
     state, after = _advance(simulation, 40, state)
-    assert _rise(after) <= SHADOW
+    _assert_no_gain(after)
     assert after[-1].J_min > 0.5
     assert _energy(after[-1]) < _energy(after[0])
 
@@ -561,8 +621,7 @@ def test_material_flows_through_a_moving_velocity_box(law):
     mass = float(simulation.solver.points.mass.sum())
     # along x the box is a wall at rest, which turns 2 m/s round
     assert log[-1].kinetic + log[-1].elastic <= 0.5 * mass * (4.0**2 + 2.0**2)
-    after = [_energy(health) for health in log[6:]]
-    assert max(after) <= SHADOW * after[0]
+    _assert_no_gain(log, since=6)
     assert 0 < log[-1].momentum_z <= 4.0 * mass
     assert abs(log[-1].momentum_x) <= 2.0 * mass
 
@@ -633,7 +692,7 @@ def test_an_energetic_body_in_a_closed_box(law, formulation):
     slack = REACH * simulation.solver.dx
     assert float(place.min()) > -slack
     assert float(place.max()) < 0.6 + slack
-    assert max(_energy(health) for health in log) <= SHADOW * _energy(log[0])
+    _assert_no_gain(log)
 
 
 def test_sand_and_rubber_in_one_run():
@@ -646,7 +705,7 @@ def test_sand_and_rubber_in_one_run():
     velocity = torch.zeros(50, 3)
     velocity[32:, 2] = -3.0
     state, log = _advance(simulation, 10, _throw(simulation, velocity))
-    assert max(_energy(health) for health in log) <= _energy(log[0]) + (SHADOW - 1) * log[0].kinetic
+    _assert_no_gain(log)
     assert _energy(log[-1]) < _energy(log[0])
     assert float(simulation.scene.frame.point_to_scene(state.position)[:, 2].min()) > -REACH * simulation.solver.dx
     assert log[-1].torn == 0
