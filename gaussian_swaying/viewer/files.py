@@ -77,7 +77,7 @@ class Files:
 
     def _save(self, event: viser.GuiEvent) -> None:
         text = self.session.yaml()
-        if self._upload is not None:  # it goes away with the program
+        if self._upload is not None and self._upload.name in text:  # it goes away with the program
             text = "# Give the splat that you loaded: --scene.ply PATH\n" + text.replace(self._upload.name + "/", "")
         if event.client is not None:
             event.client.send_file_download("live.yaml", text.encode(), save_immediately=True)
