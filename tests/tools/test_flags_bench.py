@@ -260,6 +260,15 @@ def test_a_row_of_another_mass_is_marked():
     ]  # fmt: skip
 
 
+def test_rows_of_another_splat_are_not_compared_with_ours():
+    """When ours was measured again with a splat trained anew and a row was not."""
+    old, new = ({"training": {"seconds": seconds}} for seconds in (78.2, 80.1))
+    rows = {"ours": {"1": _share(0.02) | new}, "linear": {"1": _share(0.03) | new}, "thin": {"1": _share(0.04) | old}}
+    (line,) = tables.pattern_lines(rows, 1)
+    assert line.endswith("pressure linear in the cloth's speed +1.00")
+    assert "| 4.00 % (another splat) |" in tables.rows_table({"rows": rows})[-1]
+
+
 def test_rows_that_were_dropped_are_named():
     result = {"rows": {"ours": {"2": _share(0.02)}}, "dropped": {"ours": {"2": _share(0.0162)}}}
     result["dropped"]["updated_04"] = {"2": _share(0.0149)}

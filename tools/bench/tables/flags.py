@@ -41,7 +41,14 @@ def mass_ratio(rows: Row, name: str, pattern: Flag) -> float | None:
 def _cell(rows: Row, name: str, pattern: Flag) -> str:
     """The distance of a row, with its mass where that is not ours."""
     ratio, text = mass_ratio(rows, name, pattern), chamfer(rows[name].get(str(pattern)))
+    text += " (another splat)" * (not _same_splat(rows, name, pattern))
     return text if ratio is None or abs(ratio - 1) <= _HEAVIER else f"{text} ({ratio:.2f} times the mass)"
+
+
+def _same_splat(rows: Row, name: str, pattern: Flag) -> bool:
+    """Whether a row has the splat of ours, or one of its own on purpose: the account of the training tells."""
+    own, ours = (rows.get(key, {}).get(str(pattern), {}).get("training", {}) for key in (name, "ours"))
+    return bool(VARIANTS[name].training) or own.get("seconds", 0) == ours.get("seconds", 0) or not ours or not own
 
 
 def _psnr(row: Row | None) -> str:
@@ -62,9 +69,10 @@ _TRAINED: dict[Flag, float] = {1: 0.025, 2: 0.020, 3: 0.012}  # with trained spl
 
 
 def complete(rows: Row, name: str, pattern: Flag) -> Row | None:
-    """A row that ran to its end and was compared."""
+    """A row that ran to its end and was compared, with the splat of ours."""
     row = rows.get(name, {}).get(str(pattern))
-    return row if row and row.get("status") == "complete" and "chamfer_share" in row else None
+    done = row and row.get("status") == "complete" and "chamfer_share" in row
+    return row if done and (name not in VARIANTS or _same_splat(rows, name, pattern)) else None
 
 
 def doubt(result: Row, pattern: Flag) -> str:
