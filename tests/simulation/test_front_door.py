@@ -561,6 +561,14 @@ def test_a_number_of_frames_is_checked_at_once(count):
         _flag().frames(count)
 
 
+@pytest.mark.parametrize("count", ["0", "10000001"])
+def test_a_number_of_frames_in_a_file_is_checked(count):
+    parser = Simulation.parser()
+    settings = parser.parse_args(["--scene.generator=FlagScene", f"--frames={count}"])
+    with pytest.raises(ValueError, match="`frames` to be a whole number from 1 to 10,000,000"):
+        Simulation.from_settings(parser, settings)
+
+
 def test_a_camera_that_is_not_there():
     (frame,) = _flag().frames(1)
     with pytest.raises(ValueError, match="no camera 'side'"):

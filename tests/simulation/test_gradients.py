@@ -151,3 +151,11 @@ def test_a_gradient_that_would_be_lost_is_refused(make, words):
 def test_a_colour_can_be_edited_beside_a_gradient():
     simulation = _simulation({"E": _leaf(3e3)}, [Edit(color=[1.0, 0.0, 0.0])])
     assert _end(simulation).position.requires_grad
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat"])
+def test_a_frame_with_a_gradient_is_saved(suffix, tmp_path):
+    for name, values in (("with", {"E": _leaf(3e3)}), ("without", {})):
+        *_, frame = _simulation(values).frames(2)
+        frame.save(tmp_path / f"{name}{suffix}")
+    assert (tmp_path / f"with{suffix}").read_bytes() == (tmp_path / f"without{suffix}").read_bytes()
