@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import sys
+from functools import cache
 
 import torch
 
@@ -29,12 +30,15 @@ def peak_memory() -> int | None:
 
 def versions() -> dict[str, str]:
     """Versions of the software that results depend on."""
+    found = {"python": platform.python_version(), "gaussian_swaying": gaussian_swaying.__version__}
+    return found | {name: _version(name) for name in ("torch", "gsplat", "numpy")}
+
+
+@cache  # a process may write the numbers of hundreds of runs
+def _version(name: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
-    found = {"python": platform.python_version(), "gaussian_swaying": gaussian_swaying.__version__}
-    for name in ("torch", "gsplat", "numpy"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"

@@ -15,7 +15,7 @@ from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import RUNS
 
 if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser
+    from jsonargparse import ArgumentParser, Namespace
 
 ALIKE = ("wind.flow", "wind.seed", "material.E", "material.nu", "material.density")
 """Axes along which runs keep their shape."""
@@ -74,12 +74,38 @@ def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
     first.start()  # with all checks of a run
     given = parser.instantiate(settings[0]).material
     members = [first]
-    for one in settings[1:]:
+    for one, text in zip(settings[1:], texts(parser, settings)[1:], strict=True):
         parts = parser.instantiate(one)
         wind = as_wind(parts.wind, first.scene.frame)
-        text = config_text(parser, one)
         members.append(variant(first, wind, parts.material, given, parts.recorder, text))
     return Together(members), settings[0].frames
+
+
+def texts(parser: ArgumentParser, settings: Sequence[Namespace]) -> list[str]:
+    """The configuration of each run as YAML, as :func:`~gaussian_swaying.simulation.config.config_text` writes it.
+
+    The parser takes longer for one than a GPU takes for a frame of all, so it writes the first one, and the values that
+    differ are put in.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        settings: Of each run; they differ in nothing but :data:`ALIKE`.
+    """
+    import yaml
+
+    def written(content: dict[str, Any]) -> str:
+        return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))
+
+    first = config_text(parser, settings[0])
+    content = yaml.safe_load(first)
+    if written(content) != first:  # another version of the parser writes it in another way
+        return [config_text(parser, one) for one in settings]
+    found = []
+    for one in settings:
+        for group, field in (name.split(".") for name in ALIKE):
+            content[group][field] = one[group][field]
+        found.append(written(content))
+    return found
 
 
 def _as_parsed(name: str, value: Any) -> Any:
@@ -89,4 +115,4 @@ def _as_parsed(name: str, value: Any) -> Any:
     return [float(part) for part in value] if isinstance(value, list) else float(value)
 
 
-__all__ = ["grouped", "make_together", "run_together"]
+__all__ = ["grouped", "make_together", "run_together", "texts"]

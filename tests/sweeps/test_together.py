@@ -13,10 +13,11 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.simulation.config import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.job import Job
-from gaussian_swaying.sweeps.plan import make_plan, read_sweep
-from gaussian_swaying.sweeps.together import grouped, make_together
+from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps.together import _as_parsed, grouped, make_together, texts
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
@@ -80,6 +81,32 @@ def test_the_state_of_a_scene(tmp_path, sweep_file):
     assert len({entry.wind_work for entry in health.each}) == 8
     moved = torch.linalg.vector_norm(one.position - together.solver.points.position[3], dim=-1)
     assert health.each[3].displacement_max == pytest.approx(float(moved.amax()))
+
+
+def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path, sweep_file, monkeypatch):
+    """The parser writes one of them, unless its YAML is not what PyYAML makes of it."""
+    axes = {"wind.flow": [[3.0, 1.0, 0.0], [6, 1.5, -0.25]], "material.E": [3e3, 1e-5], "material.nu": [0.3, 0.0]}
+    axes |= {"wind.seed": [1, 7], "material.density": [20, 30.5]}
+    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", axes=axes, draws=1)))
+    parser, calls = Simulation.parser(), []
+    settings = [parse_run(parser, plan.config, plan.frames, plan.runs[0])]
+    for run in plan.runs[6::6]:
+        settings.append(settings[0].clone())
+        for name, value in run.items():
+            settings[-1][name] = _as_parsed(name, value)
+    expected = [config_text(parser, one) for one in settings]
+    assert len(set(expected)) == 6
+
+    def counted(*given):
+        calls.append(given)
+        return config_text(*given) + more
+
+    monkeypatch.setattr("gaussian_swaying.sweeps.together.config_text", counted)
+    more = ""
+    assert texts(parser, settings) == expected
+    assert len(calls) == 1
+    more = "# a comment\n"
+    assert texts(parser, settings) == [text + more for text in expected]
 
 
 def test_a_diverged_run_is_done_alone(tmp_path, sweep_file, capsys):
