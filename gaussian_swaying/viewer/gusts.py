@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 KINDS = {"Sway": "SineSway", "Gusts": "UniformGust", "Noise": "GaussianGust"}
 FIELDS: dict[str, tuple[str, float, float, float]] = {  # label, least, most, step
-    "amplitude": ("Amplitude [share of the wind]", 0.0, 2.0, 0.05),
-    "delta": ("Strength [share of the wind]", 0.0, 1.0, 0.05),
+    "amplitude": ("Amplitude [share]", 0.0, 2.0, 0.05),
+    "delta": ("Strength [share]", 0.0, 1.0, 0.05),
     "std": ("Strength [m/s]", 0.0, 10.0, 0.1),
     "period": ("Period [s]", 0.05, 60.0, 0.05),
     "phase": ("Phase [rad]", -6.3, 6.3, 0.1),
-    "interval": ("New value every [s]", 0.01, 10.0, 0.01),
+    "interval": ("Interval [s]", 0.01, 10.0, 0.01),
 }
 NONE = "Add sway, gusts or noise"
 
@@ -32,7 +32,7 @@ class Gusts:
     def __init__(self, controls: Controls) -> None:
         self._controls, self.session = controls, controls.session
         self.gui = controls.server.gui
-        self.folder = self.gui.add_folder("Sway and gusts")
+        self.folder = self.gui.add_folder("Sway and gusts", expand_by_default=False)
         self.removers: list[Any] = []
         self.numbers: list[dict[str, Any]] = []  # the control of each number, for each modulation
         self._parts: list[Any] = []
@@ -51,14 +51,14 @@ class Gusts:
         for part in self._parts:
             part.remove()
         self._parts, self.numbers, self.removers = [], [], []
+        names = [_name(modulation) for modulation in there]
+        self.folder.label = f"Sway and gusts: {', '.join(names).lower() or 'none'}"
         with self.folder:
             for place, modulation in enumerate(there):
                 self._show_one(place, modulation)
 
     def _show_one(self, place: int, modulation: dict[str, Any]) -> None:
-        kind = modulation["class_path"].rsplit(".", 1)[-1]
-        name = next((name for name, known in KINDS.items() if known == kind), kind)
-        folder = self.gui.add_folder(f"{place + 1}: {name}")
+        folder = self.gui.add_folder(f"{place + 1}: {_name(modulation)}")
         found: dict[str, Any] = {}
         with folder:
             for field, value in (modulation.get("init_args") or {}).items():
@@ -98,3 +98,9 @@ class Gusts:
 
     def _set(self, modulations: list[dict[str, Any]]) -> None:
         self.session.change({"wind.modulations": modulations})
+
+
+def _name(modulation: dict[str, Any]) -> str:
+    """What a modulation is called on the page."""
+    kind = modulation["class_path"].rsplit(".", 1)[-1]
+    return next((name for name, known in KINDS.items() if known == kind), kind)

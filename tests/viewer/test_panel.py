@@ -52,6 +52,7 @@ def test_modulations_that_are_there_are_shown_and_edited(page, client, until):
     session, gusts = page.session, page.controls.gusts
     there = _modulations(session)
     assert [kind for kind, _ in there] == ["SineSway", "GaussianGust"]
+    assert gusts.folder.label == "Sway and gusts: sway, noise"
     shown = [{field: control.value for field, control in numbers.items()} for numbers in gusts.numbers]
     assert shown == [arguments for _, arguments in there]
     client.set(gusts.numbers[0]["period"], 3.0)
@@ -60,12 +61,13 @@ def test_modulations_that_are_there_are_shown_and_edited(page, client, until):
     period = gusts.numbers[0]["period"]
     client.set(gusts.add, "Gusts")
     until(lambda: len(gusts.numbers) == 3)
+    assert gusts.folder.label == "Sway and gusts: sway, noise, gusts"
     assert [kind for kind, _ in _modulations(session)] == ["SineSway", "GaussianGust", "UniformGust"]
     assert period._impl.removed  # the list is drawn anew
     client.set(gusts.numbers[2]["delta"], 0.7)
     until(lambda: session.simulation.wind.modulations[2].delta == 0.7)
     client.set(gusts.removers[0], True)
-    until(lambda: len(gusts.numbers) == 2)
+    until(lambda: len(_modulations(session)) == len(gusts.numbers) == 2)
     assert [kind for kind, _ in _modulations(session)] == ["GaussianGust", "UniformGust"]
     assert session.problem is None
     session.undo()
