@@ -13,7 +13,15 @@ from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge, check_state, diagnose, entry_names
+from gaussian_swaying.simulation.diagnostics import (
+    FrameDiagnostics,
+    SimulationDiverged,
+    TearingGauge,
+    check_state,
+    diagnose,
+    entry_names,
+    measure_scenes,
+)
 
 
 def _solver(**settings):
@@ -264,3 +272,41 @@ def test_a_frame_is_measured_in_one_transfer(formulation):
 
 def test_without_a_particle_none_is_named():
     assert "particle" not in str(SimulationDiverged(1.0, None, "cause", "remedy"))
+
+
+def test_numbers_of_a_batch_are_those_of_its_scenes():
+    """Two scenes with states of their own; the work of the wind is what it did since the state before."""
+    draw = torch.Generator().manual_seed(0)
+
+    def random(*shape):
+        return torch.randn(*shape, generator=draw, dtype=torch.float64)
+
+    rest = torch.rand(30, 3, generator=draw, dtype=torch.float64)
+    moved, velocity, F = 0.1 * random(2, 30, 3), random(2, 30, 3), torch.eye(3) + 0.1 * random(2, 30, 3, 3)
+    lost = torch.rand(2, 30, generator=draw) < 0.2
+    done, work = random(2), torch.tensor([3.5, -1.25], dtype=torch.float64)
+
+    def numbers(index, measured):
+        position = rest.expand(2, 30, 3)[index].clone()
+        points = MaterialPoints.create(position, volume=0.02, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
+        solver = MPMSolver(dx=0.2, formulation="updated")
+        before = solver.init_state(points).replace(work=done[index])
+        state = before.replace(
+            position=position + moved[index],
+            velocity=velocity[index],
+            F_total=F[index],
+            F_elastic=F[index],
+            lost=lost[index],
+            work=(done + work)[index],
+        )
+        return measured(solver, state, before)
+
+    found = numbers(slice(None), lambda *of: measure_scenes(of[0], of[1], 7, 0.1, of[2]).read()).each
+    assert len(found) == 2
+    for k in range(2):
+        expected = numbers(k, lambda *of, k=k: diagnose(of[0], of[1], 7, 0.1, wind_work=work[k], before=of[2]))
+        for name in FrameDiagnostics.__dataclass_fields__:
+            one, other = getattr(found[k], name), getattr(expected, name)
+            if name == "support":
+                one, other = ([value for force in part for value in force] for part in (one, other))
+            assert one == pytest.approx(other, rel=1e-9, abs=1e-12), name
