@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._turns import in_turn
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
@@ -333,13 +332,6 @@ class Simulation(Stepping):
         speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
         coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).detach().abs().sum())
         return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
-
-    def flows(self) -> Tensor:
-        """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
-        if isinstance(self.wind, WindField):
-            return self.wind.flows
-        position = self.scene.points.position
-        return self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
 
     # ---- the run
 

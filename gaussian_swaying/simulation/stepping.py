@@ -16,6 +16,7 @@ from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.timestep import rounding_speed
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     Gauge,
@@ -35,6 +36,10 @@ CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again wi
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first ends the run
 MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastest GPU
+
+ROUNDING_SHARE = 0.5
+"""Share of the driving speed that the bound of :func:`rounding_speed` may reach in a second; rounding itself reaches a
+tenth of its bound or so."""
 
 
 class Stepping(nn.Module):
@@ -104,6 +109,13 @@ class Stepping(nn.Module):
         custom = [force for force in self.custom_forces if isinstance(force, Force)]
         return custom if self.idle else [self.wind_force, *custom]
 
+    def flows(self) -> Tensor:
+        """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
+        if isinstance(self.wind, WindField):
+            return self.wind.flows
+        position = self.scene.points.position
+        return self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
+
     # ---- at rest
 
     @in_turn
@@ -112,7 +124,7 @@ class Stepping(nn.Module):
 
         Raises:
             ValueError: If a pin holds nothing, the grid is too large or a fixed substep is too long, now or after one
-                of the edits.
+                of the edits; if the material is so stiff that rounding shakes it.
         """
         editor, frame = self.editor, self.scene.frame
         self._started += 1
@@ -138,9 +150,24 @@ class Stepping(nn.Module):
                 f"A frame of {self.frame_dt:g} s would take {at_rest:,} substeps with this material and grid, more "
                 f"than the limit of {MAX_SUBSTEPS:,}: {remedy}."
             )
+        self._check_rounding(state, self.frame_dt / at_rest)
         self.most_substeps = min(MAX_GROWTH * at_rest, MAX_SUBSTEPS)
         self._tearing = None if self.solver.neighbours_fixed else TearingGauge(self.solver)
         return state
+
+    def _check_rounding(self, state: MPMState, dt: float) -> None:
+        """Raise ValueError if rounding moves the material at rest nearly as fast as wind and gravity do."""
+        drive = math.hypot(*self.solver.gravity)  # for a second
+        if not self.idle:
+            drive = max(drive, float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax()))
+        speed, dtype = float(self.solver.cells_per_second(state)) * self.solver.dx, state.position.dtype
+        shaken = rounding_speed(speed, dt, 1.0 / dt, self.solver.dx, dtype)
+        if drive > 0 and shaken > ROUNDING_SHARE * drive:
+            raise ValueError(
+                f"Rounding to {str(dtype).removeprefix('torch.')} may shake this stiff material by {shaken:.2g} m/s "
+                f"within a second, more than {ROUNDING_SHARE:g} of what drives it (wind, or gravity for a second, of "
+                f"{drive:.2g} m/s): lower `material.E` or `material.nu`, or set `dtype` to float64."
+            )
 
     # ---- edits
 

@@ -159,7 +159,7 @@ def test_a_force_with_a_resistance_is_stable_however_light_the_body():
     torch.testing.assert_close(
         carried, torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64).expand(20, 3), atol=0.05, rtol=0
     )
-    assert not float(solver.rollout(start, DT, 40, Carried(False)).velocity.abs().max()) < 1e3
+    assert not float(solver.rollout(start, DT, 40, Carried(False), check=False).velocity.abs().max()) < 1e3
 
 
 @torch.no_grad()
