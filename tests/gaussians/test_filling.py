@@ -276,7 +276,7 @@ def test_which_gaussians_are_on_the_surface():
     deep = 0.5 - both[0].norm(dim=-1)
     assert bool(filling.on_surface[deep < 0.5 * H].all())
     assert not bool(filling.on_surface[deep > 2 * H].any())
-    # the median Gaussian now lies inside, where cells are denser: the sheet counts as 0.13 cells deeper (1.06, not 0.94)
+    # the median Gaussian now lies inside, where cells are denser: the sheet counts as 0.13 cells deeper, 1.06 for 0.94
     assert abs(_total_volume(filling) + 0.13 * H * math.pi - math.pi / 6) < OFF * H * math.pi
     # only elements of the outer half cell, 3 H / 2 R of the ball, can be without a Gaussian
     assert float(filling.gaussian_volume.sum()) > (1 - 3 * H / (2 * 0.5)) * _total_volume(filling)
