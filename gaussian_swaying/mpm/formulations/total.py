@@ -113,7 +113,9 @@ class Total(Formulation):
         found = []
         for s, (place, weight) in enumerate(zip(position, mass, strict=True)):
             if held is None:
-                where = self.body.boundaries[k].at.detach().cpu().to(place)
+                pins = self.body.boundaries[k]
+                assert isinstance(pins, PinnedPoints)
+                where = pins.at.detach().cpu().to(place)
             else:
                 where = place[held.mass.detach().reshape(-1, count)[s].cpu() > 0]
             found.append(thickness(place, weight, where, self.settings.dx))

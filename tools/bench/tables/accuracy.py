@@ -181,6 +181,31 @@ def cantilever(rows: list[Row]) -> list[str]:
     )
 
 
+@rows_table("accuracy.held_cantilever")
+def held_cantilever(rows: list[Row]) -> list[str]:
+    """Frequencies of cantilevers held in a region, over that of a clamped beam, by thickness and depth."""
+    found = select(rows, "held cantilever")
+    depths = sorted({row["parameters"]["depth"] for row in found})
+    lines = []
+    for thickness in sorted({row["parameters"]["thickness"] for row in found}):
+        own = select(found, "held cantilever", thickness=thickness)
+        cells = {row["parameters"]["depth"]: row["result"] for row in own}
+        told = [f"{r['lowest']:.3f} to {r['highest']:.3f}" if (r := cells.get(depth)) else "-" for depth in depths]
+        lines.append([f"{thickness:g}", *told])
+    return grid(["thickness [cells]", *(f"held depth {depth:g}" for depth in depths)], lines)
+
+
+@rows_table("accuracy.clamped_end")
+def clamped_end(rows: list[Row]) -> list[str]:
+    """Error of the frequency of a clamped beam, by cells through its thickness."""
+    found = select(rows, "clamped end")
+    lines = []
+    for before, row in zip([None, *found], found, strict=False):
+        observed = f"{order(before, row):.2f}" if before else ""
+        lines.append([str(row["parameters"]["cells"]), f"{row['result']['error']:.2e}", observed])
+    return grid(["cells through the thickness", "error of the frequency", "order"], lines)
+
+
 def _mobilised(degrees: float) -> float:
     """Strength of the cone, fitted to an angle in triaxial compression, where one principal stress is the mean."""
     sine = math.sin(math.radians(degrees))
