@@ -94,7 +94,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     flows = session.simulation.wind.flows
     assert flows / flows.norm() == pytest.approx((before / before.norm()).numpy(), abs=0.02)  # the same direction
     session.change({"wind.flow": [1e7, 0.0, 0.0]})
-    window.get_by_text("to start again").wait_for(timeout=20_000)
+    window.get_by_text("to start again").wait_for()
     session.change({"wind.flow": [2.0, 0.0, 0.0]})
     window.get_by_role("button", name="Back to rest").click()
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)

@@ -225,3 +225,12 @@ def test_a_splat_that_is_loaded_tells_how_far_it_is(page, client, until, tmp_pat
     assert len(shares) > 4
     until(lambda: page.controls.stiffness.value == page.session.settings.material.E)
     assert "scene.ply" in page.session.yaml()
+
+
+def test_what_diverges_is_told_with_its_remedies(page, client, until):
+    """Two of them, and *Undo* heals it."""
+    page.session.change({"wind.flow": [1e7, 0.0, 0.0]})
+    until(lambda: "to start again, or **Undo**" in page._text.content)
+    until(lambda: not page.controls.undo.disabled)
+    client.set(page.controls.undo, True)
+    until(lambda: not page.session.broken and "to start again" not in page._text.content)
