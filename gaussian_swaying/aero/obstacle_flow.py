@@ -76,8 +76,8 @@ def carlson_rd(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     r"""Carlson's elliptic integral :math:`R_D = \tfrac32 \int_0^\infty [(t+x)(t+y)]^{-1/2} (t+z)^{-3/2} dt`.
 
     By duplication (Carlson 1995, Numer. Algorithms 10, 13): each of nine steps quarters the spread of the arguments,
-    and a series takes what remains. Its next terms are below 1e-17 if the arguments are within 1e12 of each other,
-    those of half axes within 1e6.
+    and a series takes what remains. Its next terms are below 1e-17 if the arguments are within 1e12 of each other, as
+    they are for half axes within 1e6.
 
     Args:
         x: Positive, any shape.
