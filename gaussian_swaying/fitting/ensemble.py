@@ -24,6 +24,8 @@ SAFETY = 1.15
 """How much stiffer than at rest the material may become before a rollout is repeated with shorter substeps."""
 CFL_LIMIT = 0.5
 RETRIES = 3
+MARGINS = (0, 16, 64)
+"""Cells around the grid of ``updated``, one after the other if particles leave it."""
 
 Values = Mapping[str, float]
 
@@ -132,8 +134,12 @@ class Ensemble:
         return rate
 
     def _advance(self, group: _Group, time: float, steps: int, careful: bool) -> None:
-        solver = group.solver
-        group.state = solver.rollout(solver.fit_grid(group.state, time), time / steps, steps, group.forces)
+        solver, before = group.solver, group.state
+        for margin in MARGINS:  # a variant may end in NaN, and what leaves the grid gets a larger one
+            start = solver.fit_grid(before, time, margin)
+            group.state = solver.rollout(start, time / steps, steps, group.forces, check=False)
+            if solver.neighbours_fixed or not bool(group.state.lost.any()):
+                break
         if careful:
             number = float(solver.cfl_number(group.state, time / steps))
             if not number <= CFL_LIMIT:

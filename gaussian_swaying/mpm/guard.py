@@ -19,7 +19,7 @@ from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace
 
 
-def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int) -> int:
+def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, limit: bool = True) -> int:
     """Check the arguments of a rollout.
 
     Args:
@@ -27,6 +27,7 @@ def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int) -> i
         state: The state to start from.
         dt: Substep [s].
         steps: Number of substeps.
+        limit: Whether to refuse a substep that nothing is stable with.
 
     Returns:
         The number of substeps as an integer of Python.
@@ -46,7 +47,7 @@ def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int) -> i
     if count < 0:
         raise ValueError(f"Expected `steps` not to be negative, but got {count}.")
     check_positive("dt", float(dt))
-    if dt > bound.longest_substep:
+    if limit and dt > bound.longest_substep:
         raise ValueError(
             f"Expected `dt` of at most {bound.longest_substep:.3g} s, as no longer substep is stable with this "
             f"material and grid, but got {float(dt):g} s: `solver.substeps(state, time)` says how many substeps a time "

@@ -412,8 +412,8 @@ class MPMSolver(nn.Module):
                 each time they are called with the same state.
             watch: Called from time to time with the number of substeps that are done, or queued on a GPU; not with
                 ``checkpoint``.
-            check: Whether to check the state at the end (one GPU synchronisation). Without, ``state.lost`` says what
-                left the grid, and what diverged is NaN.
+            check: Whether to check the length of the substep, and the state at the end (one GPU synchronisation).
+                Without, ``state.lost`` says what left the grid, and what diverged is NaN.
 
         Returns:
             The state ``steps * dt`` later.
@@ -424,7 +424,7 @@ class MPMSolver(nn.Module):
                 given is NaN or infinite, or if a particle left the grid of ``updated``; see :meth:`fit_grid`.
             FloatingPointError: If a particle became NaN or infinite.
         """
-        acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps)
+        acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps, check)
         end = self._rollout(state, dt, steps, acting, checkpoint, watch)
         if check:
             check_end(self.bound, state, end, dt, steps, acting)
@@ -478,7 +478,7 @@ class MPMSolver(nn.Module):
         Returns:
             The state ``steps * dt`` later, and the largest Courant number seen, a scalar tensor.
         """
-        acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps)
+        acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps, check)
         marks, end, seen = look_marks(steps, looks), state, []
         fused = self._fused_for(state, acting) if self.stiffness_damping == 0 else None
         if fused is not None and fused.watches:

@@ -8,6 +8,7 @@ from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.fitting import ensemble
 from gaussian_swaying.fitting.ensemble import Ensemble, member_of
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -47,6 +48,21 @@ def test_each_variant_moves_as_its_own_simulation(simulation, tmp_path):
         assert moved > 0.05
         assert off < 5e-3 * moved  # the substeps differ
     assert [float(state.time) for state in found[-1]] == pytest.approx([TIMES[-1]] * len(values))
+
+
+def test_what_leaves_the_grid_of_updated_gets_a_larger_one(tmp_path, monkeypatch):
+    """A free flag in a storm; its first grid knows nothing of the wind, and stopped it without a word."""
+    material = {"E": 1e5, "nu": 0.3, "density": 25.0, "thickness": 0.01}
+    settings = base(material=material, wind={"flow": [40.0, 0.0, 0.0]}, solver={"dx": 0.1, "formulation": "updated"})
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(settings))
+    simulation = Simulation.from_yaml(tmp_path / "base.yaml", device="cpu")
+    times = [0.0, 0.05]
+    (first,), (last,) = Ensemble(simulation).run([{}], times)
+    assert not bool(last.lost.any())
+    assert float((last.position - first.position)[:, 0].mean()) > 0.57
+    monkeypatch.setattr(ensemble, "MARGINS", (0,))
+    *_, (stopped,) = Ensemble(simulation).run([{}], times)
+    assert bool(stopped.lost.any())
 
 
 def test_wind_on_patches_of_many_directions_in_a_batch():
