@@ -203,9 +203,10 @@ def free_block(
 
     Returns:
         ``error`` (the largest change of the mean energy, relative to the first mean), ``kept`` (last mean over the
-        first), ``last_J`` (last mean [J]), ``rise`` (largest growth from one mean to the next, relative), ``growth`` (the largest energy at the end
-        of any frame over the first one, less 1), ``swing`` (the bound omega dt / 2 of that for symplectic Euler),
-        ``linear`` and ``angular`` (largest relative change of the momenta) and the common quantities.
+        first), ``last_J`` (last mean [J]), ``rise`` (largest growth from one mean to the next, relative), ``growth``
+        (the largest energy at the end of any frame over the first one, less 1), ``swing`` (the bound omega dt / 2 of
+        that for symplectic Euler), ``linear`` and ``angular`` (largest relative change of the momenta) and the common
+        quantities.
     """
     dx, young, density, nu = 1.0 / cells, 1e4, 100.0, 0.3
     points = block(dx, (0, 0, 0), (cells,) * 3, settings, density=density, youngs_modulus=young, poisson_ratio=nu)
