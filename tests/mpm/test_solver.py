@@ -211,8 +211,8 @@ def test_total_moves_with_particles_on_half_cell_planes():
             solver = MPMSolver(dx=0.1, boundaries=[PinnedRegion(Box([None, None, 0.35], [None, None, None]))])
             state = solver.rollout(solver.init_state(moved), 1e-3, 200)
             assert bool(torch.isfinite(state.position).all())
-            # a bar that is let go unstretched is strained by up to 2 rho g L / E, and is longer by rho g L² / E after
-            # 2, 6 and so on L / c, here 0.005 s before the end; to second order in a cell over its length
+            # let go unstretched, a bar is strained by 2 rho g L / E at most, and longer by rho g L² / E after 2, 6, ...
+            # times L / c, here 0.005 s before the end; to second order in a cell over its length
             load, length = 30.0 * 9.8 / 3e3, 0.325
             assert float((state.F_elastic - torch.eye(3, dtype=dtype)).abs().max()) < 2 * load * length
             lowest = float((state.position - moved.position).norm(dim=-1).max())
@@ -339,7 +339,7 @@ def test_particle_that_outruns_its_grid_is_marked_lost():
     points = _block(count=20)
     solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0))
     state = solver.init_state(points, torch.full((20, 3), 50.0, dtype=torch.float64), margin=1)
-    state = solver.rollout(state, 2e-3, 20, check=False)
+    state = solver.rollout(state, 2e-3, 20)
     assert bool(state.lost.any())
 
 
