@@ -88,7 +88,6 @@ def thickness(points: Tensor, mass: Tensor, places: Tensor, dx: float) -> tuple[
     return least, least <= SHEET * dx and middle >= max(_WIDE * dx, _BROAD * least)
 
 
-@torch.no_grad()
 def face(points: Tensor, held: Tensor, dx: float) -> tuple[Tensor, Tensor]:
     """Places on the face between held and free particles, and directions across it.
 
@@ -136,7 +135,6 @@ def along_face(normal: Tensor) -> Tensor:
     return torch.where((long > 0.5)[:, None, None], both, axes)
 
 
-@torch.no_grad()
 def face_patches(points: Tensor, mass: Tensor, held: Tensor, dx: float) -> tuple[Tensor, Tensor]:
     """The patches of the face of a clamped region: their centres, and the directions of the slopes that are held.
 
@@ -155,12 +153,12 @@ def face_patches(points: Tensor, mass: Tensor, held: Tensor, dx: float) -> tuple
     place, across = face(points, held, dx)
     size, equal = PATCH * dx, torch.ones(len(place), dtype=place.dtype)
     while True:
-        cell = torch.unique((place / size).floor().long(), dim=0, return_inverse=True)[1]
+        cell = torch.unique((place.detach() / size).floor().long(), dim=0, return_inverse=True)[1]
         if 4 * (int(cell.max()) + 1 if len(cell) else 0) <= MOST_ROWS:
             break
         size *= 2
     group = groups(place, equal, cell, LEAST_APART * size)
     normal = means(across, equal, group)
-    if len(place) and thickness(points, mass, place, dx)[0] < LAYER * dx:
+    if len(place) and thickness(points, mass, place.detach(), dx)[0] < LAYER * dx:
         normal = torch.zeros_like(normal)
     return means(place, equal, group), along_face(normal)

@@ -139,7 +139,7 @@ class PointHolds:
                     assert own is not None
                     held = own.mass.reshape(-1, count)[s].cpu() > 0
                     mass = body.points.mass.reshape(-1, count)[s].cpu().double()
-                    place, along = face_patches(points[s].detach(), mass.detach(), held, grid.dx)
+                    place, along = face_patches(points[s], mass.detach(), held, grid.dx)
                     corner = cells_of_places(place, grid, massive)
                     some = (corner >= 0).nonzero()[:, 0]
                     place, along, corner = place[some], along[some], corner[some]

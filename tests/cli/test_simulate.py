@@ -400,7 +400,7 @@ GUST = '[{"class_path": "SineSway", "init_args": {"amplitud": 1.0}}]'
         (["--wind.modulations", GUST], ["amplitud", "wind.modulations"]),
         (["--shader.class_path", "NoSuchShader"], ["NoSuchShader"]),
         (["--frames", "many"], ["frames", "many"]),
-        (["--frames", "0"], ["`frames`", "at least 1"]),
+        (["--frames", "0"], ["`frames`", "from 1 to"]),
         (["--frame_dt", "0"], ["`frame_dt`"]),
         (["--background", "[0.5]"], ["`background`", "3 numbers"]),
         (["--material.nu", "0.5"], ["`material.nu`", "0.49"]),

@@ -339,7 +339,7 @@ def test_particle_that_outruns_its_grid_is_marked_lost():
     points = _block(count=20)
     solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0))
     state = solver.init_state(points, torch.full((20, 3), 50.0, dtype=torch.float64), margin=1)
-    state = solver.rollout(state, 2e-3, 20)
+    state = solver.rollout(state, 2e-3, 20, check=False)
     assert bool(state.lost.any())
 
 

@@ -137,7 +137,7 @@ def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monk
     assert (tmp_path / "run/frames/00000.png").exists()
 
 
-def test_the_cameras_of_a_billion_frames(tmp_path, monkeypatch):
+def test_the_cameras_of_as_many_frames_as_there_may_be(tmp_path, monkeypatch):
     """Some of them are looked at, with the first and the last."""
     seen = []
     monkeypatch.setattr(Painter, "check_camera", lambda self, frame: seen.append(frame))
@@ -146,9 +146,9 @@ def test_the_cameras_of_a_billion_frames(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(stepping.Stepping, "start", stop)
-    assert main([*SMALL, "--frames", "1000000000", "--output", str(tmp_path / "run")]) == 130
+    assert main([*SMALL, "--frames", "10000000", "--output", str(tmp_path / "run")]) == 130
     assert len(seen) == MAX_LOOKS
-    assert (seen[0], seen[-1]) == (0, 999_999_999)
+    assert (seen[0], seen[-1]) == (0, 9_999_999)
     seen.clear()
     assert main([*SMALL, "--frames", "7", "--output", str(tmp_path / "run")]) == 130
     assert seen == list(range(7))

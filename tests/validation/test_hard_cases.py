@@ -164,7 +164,7 @@ def _add(log, simulation, state, health):
     log.append(dataclasses.replace(health, elastic=elastic, potential=potential))
     density = [solver.laws.energy(F + side * dt * rate, state.internal).double() for side in (-1, 0, 1)]
     curved = float((points.volume * (density[0] - 2 * density[1] + density[2])).abs().sum())
-    after = solver.step(state, dt)
+    after = solver.step(solver.fit_grid(state, dt), dt)
     names = ("velocity", "affine", *(["node_velocity"] if solver.neighbours_fixed else []))
     kicked = state.replace(**{name: getattr(after, name) - getattr(state, name) for name in names})
     log.slack = max(log.slack, (curved + 2 * float(solver.energies(kicked)["kinetic"])) / 12)
