@@ -8,6 +8,7 @@ import yaml
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.viewer import session as session_module
 from gaussian_swaying.viewer.gusts import KINDS
 from gaussian_swaying.viewer.legends import legend
 from gaussian_swaying.viewer.materials import MATERIALS, in_pascal, like
@@ -48,7 +49,8 @@ def test_the_configuration_comes_back_and_changes_are_undone(page, client, until
     assert len(controls.holding.places()) > 5
 
 
-def test_modulations_that_are_there_are_shown_and_edited(page, client, until):
+def test_modulations_that_are_there_are_shown_and_edited(page, client, until, monkeypatch):
+    monkeypatch.setattr(session_module, "ONE_CHANGE", 0.0)  # each is undone on its own, however fast they follow
     session, gusts = page.session, page.controls.gusts
     there = _modulations(session)
     assert [kind for kind, _ in there] == ["SineSway", "GaussianGust"]
