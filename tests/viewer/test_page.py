@@ -194,7 +194,9 @@ def test_a_click_takes_hold_of_the_flag(page, window, until):
     window.mouse.click(10, height - 10)  # beside the object: what is held stays held
     time.sleep(0.5)
     assert session.pulls
-    window.get_by_role("button", name="Let go of it").dispatch_event("click")
+    let_go = window.get_by_role("button", name="Let go of it")
+    until(let_go.is_enabled, 60)  # a slow browser hears of it later
+    let_go.dispatch_event("click")
     until(lambda: not session.pulls and holding._handle is None, 60)
     assert window.problems == []
 
