@@ -118,7 +118,8 @@ class Holding:
 
     def places(self) -> np.ndarray:
         """Places at rest of the material points that pins and handles hold [scene units], shape (N, 3)."""
-        scene, body = self.session.simulation.scene, self.session.simulation.solver.bound.body
+        with self.session.lock:  # a change binds the solver anew
+            scene, body = self.session.simulation.scene, self.session.simulation.solver.bound.body
         held = torch.zeros(scene.points.count, dtype=torch.bool, device=scene.points.position.device)
         for boundary in body.boundaries:
             if isinstance(boundary, PinnedRegion):

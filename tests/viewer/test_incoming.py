@@ -150,9 +150,10 @@ def test_before_the_server_is_there_nothing_passes():
     assert not Incoming(print).takes(b"")
 
 
-def test_many_clients_at_once_are_served_in_turn(page, connect, until, capfd):
+def test_many_clients_at_once_are_served_in_turn(page, connect, until, capfd, monkeypatch):
     """Each of 24 drags and presses as fast as it can; nothing fails, and nothing that is asked last is lost."""
     controls, failed = page.controls, []
+    monkeypatch.setattr(page.turns, "_failed", failed.append)
     clients = [connect(page) for _ in range(24)]
 
     def play(number, client):
@@ -169,6 +170,7 @@ def test_many_clients_at_once_are_served_in_turn(page, connect, until, capfd):
                 client.set(controls.arrow, k % 2 == 0)
                 client.set(controls.box, k % 2 == 1)
                 time.sleep(0.1)
+            client.look(fov=0.5)  # the last word
         except Exception as error:
             failed.append(error)
 
@@ -177,13 +179,30 @@ def test_many_clients_at_once_are_served_in_turn(page, connect, until, capfd):
         player.start()
     for player in players:
         player.join()
-    assert failed == []
+    until(lambda: all(client.camera.fov == 0.5 for client in page.server.get_clients().values()))
     clients[0].set(controls.damping, 7.5)
     until(lambda: page.session.settings.solver.damping == 7.5, 60)
     for client in clients:
         client.socket.socket.close()  # all at once, without a word
     until(lambda: not page.server.get_clients(), 60)
+    assert failed == []
     told = "".join(capfd.readouterr())
     assert "Traceback" not in told, told[-3000:]
     assert "exception" not in told
     assert page.session.problem is None or page.session.broken  # only the wind may have been too much
+
+
+def test_what_is_held_is_drawn_between_changes(page):
+    """A change takes the solver's material away for a moment."""
+    session, solver = page.session, page.session.simulation.solver
+    session.pause()
+    time.sleep(0.2)
+    drawn = []
+    drawing = threading.Thread(target=lambda: drawn.append(page.controls.holding.places()))
+    with session.lock:
+        bound, solver._bound = solver._bound, None
+        drawing.start()
+        time.sleep(0.1)
+        solver._bound = bound
+    drawing.join()
+    assert len(drawn[0]) > 0
