@@ -14,7 +14,7 @@ from bench.tables import accuracy as tables
 from bench.tables import pareto as sweep
 from bench.tables.accuracy_goals import GOALS
 from bench.tables.goals import of_runs
-from bench.tables.rows import order
+from bench.tables.rows import order, own_order
 from bench.tables.runs import seconds, whole
 
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -139,6 +139,16 @@ def test_claims_of_the_pages_are_those_of_the_records():
     runs = [{"name": "flag", "process_wall_s": 1.0, "simulated_s": 3.0}]
     runs.append({"name": "guitar, 1920x1080", "process_wall_s": 8.57, "simulated_s": 9.96})
     assert seconds({"runs": runs}, "guitar") == "8.6 s for 10 simulated seconds"
+
+
+@pytest.mark.parametrize("p", [1.0, 2.0, 3.3])
+def test_the_order_toward_an_own_limit(p):
+    rows = [{"parameters": {"cells": n}, "result": {"ratio": 1.7 - 0.3 * n**-p}} for n in (3, 4, 6)]
+    assert own_order(rows) == pytest.approx(p, abs=1e-6)
+    rows[2]["result"]["ratio"] = 0.0  # turns back
+    assert math.isnan(own_order(rows))
+    rows[2]["result"]["ratio"] = rows[1]["result"]["ratio"] + 1.0  # grows
+    assert math.isnan(own_order(rows))
 
 
 def test_the_observed_order():

@@ -126,7 +126,7 @@ def cases(device: str, thorough: bool) -> Iterable[tuple[str, Row, Callable[[], 
     for thickness in (0.3, 1.0, 2.0, 4.0, 8.0) if thorough else (0.3, 2.0):
         for depth in (0.34, 0.51, 1.01, 2.01) if thickness < 8 else (1.01,):
             yield case("held cantilever", _held_anyhow, "total", thickness=thickness, depth=depth)
-    for cells in (2, 3, 4, 6):
+    for cells in (2, 3, 4, 6, 8):
         yield case("clamped end", _clamped_end, "total", cells=cells)
     for variant in everyone:
         for cells in (16, 24, 32, 48) if thorough and variant == "total" else (16, 24, 32):
