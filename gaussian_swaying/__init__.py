@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.geometry.frame import SimFrame
     from gaussian_swaying.geometry.keyed_path import KeyedPath
     from gaussian_swaying.geometry.regions import Box, Cylinder, Sphere
+    from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera
     from gaussian_swaying.metrics.chamfer import ChamferDistance, chamfer_distance
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance, frechet_distance
     from gaussian_swaying.mpm.boundaries.ball import BallObstacle
@@ -67,6 +68,8 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
     from gaussian_swaying.mpm.solver import MPMSolver
     from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, support_force
+    from gaussian_swaying.recording.recorder import Recorder
+    from gaussian_swaying.recording.trajectory import load_trajectory
     from gaussian_swaying.rendering.cameras.camera import Camera
     from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
     from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera
@@ -76,10 +79,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.simulation.diagnostics import SimulationDiverged, TearingGauge
     from gaussian_swaying.simulation.edits import Edit
     from gaussian_swaying.simulation.frame import Frame
-    from gaussian_swaying.simulation.physgaussian.camera import PhysGaussianCamera
-    from gaussian_swaying.simulation.physgaussian.space import Normalisation
-    from gaussian_swaying.simulation.recording.recorder import Recorder
-    from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+    from gaussian_swaying.simulation.normalisation import Normalisation
     from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
     from gaussian_swaying.simulation.simulation import Simulation
     from gaussian_swaying.training.data.datamodule import CaptureDataModule
@@ -217,12 +217,12 @@ _HOMES = {
         "TearingGauge",
     ),
     "simulation.edits": ("Edit",),
-    "simulation.physgaussian.camera": ("PhysGaussianCamera",),
-    "simulation.physgaussian.space": ("Normalisation",),
+    "interop.physgaussian.camera": ("PhysGaussianCamera",),
+    "simulation.normalisation": ("Normalisation",),
     "simulation.frame": ("Frame",),
     "simulation.simulation": ("Simulation",),
-    "simulation.recording.recorder": ("Recorder",),
-    "simulation.recording.trajectory": ("load_trajectory",),
+    "recording.recorder": ("Recorder",),
+    "recording.trajectory": ("load_trajectory",),
     "simulation.scene": (
         "Material",
         "Scene",

@@ -6,7 +6,7 @@ import shutil
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parent))  # last, so that nothing that is installed is shadowed
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools")]  # last, so as to shadow nothing
 os.environ["GAUSSIAN_SWAYING_CHECKS"] = "1"
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, and for the same reason
 

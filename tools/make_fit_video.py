@@ -11,8 +11,9 @@ import argparse
 import sys
 from pathlib import Path
 
+from bench.problems.films import write_video
+
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.validation.films import write_video
 
 
 def main(arguments: list[str] | None = None) -> int:

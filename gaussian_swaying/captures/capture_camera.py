@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -157,3 +158,16 @@ class CaptureCamera(CameraPath):
             f"`{self.path}` has no view `{view}`, or several: set `view` to one of {len(names)} names such as "
             f"{names[0]}."
         )
+
+
+def photo_azimuth(eyes: Tensor, center: Tensor, rotation: Tensor) -> float | None:
+    """Azimuth of the side from which photos were taken [degrees]; None if they were taken from all around.
+
+    Args:
+        eyes: Positions of the cameras [scene units], shape (C, 3).
+        center: Centre of the object [scene units], shape (3,).
+        rotation: Scene axes to axes with z up, float64, shape (3, 3).
+    """
+    away = ((eyes.double() - center.double()) @ rotation.T)[:, :2]
+    mean = torch.nn.functional.normalize(away, dim=-1).mean(0)
+    return math.degrees(math.atan2(float(mean[1]), float(mean[0]))) if float(mean.norm()) > 0.5 else None

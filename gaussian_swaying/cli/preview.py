@@ -18,25 +18,25 @@ from gaussian_swaying._yaml_limits import check_config_files
 from gaussian_swaying.cli.errors import parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.cli.suggestions import guessing
+from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.compact import read_gaussians
-from gaussian_swaying.simulation.config import parse_text
-from gaussian_swaying.simulation.preview.as_data import cost_dict, run_dict, suggestion_dict
-from gaussian_swaying.simulation.preview.calibration import (
+from gaussian_swaying.preview.as_data import cost_dict, run_dict, suggestion_dict
+from gaussian_swaying.preview.calibration import (
     SWAY,
     calibrated_suggestion,
     check_sway,
 )
-from gaussian_swaying.simulation.preview.cost import (
+from gaussian_swaying.preview.cost import (
     Cost,
     Stopwatch,
     estimate_cost,
     finest_within,
     scaled_seconds,
 )
-from gaussian_swaying.simulation.preview.doubts import doubts
-from gaussian_swaying.simulation.preview.photos import captured_from
-from gaussian_swaying.simulation.preview.picture import preview_picture
-from gaussian_swaying.simulation.preview.report import (
+from gaussian_swaying.preview.doubts import doubts
+from gaussian_swaying.preview.photos import captured_from
+from gaussian_swaying.preview.picture import preview_picture
+from gaussian_swaying.preview.report import (
     area_line,
     cost_lines,
     quality_lines,
@@ -45,10 +45,10 @@ from gaussian_swaying.simulation.preview.report import (
     suggestion_lines,
     video_length,
 )
-from gaussian_swaying.simulation.preview.results import Preview, splat_name, write
-from gaussian_swaying.simulation.preview.shape import DIRECTIONS, bounds
-from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
-from gaussian_swaying.simulation.preview.suggest import (
+from gaussian_swaying.preview.results import Preview, splat_name, write
+from gaussian_swaying.preview.shape import DIRECTIONS, bounds
+from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.preview.suggest import (
     QUALITIES,
     at_quality,
     finest_spacing,

@@ -30,8 +30,8 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.metrics.nearest import nearest_distances
 from gaussian_swaying.metrics.ssim import SSIM_TAPS, ssim_map
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
-from gaussian_swaying.simulation.recording.video import VideoEncoder
+from gaussian_swaying.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.video import VideoEncoder
 
 if TYPE_CHECKING:
     from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance

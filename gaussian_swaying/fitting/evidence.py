@@ -13,7 +13,7 @@ from gaussian_swaying.fitting.ensemble import RETRIES, Ensemble, SubstepTooLongE
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
 
 PATCHES = 4

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._yaml_limits import check_config_files, read_fields
+from gaussian_swaying.config.parser import check_settings, option
 from gaussian_swaying.fitting.unknowns import Unknown, default_scale
-from gaussian_swaying.simulation.config import check_settings, option
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:

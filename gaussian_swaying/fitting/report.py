@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
+from gaussian_swaying.config.parser import config_text, option, parse_text
 from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.unknowns import POLAR, Unknown, flow_of
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.simulation.config import config_text, option, parse_text
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:

@@ -16,10 +16,9 @@ from torch import Tensor
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.preview.ticks import project
 from gaussian_swaying.simulation.simulation import Simulation
 
 WINDOW = 15

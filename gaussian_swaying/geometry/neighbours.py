@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import check_shape
+
 _CROWD = 16  # points in the cell of a point, on average, on the first grid; 8 to 32 take about as long
 _PAIRS = 200_000  # candidate pairs of a chunk: few enough for the cache of a processor
 
@@ -99,3 +101,15 @@ def _nearest_among(
     squared = squared.masked_fill((column >= ends[:, -1:]) | (who == itself[:, None]), torch.inf)
     nearest, chosen = squared.topk(count, dim=-1, largest=False, sorted=True)
     return nearest.sqrt(), who.gather(-1, chosen)
+
+
+def particle_spacing(points: Tensor) -> float:
+    """Distance to the nearest other point that 90 % of the points stay below, from an even sample of some 4,000.
+
+    Args:
+        points: Shape (N, 3).
+    """
+    check_shape("points", points, None, 3)
+    step = max(1, len(points) // 4000)
+    distance = nearest_neighbours(points, 2, points[::step])[0][:, 1].double()
+    return float(distance.kthvalue(1 + round(0.9 * (len(distance) - 1))).values)

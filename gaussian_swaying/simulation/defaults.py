@@ -11,24 +11,25 @@ import torch
 from gaussian_swaying._checks import VectorLike, check_vector
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField, flow_rows
-from gaussian_swaying.captures.capture_camera import CaptureCamera
+from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.selection import select_simulated
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.rendering.cameras.camera import azimuth_beside
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.physgaussian.space import Normalisation
-from gaussian_swaying.simulation.preview.photos import captured_from, photo_azimuth
-from gaussian_swaying.simulation.preview.suggest import azimuth_beside, particle_spacing, suggest_spacing
-from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 
 if TYPE_CHECKING:
@@ -137,7 +138,8 @@ def as_camera(
     captured = next((path for path in (cameras or {}).values() if isinstance(path, CaptureCamera)), None)
     azimuth = None
     if captured is not None:
-        azimuth = photo_azimuth(captured_from(captured.path), scene.center.cpu(), scene.frame.rotation)
+        eyes = torch.stack([seen.position for _, seen in read_views(captured.path)])
+        azimuth = photo_azimuth(eyes, scene.center.cpu(), scene.frame.rotation)
     if azimuth is None and isinstance(wind, WindField):
         azimuth = azimuth_beside(wind.flows[int(wind.flows.norm(dim=-1).argmax())].tolist())
     return OrbitCamera() if azimuth is None else OrbitCamera(azimuth=azimuth)

@@ -1,10 +1,12 @@
-"""Checks the size of an object: no Gaussian far away from all others, and not too small for the grid."""
+"""The size of an object and of its grid: a spacing that suits both, and no Gaussian far away from all others."""
 
 from __future__ import annotations
 
 import warnings
 
 from torch import Tensor
+
+from gaussian_swaying._checks import check_positive
 
 _SAMPLE = 100_000  # Gaussians that are sorted, at most
 _FEW = 16  # fewer Gaussians are not checked
@@ -56,4 +58,19 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
         warnings.warn(text, UserWarning, stacklevel=2)
 
 
-__all__ = ["check_extent"]
+def suggest_spacing(longest_side: float, spacing: float, cells: int) -> float:
+    """Grid spacing: the longest side over ``cells``, at least twice the particle spacing, rounded to 2 digits.
+
+    Args:
+        longest_side: Longest side of the object [m].
+        spacing: From :func:`~gaussian_swaying.geometry.neighbours.particle_spacing` [m].
+        cells: Cells along the longest side.
+
+    Returns:
+        Grid spacing [m].
+    """
+    check_positive("longest_side", longest_side)
+    return float(f"{max(longest_side / cells, 2 * spacing):.2g}")
+
+
+__all__ = ["check_extent", "suggest_spacing"]

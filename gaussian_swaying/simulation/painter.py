@@ -13,6 +13,7 @@ from gaussian_swaying._graphs import RECORDED, Replayed, fingerprint
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.recording.layout import check_camera_name
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
@@ -20,7 +21,6 @@ from gaussian_swaying.rendering.factory import make_renderer
 from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.followers import GridFollowers
-from gaussian_swaying.simulation.recording.layout import check_camera_name
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K

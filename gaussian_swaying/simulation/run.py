@@ -15,15 +15,15 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._provenance import describe_device, versions
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import GridSpec, MPMState
+from gaussian_swaying.recording.checkpoint import check_state, log_lines, unreadable
+from gaussian_swaying.recording.recorder import frame_folder
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
 from gaussian_swaying.runs.seal import sha256
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_names
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.meters import PeakMemory, WallClock
 from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.recording.checkpoint import check_state, log_lines, unreadable
-from gaussian_swaying.simulation.recording.recorder import frame_folder
 from gaussian_swaying.simulation.wind_picture import draw_wind
 
 if TYPE_CHECKING:
@@ -95,7 +95,8 @@ def _check_checkpoint(
         )
     most_nodes, edited = simulation.solver.max_nodes, bool(simulation.editor.edits)
     try:
-        check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited)
+        entries = entry_names(start.impulse.shape[-2])
+        check_state(checkpoint, start, simulation.frame_dt, most_nodes, edited, entries)
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise unreadable(output / "checkpoint.pt", error) from error
     if checkpoint["frame"] >= frames:

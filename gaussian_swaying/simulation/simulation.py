@@ -13,17 +13,7 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._turns import in_turn
 from gaussian_swaying.aero.force import AeroForce
-from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
-from gaussian_swaying.mpm.contact.surface import Contact
-from gaussian_swaying.mpm.forces import Force, as_forces
-from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.rendering.cameras.camera_path import CameraPath
-from gaussian_swaying.rendering.protocol import Renderer
-from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.config import (
+from gaussian_swaying.config.parser import (
     NOT_COMPARED,
     PYTHON_ONLY,
     arguments_of,
@@ -33,6 +23,17 @@ from gaussian_swaying.simulation.config import (
     parse_file,
     python_text,
 )
+from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
+from gaussian_swaying.mpm.contact.surface import Contact
+from gaussian_swaying.mpm.forces import Force, as_forces
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.protocol import Renderer
+from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.defaults import (
     DeviceLike,
     HoldLike,
@@ -49,9 +50,8 @@ from gaussian_swaying.simulation.diagnostics import diagnose
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.frame import Frame
 from gaussian_swaying.simulation.launch import Launched
+from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.physgaussian.space import Normalisation
-from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.run import run
 from gaussian_swaying.simulation.scene import Material, SimulatedScene
 from gaussian_swaying.simulation.stepping import Stepping
@@ -206,7 +206,7 @@ class Simulation(Stepping):
 
     @classmethod
     def parser(cls) -> ArgumentParser:
-        """The parser of ``gaussian-swaying sim``, see :func:`~gaussian_swaying.simulation.config.build_parser`."""
+        """The parser of ``gaussian-swaying sim``, see :func:`~gaussian_swaying.config.parser.build_parser`."""
         return build_parser(cls)
 
     @classmethod

@@ -18,6 +18,7 @@ from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     Gauge,
@@ -28,7 +29,6 @@ from gaussian_swaying.simulation.diagnostics import (
 )
 from gaussian_swaying.simulation.launch import needs_of
 from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.run import Run, splat_checksum
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepping import MAX_GROWTH, MAX_SUBSTEPS

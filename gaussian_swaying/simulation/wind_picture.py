@@ -10,11 +10,10 @@ from torch import Tensor
 
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.simulation.preview.ticks import project
 
 if TYPE_CHECKING:
     from gaussian_swaying.simulation.simulation import Simulation

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from gaussian_swaying.simulation.recording.nodes import load_nodes
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.nodes import load_nodes
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.sweeps.record import RUNS, SUMMARY, read_record, read_result
 
 

@@ -15,9 +15,9 @@ from typing import Any
 
 from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
 from gaussian_swaying._inputs import read_json
+from gaussian_swaying.recording.checkpoint import first_change
 from gaussian_swaying.runs.folder import hold_folder
 from gaussian_swaying.runs.lock import FolderLock
-from gaussian_swaying.simulation.recording.checkpoint import first_change
 from gaussian_swaying.sweeps.plan import Plan
 
 SWEEP, TABLE, TIMES = "sweep.json", "sweep.csv", "times.csv"

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gaussian_swaying.simulation.config import config_text
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation.defaults import as_wind
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.together import Together, variant
@@ -82,7 +82,7 @@ def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
 
 
 def texts(parser: ArgumentParser, settings: Sequence[Namespace]) -> list[str]:
-    """The configuration of each run as YAML, as :func:`~gaussian_swaying.simulation.config.config_text` writes it.
+    """The configuration of each run as YAML, as :func:`~gaussian_swaying.config.parser.config_text` writes it.
 
     The parser takes longer for one than a GPU takes for a frame of all, so it writes the first one, and the values that
     differ are put in.

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gaussian_swaying.simulation.config import parse_text
+from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.scenes import settings_of_splat
 

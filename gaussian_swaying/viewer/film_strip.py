@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from gaussian_swaying.simulation.recording.video import VideoEncoder
+from gaussian_swaying.recording.video import VideoEncoder
 
 FPS = 25.0
 LONGEST = 120.0  # s

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.config import config_text
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged, diagnose
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.changes import carry_over, changed_settings, take

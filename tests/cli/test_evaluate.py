@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.cli.simulate import main as simulate
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.trajectory import load_trajectory
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 ROOT = Path(__file__).parents[2]

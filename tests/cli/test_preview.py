@@ -16,10 +16,10 @@ from gaussian_swaying.cli.preview import main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.preview.calibration import CLOSE
+from gaussian_swaying.preview.cost import Cost
+from gaussian_swaying.preview.results import splat_name
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.preview.calibration import CLOSE
-from gaussian_swaying.simulation.preview.cost import Cost
-from gaussian_swaying.simulation.preview.results import splat_name
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -28,7 +28,7 @@ FLAG = ROOT / "configs/sim/flag.yaml"
 @pytest.fixture(autouse=True)
 def _few_frames(monkeypatch):
     """Of those that are timed, which is tested in test_cost.py."""
-    monkeypatch.setattr("gaussian_swaying.simulation.preview.cost.MOST_FRAMES", 2)
+    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import torch
 import yaml
 
 from gaussian_swaying.cli.simulate import main, output_folder
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.config import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 
 ROOT = Path(__file__).parents[2]

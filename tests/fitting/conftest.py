@@ -2,10 +2,10 @@
 
 import pytest
 import yaml
+from bench.problems.films import write_video
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.validation.films import write_video
 
 TRUTH = {"wind.speed": 5.0, "wind.azimuth": 36.869898, "material.E": 1e4}
 FRAMES = 13

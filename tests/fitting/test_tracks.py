@@ -11,10 +11,9 @@ from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.fitting.evidence import TrackEvidence
 from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track
 from gaussian_swaying.fitting.videos import Footage, read_videos
-from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.scenes.printed_cloth import printed_colours
-from gaussian_swaying.simulation.preview.ticks import project
 from gaussian_swaying.simulation.simulation import Simulation
 
 from .conftest import base, cameras

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from bench.problems import bodies
 
 from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -12,7 +13,6 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.validation import bodies
 
 
 def weights(body):

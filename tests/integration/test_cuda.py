@@ -18,7 +18,7 @@ from gaussian_swaying.mpm.boundaries.sequential_release import SequentialRelease
 from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.trajectory import load_trajectory
 
 pytestmark = pytest.mark.gpu
 FLAG = str(Path(__file__).resolve().parents[2] / "configs" / "sim" / "flag.yaml")

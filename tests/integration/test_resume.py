@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.simulate import main
+from gaussian_swaying.recording.checkpoint import read_checkpoint, write_checkpoint
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint, write_checkpoint
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.run import Run
 
 ROOT = Path(__file__).parents[2]
@@ -195,7 +195,7 @@ def test_ctrl_c_while_the_queue_is_full(whole, tmp_path):
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "import imageio.v3 as iio\n"
         "from gaussian_swaying.cli import simulate\n"
-        "from gaussian_swaying.simulation.recording import recorder\n"
+        "from gaussian_swaying.recording import recorder\n"
         f"full, go_on = pathlib.Path({str(full)!r}), pathlib.Path({str(go_on)!r})\n"
         "class Writer(recorder.FrameWriter):\n"
         "    def submit(self, *arguments, **settings):\n"

@@ -11,8 +11,11 @@ FLOORS = (
     "gaussians metrics mpm runs",
     "aero rendering scenes",
     "captures",
+    "interop recording",
+    "config",
     "simulation training",
-    "evaluation fitting sweeps validation viewer",
+    "evaluation fitting preview sweeps",
+    "viewer",
     "cli",
 )
 """From the ground up; rooms of one floor do not know each other."""

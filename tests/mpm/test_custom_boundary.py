@@ -9,7 +9,7 @@ import yaml
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.boundaries import BOUNDARIES
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.trajectory import load_trajectory
 
 ROOT = Path(__file__).parents[2]
 STRIP = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}

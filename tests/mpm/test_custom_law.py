@@ -13,7 +13,7 @@ from gaussian_swaying.mpm.laws import LAWS
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.trajectory import load_trajectory
 
 ROOT = Path(__file__).parents[2]
 

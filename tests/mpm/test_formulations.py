@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from bench.problems.flags import flag
+from bench.problems.settings import Settings
 
 from gaussian_swaying.geometry import linalg
 from gaussian_swaying.geometry.regions import Box
@@ -22,8 +24,6 @@ from gaussian_swaying.mpm.laws.snow import Snow
 from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.validation.flags import flag
-from gaussian_swaying.validation.settings import Settings
 
 FORMULATIONS = ["total", "updated"]
 ELASTIC = [FixedCorotated, NeoHookean, SpringNetwork, StVKHencky]

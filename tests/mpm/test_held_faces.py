@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from bench.problems.beams import held_cantilever, timoshenko_frequency
+from bench.problems.settings import Settings
 
 from gaussian_swaying.geometry.regions import Box, Everything, Region
 from gaussian_swaying.mpm.boundaries.handle import Handle
@@ -13,8 +15,6 @@ from gaussian_swaying.mpm.held_faces import SOFTENED, along_face, face, thicknes
 from gaussian_swaying.mpm.held_rows import MOST_ROWS
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.validation.beams import held_cantilever, timoshenko_frequency
-from gaussian_swaying.validation.settings import Settings
 
 DX = 0.1
 

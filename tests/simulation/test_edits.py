@@ -16,9 +16,9 @@ from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.laws.plasticine import Plasticine
 from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
-from gaussian_swaying.simulation.recording.recorder import Recorder
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.scene import Material, MaterialRegion
 
 FREE_HALF = [0.55, None, None], [None, None, None]

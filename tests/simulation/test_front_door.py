@@ -34,8 +34,8 @@ from gaussian_swaying import (
     load_trajectory,
     write_ply,
 )
+from gaussian_swaying.config.parser import PYTHON_ONLY, arguments_of
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.config import PYTHON_ONLY, arguments_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "python.md").read_text()

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.health import advice, extremes, particle_of_extremes
-from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.run import run_health
 from gaussian_swaying.simulation.scene import Material
 

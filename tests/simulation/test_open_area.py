@@ -6,20 +6,20 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from bench.problems.bodies import cluttered_sphere
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
+from gaussian_swaying.preview.as_data import run_dict
+from gaussian_swaying.preview.report import run_lines
+from gaussian_swaying.preview.starter import draft_yaml, starter_yaml
+from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.preview.as_data import run_dict
-from gaussian_swaying.simulation.preview.report import run_lines
-from gaussian_swaying.simulation.preview.starter import draft_yaml, starter_yaml
-from gaussian_swaying.simulation.preview.suggest import suggest
 from gaussian_swaying.simulation.scene import Material, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.validation.bodies import cluttered_sphere
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "sim"
 

@@ -15,14 +15,14 @@ from gaussian_swaying.geometry.patches import deform_all, deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview.picture import classify
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.preview.picture import classify
-from gaussian_swaying.simulation.recording.recorder import Recorder
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.sampling import matched_points
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
 

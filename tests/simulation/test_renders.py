@@ -7,13 +7,13 @@ import torch
 
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.recording.layout import frame_folder, video_file
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.recording.layout import frame_folder, video_file
-from gaussian_swaying.simulation.recording.recorder import Recorder
 
 SIDE = OrbitCamera(width=24, height=20, azimuth=-90.0, elevation=0.1, radius=1.5)
 ALL = ["color", "depth", "normal", "force", "wind"]

@@ -15,10 +15,10 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.regions import Box, Not, Sphere
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
-from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.sampling import cell_volume
 from gaussian_swaying.simulation.scene import Material, MaterialRegion, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation

@@ -10,8 +10,8 @@ from gaussian_swaying.aero.effects import LogProfile
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.launch import parts_of
-from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.simulation.simulation import Simulation
 
 

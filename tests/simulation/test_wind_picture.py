@@ -6,9 +6,8 @@ import torch
 
 from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.wind import WindField
-from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.simulation.preview.ticks import project
-from gaussian_swaying.simulation.recording.recorder import Recorder
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.simulation.wind_picture import STEPS, draw_wind, streaks
 
 

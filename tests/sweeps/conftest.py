@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from bench.problems.small_sweep import AXES, SETTINGS
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps import pool
-from gaussian_swaying.validation.small_sweep import AXES, SETTINGS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gaussian_swaying.simulation.config import option
+from gaussian_swaying.config.parser import option
 from gaussian_swaying.sweeps.axes import read_axis, runs_of
 
 

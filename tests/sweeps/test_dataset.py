@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch.utils.data import DataLoader
 
-from gaussian_swaying.simulation.recording.nodes import load_nodes
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.nodes import load_nodes
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.sweeps.dataset import SweepDataset
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.simulation.config import config_text
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep

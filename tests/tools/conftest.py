@@ -1,4 +1,4 @@
-"""The folder tools/ is where tests of the benchmarks import from, as ``python tools/bench.py`` does."""
+"""What tests of the benchmarks share."""
 
 import importlib
 import sys
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "tools"))  # last, so that nothing that is installed is shadowed
 
 
 @pytest.fixture(scope="session")

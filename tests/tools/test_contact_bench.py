@@ -7,9 +7,8 @@ from functools import partial
 import pytest
 import torch
 from bench.cases import contact
+from bench.problems.contacts import crossings, sheet_triangles
 from bench.tables import contact as tables
-
-from gaussian_swaying.validation.contacts import crossings, sheet_triangles
 
 CPU = torch.device("cpu")
 

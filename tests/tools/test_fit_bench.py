@@ -10,11 +10,11 @@ import torch
 import yaml
 from bench.cases import fit as case
 from bench.cases import fit_bias, fit_reference
+from bench.problems.films import write_video
 from bench.tables import fit as tables
 
 from gaussian_swaying.fitting.ensemble import Ensemble
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.validation.films import write_video
 
 HEAD = {"device": "a CPU", "versions": {"torch": "2"}, "seed": 0}
 ROW = {

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from bench import problems
+from bench import scenes
 from bench.cases import speed
 from bench.tables import goals, speed_goals
 
@@ -156,7 +156,7 @@ def test_only_keeps_the_other_sections(bench, tmp_path):
 
 def test_the_fewest_bytes():
     """Ten particles and four nodes, by hand: four bytes times the numbers that go in and out."""
-    count = problems.fewest_bytes
+    count = scenes.fewest_bytes
     # rest position 3, volume, mu, lambda; of a node u and v in and out, and its mass
     assert count("total", 10, 4) == 4 * (10 * (3 + 3) + 4 * (6 + 6 + 1))
     assert count("total", 10, 4, wind=True) - count("total", 10, 4) == 4 * 10 * (3 + 1)
@@ -167,7 +167,7 @@ def test_the_fewest_bytes():
 
 
 def test_nodes_in_reach():
-    count = problems.nodes_in_reach
+    count = scenes.nodes_in_reach
     position = torch.tensor([[0.5, 0.5, 0.5], [0.51, 0.49, 0.52], [0.61, 0.5, 0.5], [0.91, 0.5, 0.5]])
     assert count(position[:1], 0.1) == 27
     assert count(position[:2], 0.1) == 27  # the same cell
@@ -178,10 +178,10 @@ def test_nodes_in_reach():
 def test_the_error_is_that_of_the_end():
     """One hundredth of the largest displacement beside the truth is an error of one hundredth."""
     with torch.inference_mode():
-        points = problems.sheet(64, torch.device("cpu"))
-        load = problems.wind_load(points, problems.wind(0, True, torch.device("cpu")))
+        points = scenes.sheet(64, torch.device("cpu"))
+        load = scenes.wind_load(points, scenes.wind(0, True, torch.device("cpu")))
         solver = MPMSolver(dx=0.05)
-        start = solver.init_state(points, problems.waves(points.position))
+        start = solver.init_state(points, scenes.waves(points.position))
         end = solver.rollout(start, 1e-4, 32, load)
         assert max(speed.error_of(end, solver, start, 32, load).values()) < 1e-4
         moved = (end.position - start.position).abs().amax()

@@ -10,8 +10,8 @@ import torch
 import yaml
 
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.preview.ticks import project
 from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")

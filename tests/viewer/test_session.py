@@ -9,7 +9,7 @@ import pytest
 import torch
 import yaml
 
-from gaussian_swaying.simulation.config import config_text
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.pictures import draw
 from gaussian_swaying.viewer.session import WINDOW, Session

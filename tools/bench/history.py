@@ -31,7 +31,7 @@ def git(*arguments: str) -> str:
 @cache
 def sources(commit: str, part: str) -> str:
     """The hash of a part of the package in a commit, as :func:`bench.stamps.sources` makes it."""
-    lines = git("ls-tree", "-r", commit, f"{stamps.PACKAGE}/{part}").splitlines()
+    lines = git("ls-tree", "-r", commit, part if "/" in part else f"{stamps.PACKAGE}/{part}").splitlines()
     return stamps.of_blobs([(line.split()[2], line.partition("\t")[2]) for line in lines])
 
 

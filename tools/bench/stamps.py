@@ -24,10 +24,11 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = "gaussian_swaying"
 
 _SOLVER = ("mpm", "geometry", "aero")
-_SIMULATION = (*_SOLVER, "gaussians", "simulation")
+_PROBLEMS = (*_SOLVER, "tools/bench/problems")
+_SIMULATION = (*_SOLVER, "gaussians", "recording", "simulation")
 _DRAWN = (*_SIMULATION, "rendering")
 PARTS: dict[str, tuple[str, ...]] = {
-    "accuracy": (*_SOLVER, "validation"),
+    "accuracy": _PROBLEMS,
     "area": ("gaussians", "geometry"),
     "backward": _SOLVER,
     "contact": _SIMULATION,
@@ -38,11 +39,11 @@ PARTS: dict[str, tuple[str, ...]] = {
     "gradients": _SIMULATION,
     "live": (*_DRAWN, "viewer"),
     "long_flag": _SIMULATION,
-    "pareto": (*_SOLVER, "validation"),
+    "pareto": _PROBLEMS,
     "peers": (),  # other solvers
     "pins": (*_SIMULATION, "evaluation"),
     "points": _SIMULATION,
-    "previews": _SIMULATION,
+    "previews": (*_SIMULATION, "preview"),
     "sim": _DRAWN,
     "soft": (*_DRAWN, "fitting"),
     "speed": _DRAWN,
@@ -53,7 +54,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "web": (*_DRAWN, "viewer"),
     "winds": _SOLVER,
 }
-"""The parts of the package that a record measures, by the beginning of its name."""
+"""What a record measures, by the beginning of its name: parts of the package, or folders."""
 
 _NOT_ROWS = ("device", "versions", "seed", "measured", "uncertainty", "references", "figures")
 _UNKNOWN = {"date": None, "commit": None, "clean": None, "versions": {}, "sources": {}}
@@ -84,8 +85,8 @@ def parts_of(name: str) -> tuple[str, ...]:
 
 @cache
 def sources(part: str) -> str:
-    """A hash of the Python files of a part of the package, as :func:`of_blobs` makes it."""
-    files = sorted((ROOT / PACKAGE / part).rglob("*.py"))
+    """A hash of the Python files of a part of the package or of a folder, as :func:`of_blobs` makes it."""
+    files = sorted((ROOT / part if "/" in part else ROOT / PACKAGE / part).rglob("*.py"))
     blobs = []
     for path in files:
         data = path.read_bytes().replace(b"\r\n", b"\n")

@@ -250,3 +250,20 @@ def resized_intrinsics(
         width,
         height,
     )
+
+
+def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pixel coordinates (N, 2) and depths (N,) [scene units] of points (N, 3), in float64; depth <= 0 is behind."""
+    check_shape("points", points, None, 3)
+    view, intrinsics = camera.world_to_camera.cpu().double(), camera.intrinsics.cpu().double()
+    inside = points.detach().cpu().double() @ view[:3, :3].T + view[:3, 3]
+    depth = inside[:, 2]
+    pixel = inside @ intrinsics.T
+    return pixel[:, :2] / torch.where(depth.abs() < 1e-12, 1e-12, depth)[:, None], depth
+
+
+def azimuth_beside(flow: Sequence[float]) -> float | None:
+    """Azimuth [degrees] from which a flow [m/s, z up] goes to the right of the picture; None if it is not level."""
+    x, y, z = flow
+    level = math.hypot(x, y)
+    return math.degrees(math.atan2(-x, y)) if level > abs(z) else None

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gaussian_swaying._files import atomic
-from gaussian_swaying.simulation.recording.nodes import join_far, split_at
+from gaussian_swaying.recording.nodes import join_far, split_at
 from gaussian_swaying.viewer.film.recorded import Film, read_film
 
 PAGE = Path(__file__).parent / "page"

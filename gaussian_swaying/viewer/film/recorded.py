@@ -12,17 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying.config.parser import parse_file
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import gather
+from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.runs.seal import sha256
-from gaussian_swaying.simulation.config import parse_file
 from gaussian_swaying.simulation.diagnostics import FARTHEST
 from gaussian_swaying.simulation.followers import follower_stencil
 from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.recording.nodes import load_nodes
 from gaussian_swaying.simulation.scene import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 

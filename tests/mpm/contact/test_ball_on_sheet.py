@@ -4,13 +4,13 @@ import math
 
 import pytest
 import torch
+from bench.problems.contacts import crossings, gaps, sheet_triangles
 
 from gaussian_swaying.geometry.regions import Box, Not
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.validation.contacts import crossings, gaps, sheet_triangles
 
 RADIUS, SPACING, THICKNESS, SIDE = 0.1, 0.02, 0.01, 26
 RINGS, AROUND = 11, 18

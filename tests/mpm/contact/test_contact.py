@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from bench.problems.contacts import crossings, gaps, sheet_triangles
 
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
@@ -13,7 +14,6 @@ from gaussian_swaying.mpm.contact.solve import Constraints, Rows, pair_gaps, res
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.validation.contacts import crossings, gaps, sheet_triangles
 
 THICKNESS = 0.01
 GROUND = [0.0, 0.0, -0.005], [0.0, 0.0, 1.0]

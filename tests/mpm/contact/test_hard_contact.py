@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bench.problems.contacts import crossings, sheet_triangles
 
 from gaussian_swaying.mpm.contact.surface import Contact
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.validation.contacts import crossings, sheet_triangles
 
 THICKNESS, APART = 0.01, 0.2
 

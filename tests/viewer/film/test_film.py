@@ -14,9 +14,9 @@ from gaussian_swaying.cli.export import main
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.mpm.transfer import bspline_weights
+from gaussian_swaying.recording.nodes import join_far, load_nodes, split_far
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.recording.nodes import join_far, load_nodes, split_far
-from gaussian_swaying.simulation.recording.recorder import Recorder
 from gaussian_swaying.viewer.film.page import pack, page, unpack
 from gaussian_swaying.viewer.film.recorded import read_film
 

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 
 from bench import record
+from bench.problems import bars, beams, flags, plates, strips, surfaces, vortex
+from bench.problems.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
+from bench.problems.granular.columns import column_collapse
+from bench.problems.granular.layers import angle_of_repose
+from bench.problems.settings import Settings
 from gaussian_swaying.mpm.laws.sand import Sand
-from gaussian_swaying.validation import bars, beams, flags, plates, strips, surfaces, vortex
-from gaussian_swaying.validation.granular.angles import plane_strain_angle, shear_angle, triaxial_angle
-from gaussian_swaying.validation.granular.columns import column_collapse
-from gaussian_swaying.validation.granular.layers import angle_of_repose
-from gaussian_swaying.validation.settings import Settings
 
 Row = dict[str, Any]
 

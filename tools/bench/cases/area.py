@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from bench import record
+from bench.problems.bodies import BODIES, area_shares, cluttered_sphere, of_cloud
 from gaussian_swaying.gaussians.compact import read_gaussians
 from gaussian_swaying.geometry.directions import hull_area
-from gaussian_swaying.validation.bodies import BODIES, area_shares, cluttered_sphere, of_cloud
 
 Row = dict[str, Any]
 

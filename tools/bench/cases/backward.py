@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bench import record
 from bench.clock import Clock, Peak, clear, guarded, spread
-from bench.problems import sheet, waves, wind_load
+from bench.scenes import sheet, waves, wind_load
 from gaussian_swaying.aero.wind import UniformGust, WindField
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion

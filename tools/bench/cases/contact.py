@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from bench.clock import spread, timed
+from bench.problems.contacts import crossings, gaps, sheet_triangles
 from gaussian_swaying.mpm.boundaries.half_space import HalfSpaceObstacle
 from gaussian_swaying.mpm.contact.surface import Contact, Surface
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.validation.contacts import crossings, gaps, sheet_triangles
 
 Row = dict[str, Any]
 

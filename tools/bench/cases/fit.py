@@ -15,11 +15,11 @@ from typing import Any
 import yaml
 
 from bench.cases import fit_bias, fit_reference
+from bench.problems.films import write_video
 from gaussian_swaying.fitting.fit import run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
 from gaussian_swaying.fitting.unknowns import flow_of
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.validation.films import write_video
 
 Row = dict[str, Any]
 

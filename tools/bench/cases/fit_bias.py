@@ -23,7 +23,7 @@ from gaussian_swaying.fitting.least_squares import normal_equations, sensitiviti
 from gaussian_swaying.fitting.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.videos import read_videos
-from gaussian_swaying.simulation.preview.ticks import project
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
 
 Row = dict[str, Any]

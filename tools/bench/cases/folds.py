@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from bench.cases import flags, pins
+from bench.problems.contacts import crossings, sheet_triangles
 from bench.record import ROOT
 from gaussian_swaying.evaluation.compare import compare_run
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
-from gaussian_swaying.validation.contacts import crossings, sheet_triangles
+from gaussian_swaying.recording.trajectory import load_trajectory
 
 Row = dict[str, Any]
 

@@ -10,12 +10,12 @@ import time
 
 import torch
 
+from bench.problems.flags import HEIGHT, WIDTH, flag_points
+from bench.problems.settings import Settings
 from gaussian_swaying._provenance import peak_memory
 from gaussian_swaying.aero.force import aero_force
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.validation.flags import HEIGHT, WIDTH, flag_points
-from gaussian_swaying.validation.settings import Settings
 
 
 def _peak_mib() -> float:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from bench import record
-from gaussian_swaying.validation import bars, beams, flags, plates
-from gaussian_swaying.validation.settings import Settings
+from bench.problems import bars, beams, flags, plates
+from bench.problems.settings import Settings
 
 Row = dict[str, Any]
 

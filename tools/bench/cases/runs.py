@@ -18,10 +18,10 @@ import torch
 
 from bench import record
 from bench.clock import Clock, timed
-from bench.problems import CUBE, sheet
+from bench.scenes import CUBE, sheet
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.simulation.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.simulation import Simulation
 
 FLAG = record.ROOT / "configs" / "sim" / "flag.yaml"

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bench import record, stamps
 from bench.clock import Clock, Peak, clear, copy_bandwidth, guarded, spread, timed
-from bench.problems import CUBE, block, cube, fewest_bytes, nodes_in_reach, sheet, spin, waves, wind, wind_load
+from bench.scenes import CUBE, block, cube, fewest_bytes, nodes_in_reach, sheet, spin, waves, wind, wind_load
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox

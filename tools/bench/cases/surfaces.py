@@ -19,9 +19,9 @@ import torch
 
 from bench.cases.flags import VARIANTS, run_row
 from bench.cases.trained import GENTLE, NORMALS, filled, last_psnr, tilts, two_views
+from bench.problems.capture_limits import surface_limits
 from bench.record import ROOT
 from gaussian_swaying.captures.capture import read_capture
-from gaussian_swaying.validation.capture_limits import surface_limits
 
 Row = dict[str, Any]
 WAYS: dict[str, tuple[str, tuple[str, ...]]] = {

@@ -24,11 +24,11 @@ from lightning.pytorch.callbacks import Callback
 
 from bench.cases.training import evaluate
 from bench.clock import guarded
+from bench.problems.small_sweep import AXES, SETTINGS
 from gaussian_swaying.captures.transforms import find_image
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.training.data.datamodule import CaptureDataModule
-from gaussian_swaying.validation.small_sweep import AXES, SETTINGS
 
 ROOT = Path(__file__).resolve().parents[3]
 Row = dict[str, Any]

@@ -20,6 +20,7 @@ from einops import rearrange
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
+from bench.problems.surface_quality import surface_quality
 from gaussian_swaying.cli.train import make_cli
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.factory import make_renderer
@@ -29,7 +30,6 @@ from gaussian_swaying.training.data.order import EndlessShuffle
 from gaussian_swaying.training.losses import photometric_loss
 from gaussian_swaying.training.panels import panel
 from gaussian_swaying.training.rates import LearningRates, means_rate
-from gaussian_swaying.validation.surface_quality import surface_quality
 
 ROOT = Path(__file__).resolve().parents[3]
 Row = dict[str, Any]

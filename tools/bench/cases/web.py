@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.recording.checkpoint import read_checkpoint
+from gaussian_swaying.recording.checkpoint import read_checkpoint
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import write_film
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from bench.clock import Clock, guarded
-from bench.problems import CUBE, sheet, waves, wind_load
+from bench.scenes import CUBE, sheet, waves, wind_load
 from gaussian_swaying.aero.carried import Turbulence
 from gaussian_swaying.aero.effects import LogProfile, WindEffect
 from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle

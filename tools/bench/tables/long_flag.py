@@ -1,4 +1,4 @@
-"""Table and findings of the long flag, which a slow test of tests/validation/test_hard_cases.py records."""
+"""Table and findings of the long flag, which a slow test of tests/problems/test_hard_cases.py records."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench.tables.markdown import grid, measured, stack
 
 Row = dict[str, Any]
 MADE = (
-    "Recorded by `GAUSSIAN_SWAYING_RECORD=docs/results python -m pytest -m slow tests/validation/test_hard_cases.py "
+    "Recorded by `GAUSSIAN_SWAYING_RECORD=docs/results python -m pytest -m slow tests/problems/test_hard_cases.py "
     "-k ten_minutes`."
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from bench.problems import PLASTIC_TRAFFIC, TRAFFIC, WIND_TRAFFIC
+from bench.scenes import PLASTIC_TRAFFIC, TRAFFIC, WIND_TRAFFIC
 from bench.slots import table
 from bench.tables.markdown import gib, grid, source
 

@@ -1,0 +1,1 @@
+"""Turns YAML files and the command line into settings."""

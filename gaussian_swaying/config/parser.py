@@ -1,0 +1,222 @@
+"""Turns a YAML file and the command line into settings. The constructors of the components are the schema."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import sys
+import tempfile
+from argparse import SUPPRESS, Action, ArgumentError
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+from gaussian_swaying import _program as program
+from gaussian_swaying._checks import check_frames
+from gaussian_swaying._yaml_limits import check_config_files, limit_yaml
+from gaussian_swaying.aero.obstacles import CylinderObstacle, EllipsoidObstacle, SphereObstacle
+from gaussian_swaying.captures.capture_camera import CaptureCamera
+from gaussian_swaying.config.common_help import CommonHelp
+from gaussian_swaying.config.description import describe
+from gaussian_swaying.interop.physgaussian.convert import convert, read_config
+from gaussian_swaying.interop.physgaussian.yaml_file import to_yaml
+from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+# imported so that a configuration can use their class names without the module
+CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
+OBSTACLES = (CylinderObstacle, EllipsoidObstacle, SphereObstacle)
+# options that a configuration file cannot contain; settings that may change when a run is resumed
+COMMAND_LINE_ONLY = ("preset", "physgaussian")
+RUN_ONLY = ("config", "output", "device", "frames", "resume")
+# constructor arguments that a YAML file sets within a component instead; components that may be null
+PYTHON_ONLY = ("up", "hold", "renderer")
+NULLABLE = ("contact", "normalisation")
+# arguments that may change between a run and the one that resumes it
+NOT_COMPARED = ("device", "recorder", "renderer")
+
+
+class PhysGaussianAction(Action):
+    """Reads a PhysGaussian configuration as ``--config`` reads a YAML file, and prints the differences in meaning."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Convert the file and merge it into the settings parsed so far."""
+        from jsonargparse import ActionConfigFile
+
+        try:
+            settings, notes = convert(read_config(values))
+        except ValueError as error:  # which argparse would not report
+            raise TypeError(str(error)) from error
+        ActionConfigFile.apply_config(parser, namespace, "config", to_yaml(settings))
+        namespace["config"][-1] = values
+        for note in notes:
+            print(f"note: {note}", file=sys.stderr)
+
+
+class PresetAction(Action):
+    """Reads the preset: the file of the same name in a folder next to the configuration given before."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Merge the preset into the settings parsed so far."""
+        from jsonargparse import ActionConfigFile
+
+        given = [file for file in namespace.get("config") or [] if file is not None]
+        if not given:
+            raise TypeError("Expected --config before --preset, which belongs to a configuration.")
+        config = Path(str(given[-1]))
+        preset = config.parent / str(values) / config.name
+        if not preset.is_file():
+            there = sorted(path.parent.name for path in config.parent.glob(f"*/{config.name}"))
+            raise TypeError(
+                f"There is no preset `{values}` of {config}: {preset} is missing"
+                + (f"; available: {', '.join(there)}." if there else "; leave out --preset.")
+            )
+        ActionConfigFile.apply_config(parser, namespace, "config", str(preset))
+
+
+def build_parser(schema: type) -> ArgumentParser:
+    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors.
+
+    Args:
+        schema: The class whose constructor defines the fields of a configuration.
+    """
+    from jsonargparse import ActionYesNo, ArgumentParser
+
+    limit_yaml()
+    parser = ArgumentParser(
+        prog=program.name("sim"),
+        exit_on_error=False,
+        add_help=False,
+        description="Move a 3D Gaussian scene in the wind: splat in, video out. Positions and regions are in scene "
+        "units and axes; velocities, gravity and light are in metres, z up.",
+    )
+    parser.add_argument("-h", "--help", action=CommonHelp, help="Show the options that people use, and exit.")
+    parser.add_argument("--help-all", action="help", help="Show all options, and exit.")
+    parser.add_argument("--config", action="config", help="YAML file; options given after it override it.")
+    parser.add_argument(
+        "--physgaussian",
+        action=PhysGaussianAction,
+        default=SUPPRESS,
+        help="Like --config, for a JSON file of PhysGaussian, which is converted.",
+    )
+    parser.add_argument(
+        "--preset",
+        action=PresetAction,
+        default=SUPPRESS,
+        help="preview: fewer Gaussians, a coarser grid and a small picture, for a laptop; options given after it "
+        "override it.",
+    )
+    parser.add_argument("--output", type=str | None, help="Folder for the results. Default: outputs/<config name>.")
+    parser.add_argument("--frames", type=int, default=250, help="Number of frames; the first is at rest.")
+    parser.add_argument(
+        "--resume",
+        action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
+        default=False,
+        help="Continue the run found in the output folder.",
+    )
+    groups = _groups(schema)
+    for name, component in groups.items():
+        parser.add_class_arguments(component, name)
+    parser.add_class_arguments(schema, skip={*groups, *PYTHON_ONLY})
+    return parser
+
+
+def arguments_of(schema: type) -> list[str]:
+    """The arguments of a constructor that a configuration can contain."""
+    return [name for name in inspect.signature(schema).parameters if name not in PYTHON_ONLY]
+
+
+def _groups(schema: type) -> dict[str, type]:
+    """The arguments that are a single component each; they become groups of options."""
+    hints = get_type_hints(schema.__init__)  # type: ignore[misc]
+    found: dict[str, type] = {}
+    for name in arguments_of(schema):
+        kinds = get_args(hints[name]) if isinstance(hints[name], UnionType) else (hints[name],)
+        kinds = tuple(kind for kind in kinds if kind is not type(None))
+        if name not in NULLABLE and len(kinds) == 1 and inspect.isclass(kinds[0]) and not inspect.isabstract(kinds[0]):
+            found |= {name: kinds[0]} if kinds[0].__module__ != "builtins" else {}
+    return found
+
+
+def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespace:
+    """The settings of a configuration file.
+
+    Args:
+        parser: From :func:`build_parser`.
+        path: The YAML file.
+
+    Raises:
+        ValueError: If the file or a value in it is invalid; the message names the field.
+    """
+    arguments = ["--config", os.fspath(path)]
+    check_config_files(arguments)
+    try:
+        return parser.parse_args(arguments)
+    except ArgumentError as error:
+        raise ValueError(str(error)) from error
+
+
+def parse_text(parser: ArgumentParser, text: str, arguments: Sequence[str] = ()) -> Namespace:
+    """The settings of a configuration that is not in a file.
+
+    Args:
+        parser: From :func:`build_parser`.
+        text: The YAML.
+        arguments: Options that override it.
+
+    Raises:
+        ArgumentError: If a value is invalid.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "starter.yaml"
+        path.write_text(text, encoding="utf-8")
+        return parser.parse_args(["--config", str(path), *arguments])
+
+
+def check_settings(schema: type, settings: Namespace) -> None:
+    """Raise ValueError if parsed settings contain something that a configuration cannot.
+
+    Args:
+        schema: As in :func:`build_parser`.
+        settings: The settings that its parser returned.
+    """
+    from jsonargparse import Namespace
+
+    for name in COMMAND_LINE_ONLY:
+        if name in settings:
+            raise ValueError(f"`{name}` is a command-line option, not a YAML field: remove it and use --{name}.")
+    for name in _groups(schema):
+        if not isinstance(settings[name], Namespace):
+            raise ValueError(
+                f"Expected `{name}` to contain fields, such as those that --help-all lists, but got {settings[name]!r}."
+            )
+    check_frames("frames", settings.frames)
+
+
+def config_text(parser: ArgumentParser, settings: Namespace) -> str:
+    """The settings that determine the result, as YAML."""
+    kept = settings.clone()
+    for name in RUN_ONLY:
+        kept.pop(name, None)
+    return str(parser.dump(kept, skip_validation=True))
+
+
+def python_text(heading: str, arguments: Mapping[str, Any]) -> str:
+    """Arguments that were given in Python, as YAML, so that a run with other ones is not continued."""
+    import yaml
+
+    return yaml.safe_dump({heading: describe(dict(sorted(arguments.items())))}) if arguments else ""
+
+
+def option(name: str, value: Any) -> str:
+    """A setting as an option of the command line.
+
+    Example:
+        >>> option("wind.flow", [4, 0, 0])
+        '--wind.flow=[4, 0, 0]'
+    """
+    return f"--{name}={value if isinstance(value, str) else json.dumps(value)}"

@@ -1,0 +1,290 @@
+"""The cost of a run: its number of substeps, and their time on this machine, measured on a few frames."""
+
+from __future__ import annotations
+
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._provenance import describe_device
+from gaussian_swaying.mpm.state import MPMState
+from gaussian_swaying.mpm.timestep import wave_speed
+from gaussian_swaying.recording.writer import WORKERS
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.simulation import Simulation
+
+BUDGET = 2.5  # s; for the frames that are timed
+MOST_FRAMES = 9  # timed at most
+SUBSTEPS = 5  # timed where a frame takes longer than the budget
+WARM_UP = 3.0  # s; kernels of a run are loaded and recorded in 2 to 3 s; compiling is done only once on a machine
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of a run, estimated from its first frames.
+
+    More substeps are needed if the material stiffens as it deforms, if the wind is faster, or if a body moves fast in
+    ``updated``.
+
+    Attributes:
+        device: The device on which it was measured.
+        particles: Material points.
+        dx: Grid spacing [m].
+        grid: Grid nodes along each axis.
+        frames: Frames of the run.
+        wave_speed: Fastest elastic wave [m/s].
+        stable_substep: Longest stable substep [s].
+        substep: Substep of the run at rest [s].
+        substeps: Substeps per frame, on average over the run.
+        substep_seconds: Time for one substep, with its share of what a frame takes besides [s].
+        simulation_seconds: Time for all frames without pictures [s].
+        picture_seconds: Time that the pictures of a frame add, one from each camera, including files and video [s];
+            None without pictures.
+        startup_seconds: Time to read the splat and prepare the scene, and on a GPU its kernels [s].
+    """
+
+    device: str
+    particles: int
+    dx: float
+    grid: tuple[int, ...]
+    frames: int
+    wave_speed: float
+    stable_substep: float
+    substep: float
+    substeps: int
+    substep_seconds: float
+    simulation_seconds: float
+    picture_seconds: float | None
+    startup_seconds: float = 0.0
+
+    @property
+    def total_seconds(self) -> float:
+        """Time of the whole run [s]."""
+        return self.startup_seconds + self.simulation_seconds + self.frames * (self.picture_seconds or 0.0)
+
+
+@torch.inference_mode()
+def estimate_cost(simulation: Simulation, frames: int, startup_seconds: float = 0.0, growth: float = 1.0) -> Cost:
+    """Start a run, and measure its first frames and a picture.
+
+    Nothing that a run does once is in the measured frames: on a GPU, kernels are compiled and graphs recorded in two
+    frames before.
+
+    Args:
+        simulation: The run.
+        frames: Number of frames of the run.
+        startup_seconds: Time to prepare the run [s], if known.
+        growth: How many times the substeps at rest a frame takes on average, if known.
+
+    Returns:
+        The estimate.
+
+    Raises:
+        ValueError: If the run cannot start, because a pin holds nothing, the grid is too large or a fixed substep is
+            too long.
+    """
+    solver = simulation.solver
+    state = simulation.start()
+    at_rest = solver.substeps(state, simulation.frame_dt)
+    warm_up, each, taken = _timed_frames(simulation, state, at_rest)
+    steps = max(at_rest * growth, statistics.mean(taken), _drag_substeps(simulation, state, frames))
+    seconds = statistics.median(each)
+    drawn = _picture_seconds(simulation, state, seconds * steps) if simulation.recorder.images else None
+    return Cost(
+        device=describe_device(simulation.device),
+        particles=solver.points.count,
+        dx=solver.dx,
+        grid=tuple(state.grid.resolution),
+        frames=frames,
+        wave_speed=float(wave_speed(solver.points).amax()),
+        stable_substep=solver.stable_substep(),
+        substep=simulation.frame_dt / at_rest,
+        substeps=round(steps),
+        substep_seconds=seconds,
+        simulation_seconds=seconds * round(steps) * (frames - 1),
+        picture_seconds=drawn,
+        startup_seconds=startup_seconds + warm_up,
+    )
+
+
+def _timed_frames(simulation: Simulation, state: MPMState, at_rest: int) -> tuple[float, list[float], list[int]]:
+    """Time to load the kernels [s]; and of some frames the time for a substep [s] and their numbers of substeps."""
+    solver, warm_up = simulation.solver, 0.0
+    each: list[float] = []
+    taken: list[int] = []
+    begin = Stopwatch()
+    try:
+        if simulation.device.type == "cuda":
+            state, _ = simulation.advance(state)
+            torch.cuda.synchronize(simulation.device)
+            warm_up = min(begin.wall, WARM_UP)
+            state, _ = simulation.advance(state)
+        else:
+            dt = simulation.frame_dt / at_rest
+            solver.rollout(state, dt, 1, simulation.forces, check=False)
+            trial = _seconds(simulation, lambda: solver.rollout(state, dt, 1, simulation.forces, check=False))
+            if trial * at_rest > 0.4 * BUDGET:  # a frame would take too long
+                several = [
+                    _seconds(simulation, lambda: solver.rollout(state, dt, 1, simulation.forces, check=False))
+                    for _ in range(SUBSTEPS)
+                ]
+                return 0.0, several, [at_rest]
+        begin = Stopwatch()
+        while len(each) < MOST_FRAMES and (begin.wall < BUDGET or len(each) < 2):
+            frame = Stopwatch()
+            state, health = simulation.advance(state)
+            each.append(frame.on(simulation.device) / health.substeps)
+            taken.append(health.substeps)
+    except SimulationDiverged:
+        if not each:
+            return warm_up, [begin.on(simulation.device) / at_rest], [at_rest]
+    return warm_up, each, taken
+
+
+def _picture_seconds(simulation: Simulation, state: MPMState, frame: float) -> float:
+    """Time that the pictures of a frame add to the ``frame`` seconds without [s].
+
+    Further threads and ffmpeg write the files and the video. If there are more than two cores, they use the others, and
+    the run waits only for what they cannot write in the time of a frame.
+    """
+    painter = simulation.painter
+    count = (1 + len(painter.cameras)) * len(simulation.recorder.renders)  # as if all were the first
+    image = painter.render(state, 0).color
+    draw = count * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
+    write = count * min(_seconds(simulation, lambda: _encode(image)) for _ in range(2))
+    cores = _cores()
+    return draw + write if cores <= 2 else max(draw, write / min(WORKERS, cores - 1) - frame)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def scaled_seconds(cost: Cost, other: Cost, dx: float) -> float:
+    """Time of a run on another grid [s], from its cost on one grid and the time for a substep on another.
+
+    The substeps of a frame grow with 1 / dx. The time for a substep follows the power of dx between the two grids.
+
+    Args:
+        cost: The run on a grid as close to ``dx`` as there is.
+        other: The same scene on another grid; its frames and pictures do not count.
+        dx: Grid spacing [m].
+    """
+    power = 2.0  # of a surface
+    if abs(math.log(other.dx / cost.dx)) > 0.1:
+        power = math.log(other.substep_seconds / cost.substep_seconds) / math.log(cost.dx / other.dx)
+    finer = cost.dx / dx
+    changed = cost.simulation_seconds * finer ** (1 + min(max(power, 0.0), 3.0))
+    return cost.total_seconds - cost.simulation_seconds + changed
+
+
+def finest_within(
+    measure: Callable[[float], Cost], seconds: float, first: Cost, draft: Cost, finest: float, coarsest: float
+) -> Cost:
+    """The cost of a run on the finest grid that takes at most some time; on the coarsest one if none does.
+
+    Args:
+        measure: Function that estimates the cost of the run for a grid spacing [m].
+        seconds: Longest time of the run [s].
+        first: What it returned for one spacing.
+        draft: The same scene on another grid; its frames and pictures do not count.
+        finest: Smallest grid spacing [m].
+        coarsest: Largest grid spacing [m].
+
+    Raises:
+        ValueError: If the run cannot start on a grid that is coarser than the first; finer ones are passed over.
+    """
+    tried = {first.dx: first}
+    for _ in range(3):
+        nearest = min(tried.values(), key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
+        others = [draft, *(cost for cost in tried.values() if cost is not nearest)]
+        other = min(others, key=lambda cost: _apart(cost.dx, nearest.dx))
+        low, high = finest, coarsest
+        for _ in range(30):  # the time falls as dx grows
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if scaled_seconds(nearest, other, middle) > seconds else (low, middle)
+        dx = min(_rounded_up(high), coarsest)
+        if dx in tried:
+            break
+        try:
+            tried[dx] = measure(dx)
+        except ValueError:  # a finer grid than the first may need too many nodes or points
+            if dx > first.dx:
+                raise
+            finest = math.sqrt(dx * first.dx)
+    fitting = [cost for cost in tried.values() if cost.total_seconds <= seconds]
+    if fitting:
+        return min(fitting, key=lambda cost: cost.dx)
+    return tried[coarsest] if coarsest in tried else measure(coarsest)
+
+
+def _apart(dx: float, from_dx: float) -> float:
+    """How far two grid spacings are apart, as a logarithm; those that are nearly the same are the farthest."""
+    distance = abs(math.log(dx / from_dx))
+    return distance if distance > 0.1 else math.inf
+
+
+def _rounded_up(value: float) -> float:
+    """A number rounded up to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / unit - 1e-6) * unit:.2g}")
+
+
+def _drag_substeps(simulation: Simulation, state: MPMState, frames: int) -> int:
+    """Substeps per frame needed for explicit drag at rest, on average over the wind of the run."""
+    if simulation.idle or simulation.aero.drag_step == "semi_implicit":
+        return 1
+    winds = simulation.wind_force.samples(state, simulation.frame_dt, frames)
+    speed = torch.linalg.vector_norm(winds, dim=-1).reshape(frames, -1).amax(1)
+    area, mass = simulation.wind_force.area, simulation.solver.points.mass
+    rates = [
+        float(simulation.aero.rate(one.to(mass).expand_as(mass), area, mass).amax()) for one in speed.sort().values
+    ]
+    return math.ceil(statistics.mean(rates) * simulation.frame_dt)
+
+
+def _encode(image: Tensor) -> None:
+    """Work similar to writing a picture and its part of the video: the picture is compressed twice."""
+    import imageio.v3 as iio
+
+    pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+    for _ in range(2):
+        iio.imwrite("<bytes>", pixels, extension=".png", compress_level=3)
+
+
+def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
+    """Time for some work [s] on an otherwise idle machine; on a GPU until it is finished."""
+    begin = Stopwatch()
+    work()
+    return begin.on(simulation.device)
+
+
+class Stopwatch:
+    """Time since it was created [s]."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    @property
+    def wall(self) -> float:
+        """Wall-clock time."""
+        return time.perf_counter() - self._wall
+
+    @property
+    def quiet(self) -> float:
+        """The smaller of wall-clock and processor time, to exclude the time used by other programs."""
+        return min(self.wall, time.process_time() - self._cpu)
+
+    def on(self, device: torch.device) -> float:
+        """Time for work on a device: on a GPU until it is finished, else :attr:`quiet`."""
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+            return self.wall
+        return self.quiet

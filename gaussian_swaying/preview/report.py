@@ -1,0 +1,169 @@
+"""The results of the preview as text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
+from gaussian_swaying.preview.cost import Cost
+from gaussian_swaying.preview.starter import region_dict
+from gaussian_swaying.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
+from gaussian_swaying.preview.up import wind_words
+from gaussian_swaying.simulation.progress import duration
+
+
+def splat_lines(name: str, cloud: GaussianCloud, data: dict[str, Any]) -> list[str]:
+    """Bounds, opacities and shapes of the Gaussians."""
+    corner, own = data["bounds"], data["gaussians"]
+    below = ", ".join(f"{share:.0%} below {t}" for t, share in own["opacity_below"].items())
+    infinite = own["opacity_0_or_1"]
+    note = (
+        f"  note: the opacity of {infinite:,} is exactly 0 or 1, an infinite logit, which is read as ±{OPAQUE_LOGIT:g}"
+    )
+    normals = "with normals" if own["normals"] else "without normals (the smallest axes are used)"
+    return [
+        f"{name}: {len(cloud):,} Gaussians, SH degree {own['sh_degree']}, {normals}",
+        f"  bounds        {_numbers(corner['min'])} to {_numbers(corner['max'])} (scene units)",
+        f"  without 1 %   {_numbers(corner['robust_min'])} to {_numbers(corner['robust_max'])}",
+        "  5, 50 and 95 % of the Gaussians have at most",
+        f"    opacity     {_numbers(own['opacity'])}; {below}",
+        f"    S1 / S2     {_numbers(own['S1_over_S2'])}   (needles are above 10)",
+        f"    S2 / S3     {_numbers(own['S2_over_S3'])}   (surface patches are above 3)",
+        f"    S1 / side   {_numbers(own['size_share'])}   (of the longest side; haze is above 0.1)",
+        *([note] if infinite else []),
+    ]
+
+
+def suggestion_lines(found: Suggestion, further: int) -> list[str]:
+    """The guesses, and the number of points that fill holes."""
+    region = "all of space"
+    if found.region.box is not None:
+        region = json.dumps(dict(zip(("min", "max"), found.region.box, strict=True)))
+    count = int(found.region.simulated.sum())
+    lines = [
+        f"up              {_numbers(found.up.direction)}, {_why(found.up.confidence, '; '.join(found.up.reasons))}",
+        f"region          {region}: {found.region.reason}",
+        f"opacity         {found.region.opacity_threshold:g} and above is simulated: {count:,} particles",
+        f"held            at the {found.hold.end}, {_why(found.hold.confidence, found.hold.reason)}"
+        if found.pin is not None
+        else "held            nowhere: it will fall",
+    ]
+    if found.pin is not None:
+        lines.append(f"  pin           {_short(region_dict(found.pin))}")
+    lines += [
+        f"size            {_numbers(found.size)} m along the axes with z up; 1 scene unit = "
+        f"{found.metres_per_unit:.4g} m, assuming a longest side of {found.longest_side:g} m",
+        f"grid            quality {found.quality}: dx = {found.dx:g} m, {found.longest_side / found.dx:.0f} cells "
+        f"along the longest side, {found.dx / max(found.spacing, 1e-30):.1f} times the particle spacing of "
+        f"{found.spacing:.3g} m",
+        "further points  " + (f"{further:,} where Gaussians are sparse for this grid" if further else "none needed"),
+        f"material        {_material(found)}",
+        f"wind            {wind_words(found.flow, found.up.direction)}",
+    ]
+    return ["", "guesses (each can be set instead, see --help)", *(f"  {line}" for line in lines)]
+
+
+def area_line(run: dict[str, Any]) -> str:
+    """The area in the wind, next to that of the convex hull, which is easily compared with the object itself."""
+    return f"  area            {run['area_m2']:.3g} m^2 in the wind; the convex hull has {run['hull_area_m2']:.3g} m^2"
+
+
+def run_lines(run: dict[str, Any]) -> list[str]:
+    """What a given configuration simulates."""
+    return [
+        "",
+        "this configuration",
+        f"  simulated       {run['simulated']:,} of {run['gaussians']:,} Gaussians, {run['mass_kg']:.3g} kg; "
+        f"box {_numbers(run['box_min'])} to {_numbers(run['box_max'])} (scene units)",
+        area_line(run),
+        f"  follow them     {run['carried']:,} faint or loose ones",
+        f"  fill the inside {run['filled']:,} points; {run['further']:,} further points on large Gaussians",
+        f"  conditions      {'; '.join(run['conditions']) or 'none: it will fall'}",
+        *(f"                  {region}" for region in run["regions"]),
+        f"  frame           {run['frame']}",
+        f"  grid            dx = {run['dx_m']:g} m, {run['formulation']}",
+        f"  wind            {wind_words(run['flow'], run['up'])}, before modulations",
+    ]
+
+
+def cost_lines(cost: Cost) -> list[str]:
+    """The cost of a run."""
+    frame = cost.substeps * cost.substep_seconds
+    picture = ""
+    if cost.picture_seconds is not None:
+        picture = f" + {duration(cost.picture_seconds)} for its pictures"
+    return [
+        "",
+        f"cost on this machine ({cost.device})",
+        f"  substep         {cost.substep:.3g} s, {cost.substeps} per frame (stable up to {cost.stable_substep:.3g} s; "
+        f"waves of {cost.wave_speed:.3g} m/s)",
+        f"  work            {cost.particles:,} particles x {cost.substeps} substeps x {cost.frames} frames = "
+        f"{cost.particles * cost.substeps * cost.frames:.2g}; grid of {' x '.join(map(str, cost.grid))} nodes",
+        f"  a frame         {duration(frame)}{picture}, from {duration(cost.substep_seconds)} per substep",
+        f"  the run         about {duration(cost.total_seconds)}, if nothing else runs",
+    ]
+
+
+def quality_lines(
+    found: Suggestion, cost: Cost, minutes: float | None, grids: dict[str, float], others: dict[str, float]
+) -> list[str]:
+    """Why the starter has its grid, and what the other qualities would cost.
+
+    Args:
+        found: The guesses, with the chosen grid.
+        cost: The cost of the starter.
+        minutes: The wanted time [minutes], if there is one.
+        grids: Grid spacings of the qualities [m].
+        others: Times of a run with the other ones [s], from scaling.
+    """
+    cells = found.longest_side / found.dx
+    chosen = f"  quality         {found.quality}: {cells:.0f} cells along the longest side"
+    lines = [chosen]
+    if minutes is not None:
+        wish = duration(60 * minutes)
+        if cost.total_seconds > 60 * minutes:
+            lines[0] = (
+                f"warning: Even a draft takes about {duration(cost.total_seconds)}, longer than {wish}: ask for fewer "
+                "`--frames`. The starter has the grid of a draft."
+            )
+        else:
+            why = f"the finest grid that takes at most {wish}"
+            if found.dx <= finest_spacing(found):
+                limited = found.dx > 1.02 * found.longest_side / MOST_CELLS
+                why = "the finest for Gaussians so far apart" if limited else "the finest that a preview chooses"
+            lines[0] = f"{chosen}, {why}"
+    for name, seconds in others.items():
+        if grids[name] == found.dx:
+            lines.append(f"    {name:<13} the same grid")
+        else:
+            lines.append(f"    {name:<13} about {duration(seconds)} with dx = {grids[name]:g} m (--quality {name})")
+    return lines
+
+
+def video_length(text: str) -> str:
+    """Length and picture size of a configuration's video, in words."""
+    import yaml
+
+    given = yaml.safe_load(text)
+    size = given["camera"]["init_args"]
+    return f"{given['frames'] * given['frame_dt']:.3g} s at {size['width']} x {size['height']}"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value + 0.0:.3g}" for value in values) + "]"
+
+
+def _material(found: Suggestion) -> str:
+    what = "cloth" if found.sheet else "rubber"
+    return f"{what}, E = {found.youngs_modulus:.1e} Pa, {found.thickness:.2g} m thick: {found.stiffness_reason}"
+
+
+def _why(confidence: str, reason: str) -> str:
+    return "given" if confidence == "given" else f"confidence {confidence}: {reason}"
+
+
+def _short(region: dict[str, Any]) -> str:
+    return json.dumps(region["init_args"]) if region["class_path"] == "Box" else json.dumps(region)

@@ -1,0 +1,428 @@
+"""A suggestion for the first configuration of a splat: bounds, up axis, sizes, and every number that a run needs.
+
+Everything here is a guess, made with rules that are stated with the result. The rules do not depend on what the object
+is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_choice, check_positive
+from gaussian_swaying.captures.capture_camera import photo_azimuth
+from gaussian_swaying.gaussians.area import patch_area
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.ply import OPAQUE_LOGIT
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.neighbours import particle_spacing
+from gaussian_swaying.geometry.patches import smallest_axis_normal
+from gaussian_swaying.geometry.regions import Box, Not, Region, Union
+from gaussian_swaying.preview.framing import orbit_frame, whole_box
+from gaussian_swaying.preview.hold import HoldGuess, end_region, given_hold, guess_hold
+from gaussian_swaying.preview.photos import CapturedFrom, ShownObject, shown_object
+from gaussian_swaying.preview.shape import (
+    FEWEST,
+    bounds,
+    connected_parts,
+    quantile,
+    rounded,
+    sheet_normal,
+)
+from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
+from gaussian_swaying.simulation.extent import suggest_spacing
+
+QUALITIES = {"draft": 16, "normal": 24, "fine": 48}  # cells along the longest side; normal is enough for bending
+CELLS = QUALITIES["normal"]
+MOST_CELLS = 96  # of a grid that is chosen by its time
+CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
+SHELL_E, SHELL_THICKNESS = 5e5, 0.01  # Pa, share of the longest side; everything else: a shell of rubber
+THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's
+KEPT_AREA = 0.95  # share of the visible area that the threshold must keep
+MAX_BOXES = 8  # largest number of boxes that cut specks out of the region
+
+
+@dataclass(frozen=True)
+class RegionGuess:
+    """Which Gaussians to simulate.
+
+    Attributes:
+        simulated: The simulated ones, shape (N,).
+        box: Lower and upper corner [scene units] of the region, or None for all of space.
+        holes: Boxes inside it that are left out, as corners.
+        opacity_threshold: Smallest simulated opacity.
+        specks: Number of Gaussians above the threshold that are not part of the object, floor or surroundings.
+        reason: In words.
+        cuts: Further regions inside it that are left out: walls and everything behind them.
+    """
+
+    simulated: Tensor
+    box: tuple[list[float], list[float]] | None
+    holes: list[tuple[list[float], list[float]]]
+    opacity_threshold: float
+    specks: int
+    reason: str
+    cuts: tuple[Region, ...] = ()
+
+    def region(self) -> Region | None:
+        """The region for a run; None for all of space."""
+        if self.box is None:
+            return None
+        inside: Region = Box(*self.box)
+        out = [*(Box(*hole) for hole in self.holes), *self.cuts]
+        return Not(Union([Not(inside), *out])) if out else inside
+
+
+def visible_weight(cloud: GaussianCloud) -> Tensor:
+    """Opacity times area pi s1 s2 of each Gaussian [scene units²], shape (N,), with the largest 1 % clamped."""
+    weight = (cloud.opacities.sigmoid() * patch_area(cloud.scales)).double()
+    return weight.clamp(max=quantile(weight, 0.99))
+
+
+def gaussian_statistics(cloud: GaussianCloud) -> dict[str, object]:
+    """Count, opacities, shapes and sizes of the Gaussians, as plain numbers.
+
+    Returns:
+        Quantiles are lists of the 5, 50 and 95 % values. ``size_share`` is the largest standard deviation over the
+        longest robust side. S1 >= S2 >= S3 are the standard deviations of a Gaussian.
+    """
+    opacity = cloud.opacities.sigmoid()
+    s1, s2, s3 = cloud.scales.double().exp().sort(-1, descending=True).values.unbind(-1)
+    corner = bounds(cloud.means)
+    longest = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
+    return {
+        "count": len(cloud),
+        "sh_degree": cloud.sh_degree,
+        "normals": cloud.normals is not None,
+        "opacity": _three(opacity),
+        "opacity_0_or_1": int((cloud.opacities.abs() == OPAQUE_LOGIT).sum()),
+        "opacity_below": {str(t): float((opacity < t).double().mean()) for t in THRESHOLDS if t > 0},
+        "S1_over_S2": _three(s1 / s2),
+        "S2_over_S3": _three(s2 / s3),
+        "size_share": _three(s1 / max(longest, 1e-30)),
+    }
+
+
+# ---- all of it
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Everything that a first configuration needs.
+
+    Attributes:
+        up: The up direction.
+        region: The simulated part.
+        hold: The end at which it is held.
+        pin: That end as a region, None if it is not held.
+        longest_side: Assumed length of the longest side of the object [m].
+        metres_per_unit: Resulting length of a scene unit [m].
+        size: Sides of the object along the z-up axes [m].
+        spacing: Particle spacing [m], see :func:`particle_spacing`.
+        dx: Grid spacing [m].
+        quality: Which quality that is, one of ``QUALITIES``, or in words how it was chosen.
+        sheet: Whether the object is a thin sheet.
+        azimuth: Azimuth of a camera that sees the broad side, or the side seen in photos [degrees].
+        flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
+        youngs_modulus: Young's modulus [Pa], a first guess;
+            :mod:`~gaussian_swaying.preview.calibration` finds a better one.
+        thickness: Thickness of the surface [m], also a first guess.
+        stiffness_reason: The reason for both, in words.
+        whole: Corners of the box of the whole object, including parts that do not move [scene units].
+        camera_offset: Vector from the centre of the moving part to that of the whole, in multiples of the longest side
+            of the moving part.
+        camera_radius: Distance of a camera that shows the whole, in the same unit.
+        growth: How many times the substeps of a frame at rest a frame takes on average, from the trial runs.
+    """
+
+    up: UpGuess
+    region: RegionGuess
+    hold: HoldGuess
+    pin: Region | None
+    longest_side: float
+    metres_per_unit: float
+    size: tuple[float, ...]
+    spacing: float
+    dx: float
+    quality: str
+    sheet: bool
+    azimuth: float
+    flow: tuple[float, ...]
+    youngs_modulus: float
+    thickness: float
+    stiffness_reason: str
+    whole: tuple[list[float], list[float]]
+    camera_offset: tuple[float, ...]
+    camera_radius: float
+    growth: float = 1.0
+
+
+def suggest(
+    cloud: GaussianCloud,
+    up: Sequence[float] | str | None = None,
+    hold: str | None = None,
+    region: tuple[Sequence[float], Sequence[float]] | None = None,
+    longest_side: float = 1.0,
+    speed: float = 6.0,
+    capture: CapturedFrom | None = None,
+    quality: str = "normal",
+) -> Suggestion:
+    """Guess a first configuration.
+
+    Args:
+        cloud: The splat.
+        up: Direction that points up, as 3 numbers or as ``+x`` to ``-z``; guessed if None.
+        hold: ``top``, ``bottom``, ``none`` or ``+x`` to ``-z``; guessed if None.
+        region: Corners of the box to simulate [scene units]; guessed if None.
+        longest_side: Length of the longest side of the object [m].
+        speed: Speed of the wind [m/s].
+        capture: The cameras of the splat's photos, which define the up direction and the object.
+        quality: ``draft``, ``normal`` or ``fine``. Only the grid spacing depends on it.
+
+    Returns:
+        The suggestion.
+
+    Raises:
+        ValueError: If the splat has too few Gaussians, or an argument does not fit the splat.
+    """
+    check_positive("--longest-side", longest_side)
+    check_positive("--wind", speed, allow_zero=True)
+    check_choice("--quality", quality, tuple(QUALITIES))
+    if len(cloud) < FEWEST:
+        raise ValueError(f"The splat has {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed.")
+    means, opacity, weight = cloud.means.detach(), cloud.opacities.detach().sigmoid(), visible_weight(cloud)
+    normals = smallest_axis_normal(cloud.quats, cloud.scales)
+    shown = None if capture is None or region is not None else shown_object(means, opacity, weight, capture)
+    if up is not None:
+        upward = given_up(up, means, normals, weight)
+    elif capture is not None:
+        upward = given_up(capture.up, means, normals, weight)
+        upward = replace(upward, confidence=capture.confidence, reasons=[capture.reason], options=capture.options)
+    else:
+        upward = guess_up(means, normals, weight)
+    if shown is not None:
+        upward = replace(upward, ground=shown.floor(upward.direction))
+    corner = bounds(means if shown is None else means[shown.mask])
+    side = max(b - a for a, b in zip(corner["robust_min"], corner["robust_max"], strict=True))
+    if side <= 0:
+        raise ValueError("All Gaussians of the splat are at one point: there is no object to simulate.")
+    if region is None:
+        cell = max(side / CELLS, 2 * particle_spacing(means if shown is None else means[shown.mask]))
+        if shown is not None:  # the rest of a backdrop must not count as a part of the object
+            cell = 0.5 * cell
+        chosen = suggest_region(means, opacity, weight, upward.ground, cell, shown)
+    else:
+        chosen = given_region(means, opacity, weight, *region)
+    points, visible = means[chosen.simulated], weight[chosen.simulated]
+    frame = SimFrame.fit(points, upward.direction, longest_side)
+    metres = frame.point_to_sim(points.double())
+    spacing = particle_spacing(points) * frame.metres_per_unit
+    dx = suggest_spacing(longest_side, spacing, CELLS)
+    if hold is None:
+        rest = means[~chosen.simulated & (opacity >= chosen.opacity_threshold)]
+        eyes = None if capture is None else capture.eyes
+        wall = None if shown is None else shown.wall(upward.direction)
+        held = guess_hold(points, visible, upward.direction, dx / frame.metres_per_unit, rest, eyes, wall)
+    else:
+        held = given_hold(hold, upward.direction)
+    pin = None if held.end == "none" else end_region(points, held.direction, dx / frame.metres_per_unit)
+    azimuth, turn = broad_side(metres), 20.0  # the broad side, seen slightly from the side
+    front = None if capture is None else photo_azimuth(capture.eyes, points.double().mean(0), frame.rotation)
+    if front is not None:
+        azimuth, turn = front, 0.0
+    flow = _across_picture(azimuth, speed)
+    flat = sheet_normal(points)
+    if held.end == "side" and flat is not None:  # along the sheet from the pole, and slightly onto it
+        away = -frame.direction_to_sim(torch.tensor(held.direction, dtype=torch.float64))
+        onto = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), away)
+        flow = tuple(speed * float(c) for c in math.cos(0.25) * away + math.sin(0.25) * onto)
+    elif flat is not None:  # a curtain is moved by wind that hits its face
+        flow = _across_picture(azimuth - 90, speed)
+    outside = upward.ground if shown is None else upward.ground | ~shown.mask
+    whole = whole_box(means, opacity, chosen.simulated, outside, dx / frame.metres_per_unit)
+    offset, radius = orbit_frame(whole, (points.amin(0).tolist(), points.amax(0).tolist()))
+    found = Suggestion(
+        up=upward,
+        region=chosen,
+        hold=held,
+        pin=pin,
+        longest_side=float(longest_side),
+        metres_per_unit=frame.metres_per_unit,
+        size=tuple(float(v) for v in metres.amax(0) - metres.amin(0)),
+        spacing=spacing,
+        dx=dx,
+        quality="normal",
+        sheet=flat is not None,
+        azimuth=round(azimuth + turn, 1),
+        flow=tuple(round(c, 2) + 0.0 for c in flow),
+        youngs_modulus=SHELL_E if flat is None else CLOTH_E,
+        thickness=SHELL_THICKNESS * longest_side if flat is None else CLOTH_THICKNESS,
+        stiffness_reason="rubber, not tried" if flat is None else "the cloth of the paper's flags, not tried",
+        whole=whole,
+        camera_offset=offset,
+        camera_radius=radius,
+    )
+    return at_quality(found, quality)
+
+
+def at_quality(found: Suggestion, quality: str) -> Suggestion:
+    """The same suggestion with the grid of another quality, one of ``QUALITIES``."""
+    spacing = suggest_spacing(found.longest_side, found.spacing, QUALITIES[quality])
+    return replace(found, dx=spacing, quality=quality)
+
+
+def finest_spacing(found: Suggestion) -> float:
+    """The finest grid spacing [m] that a time may choose: ``MOST_CELLS``, and at least twice the particle spacing."""
+    return suggest_spacing(found.longest_side, found.spacing, MOST_CELLS)
+
+
+def _across_picture(azimuth: float, speed: float) -> tuple[float, ...]:
+    """Horizontal flow to the right of a picture from an azimuth [degrees]."""
+    angle = math.radians(azimuth)
+    return (-speed * math.sin(angle), speed * math.cos(angle), 0.0)
+
+
+# ---- what is simulated
+
+
+def suggest_threshold(opacity: Tensor, weight: Tensor) -> float:
+    """The highest of ``THRESHOLDS`` that keeps at least ``KEPT_AREA`` of the visible area."""
+    total = float(weight.sum())
+    for threshold in THRESHOLDS:
+        if float(weight[opacity >= threshold].sum()) >= KEPT_AREA * total:
+            return threshold
+    return 0.0
+
+
+def suggest_region(
+    points: Tensor, opacity: Tensor, weight: Tensor, ground: Tensor, cell: float, shown: ShownObject | None = None
+) -> RegionGuess:
+    """The main object without floor, surroundings and specks.
+
+    The object is the connected part (:func:`connected_parts`) with the largest visible area. Specks inside its box are
+    cut out by smaller boxes, the largest first.
+
+    Args:
+        points: Centres [scene units], shape (N, 3).
+        opacity: Opacities, shape (N,).
+        weight: Visible area, shape (N,).
+        ground: The floor, shape (N,).
+        cell: Points farther apart than two such cells are not connected [scene units].
+        shown: The object in photos, to which the result is limited; the part nearest to their common point counts most.
+
+    Returns:
+        The guess.
+
+    Raises:
+        ValueError: If hardly any Gaussian is left.
+    """
+    among = torch.ones_like(opacity, dtype=torch.bool) if shown is None else shown.mask
+    threshold = suggest_threshold(opacity[among], weight[among])
+    solid = (opacity >= threshold) & ~ground & among
+    index = solid.nonzero()[:, 0]
+    if len(index) < FEWEST:
+        raise ValueError(
+            f"Only {len(index)} Gaussians are left above the floor and an opacity of {threshold:g}, too few for an "
+            "object: set another `--up`."
+        )
+    part = connected_parts(points[index], cell)
+    counted = weight[index].double() if shown is None else weight[index].double() * shown.nearness(points[index])
+    area = torch.zeros(int(part.max()) + 1, dtype=torch.float64).index_add_(0, part, counted)
+    main = int(area.argmax())
+    chosen = torch.zeros_like(solid)
+    chosen[index[part == main]] = True
+    low, high = _padded(points[chosen], 0.5 * cell)
+    if bool(ground.any()):  # the box must not reach into the floor again
+        low, high = _without(low, high, points[chosen], points[ground])
+    cuts = () if shown is None else tuple(backdrop.behind for backdrop in shown.backdrops)
+    box: Region = Box(low, high)
+    if cuts:
+        box = Not(Union([Not(box), *cuts]))
+    holes: list[tuple[list[float], list[float]]] = []
+    stray = box.contains(points[index]) & (part != main)
+    numbers, counts = part[stray].unique(return_counts=True)
+    for number in numbers[counts.argsort(descending=True)][: 4 * MAX_BOXES].tolist():
+        members = index[stray & (part == number)]
+        hole = _padded(points[members], 0.05 * cell)
+        caught = Box(*hole).contains(points) & chosen
+        if len(holes) < MAX_BOXES and int(caught.sum()) <= len(members):  # removes more specks than parts of the object
+            holes.append(hole)
+    guess = RegionGuess(chosen, (low, high), holes, threshold, len(index) - int(chosen.sum()), "", cuts)
+    region = guess.region()
+    assert region is not None
+    simulated = region.contains(points) & (opacity >= threshold)
+    everything = bool(region.contains(points).all())
+    words = [f"{int(chosen.sum()):,} Gaussians of opacity {threshold:g} and more form one connected part"]
+    if bool(ground.any()):
+        words.append(f"a floor of {int(ground.sum()):,} lies below it")
+    if shown is not None:
+        words.append("the cameras look at it")
+        if shown.backdrops:
+            words.append("everything in or behind a wall or floor is left out")
+    if guess.specks:
+        words.append(f"{guess.specks:,} float apart from it")
+    words.append("the region is all of space" if everything else "the region is the box around it")
+    if holes:
+        words.append(f"without {len(holes)} boxes of specks")
+    return RegionGuess(
+        simulated, None if everything else (low, high), holes, threshold, guess.specks, "; ".join(words), cuts
+    )
+
+
+def given_region(
+    points: Tensor, opacity: Tensor, weight: Tensor, low: Sequence[float], high: Sequence[float]
+) -> RegionGuess:
+    """A region given by the corners of a box, with a suggested threshold.
+
+    Raises:
+        ValueError: If it contains hardly any Gaussian.
+    """
+    box = Box(low, high)
+    inside = box.contains(points)
+    if int(inside.sum()) < FEWEST:
+        span = [[round(float(v), 4) for v in corner] for corner in (points.amin(0), points.amax(0))]
+        raise ValueError(
+            f"The box of `--region` contains {int(inside.sum())} Gaussians, too few for an object: the splat spans "
+            f"{span[0]} to {span[1]}."
+        )
+    threshold = suggest_threshold(opacity[inside], weight[inside])
+    simulated = inside & (opacity >= threshold)
+    corners = ([float(v) for v in low], [float(v) for v in high])
+    return RegionGuess(simulated, corners, [], threshold, 0, "given")
+
+
+# ---- sizes
+
+
+def broad_side(points: Tensor) -> float:
+    """Azimuth [degrees], from -90 to 90, of the horizontal direction of smallest extent of points (N, 3), z up."""
+    flat = points.double()[:, :2]
+    _, axes = torch.linalg.eigh(torch.cov((flat - flat.mean(0)).T))
+    x, y = axes[:, 0].tolist()
+    angle = math.degrees(math.atan2(y, x))
+    return (angle + 90) % 180 - 90
+
+
+def _three(values: Tensor) -> list[float]:
+    return [quantile(values, q) for q in (0.05, 0.5, 0.95)]
+
+
+def _padded(points: Tensor, margin: float) -> tuple[list[float], list[float]]:
+    low = [rounded(float(v) - margin, margin) for v in points.amin(0)]
+    return low, [rounded(float(v) + margin, margin) for v in points.amax(0)]
+
+
+def _without(low: list[float], high: list[float], points: Tensor, ground: Tensor) -> tuple[list[float], list[float]]:
+    """The box, with the face at the floor moved back to the object if the box extends into the floor."""
+    for axis in range(3):
+        first, last = float(points[:, axis].amin()), float(points[:, axis].amax())
+        floor_low, floor_high = float(ground[:, axis].amin()), float(ground[:, axis].amax())
+        if low[axis] < floor_high <= first:
+            low[axis] = round(0.5 * (floor_high + first), 6)
+        if high[axis] > floor_low >= last:
+            high[axis] = round(0.5 * (floor_low + last), 6)
+    return low, high

@@ -1,0 +1,159 @@
+"""The estimate of a run's time: from one grid to another, the grid for a time, and against runs."""
+
+import statistics
+import time
+
+import pytest
+import torch
+
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.preview import cost as cost_module
+from gaussian_swaying.preview.cost import Cost, estimate_cost, finest_within, scaled_seconds
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.vase import VaseScene
+from gaussian_swaying.simulation.scene import Material
+from gaussian_swaying.simulation.simulation import Simulation
+
+FRAMES = 101
+
+
+def cost(dx, power=2.0, picture=0.1):
+    """A substep of 1 ms at dx = 0.04 that takes longer with a power of 1 / dx; 100 of them in a frame there."""
+    substep, steps = 1e-3 * (0.04 / dx) ** power, round(100 * 0.04 / dx)
+    return Cost(
+        device="",
+        particles=1,
+        dx=dx,
+        grid=(1, 1, 1),
+        frames=FRAMES,
+        wave_speed=1.0,
+        stable_substep=1.0,
+        substep=0.04 / steps,
+        substeps=steps,
+        substep_seconds=substep,
+        simulation_seconds=substep * steps * (FRAMES - 1),
+        picture_seconds=picture,
+        startup_seconds=5.0,
+    )
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 2.0, 3.0])
+def test_another_grid_has_other_substeps_and_the_same_pictures(power):
+    here = cost(0.04, power)
+    assert here.total_seconds == pytest.approx(5 + 10 + 10.1)
+    fine = scaled_seconds(here, cost(0.06, power, picture=0.01), 0.02)
+    assert fine == pytest.approx(5 + 10 * 2 ** (1 + power) + 10.1, rel=0.02)
+    assert scaled_seconds(here, here, 0.04) == pytest.approx(here.total_seconds)
+
+
+def test_without_two_grids_a_surface_is_assumed():
+    here = cost(0.04, 1.0)
+    assert scaled_seconds(here, here, 0.02) == pytest.approx(5 + 10 * 2**3 + 10.1)
+
+
+@pytest.mark.parametrize("power", [0.0, 1.3, 3.0])
+@pytest.mark.parametrize("seconds", [22.0, 40.0, 300.0])
+def test_the_finest_grid_for_a_time_is_found(power, seconds):
+    tried = []
+
+    def measure(dx):
+        tried.append(dx)
+        return cost(dx, power)
+
+    found = finest_within(measure, seconds, cost(0.04, power), cost(0.06, power), 0.01, 0.06)
+    assert found.total_seconds <= seconds
+    assert len(tried) <= 3
+    assert found.dx == 0.01 or cost(found.dx - 0.0021, power).total_seconds > seconds
+    assert all(0.01 <= dx <= 0.06 and dx == float(f"{dx:.2g}") for dx in tried)
+
+
+def test_a_grid_that_is_too_fine_to_start_is_passed_over():
+    def measure(dx):
+        if dx < 0.018:
+            raise ValueError("too many nodes")
+        return cost(dx)
+
+    assert 0.018 <= finest_within(measure, 1e6, cost(0.04), cost(0.06), 0.01, 0.06).dx < 0.04
+    with pytest.raises(ValueError, match="too many nodes"):
+        finest_within(measure, 1e-6, cost(0.012), cost(0.06), 0.01, 0.015)
+
+
+def test_the_coarsest_grid_is_the_answer_if_none_is_fast_enough():
+    assert finest_within(cost, 3.0, cost(0.04), cost(0.06), 0.01, 0.06).dx == 0.06
+
+
+def test_files_are_written_beside_the_simulation_where_there_are_cores(monkeypatch):
+    """A picture of 1 s, and 4 s for its files: two more threads write them, and a frame takes 0.5 s without it."""
+    simulation, clock = flag("cpu"), iter([1.0, 1.0, 4.0, 4.0] * 2)
+    state = simulation.start()
+    monkeypatch.setattr(cost_module, "_seconds", lambda simulation, work: next(clock))
+    monkeypatch.setattr(cost_module, "WORKERS", 2)
+    found = {}
+    for cores in (2, 4):
+        monkeypatch.setattr(cost_module, "_cores", lambda cores=cores: cores)
+        found[cores] = cost_module._picture_seconds(simulation, state, 0.5)
+    assert found == {2: 1 + 4, 4: 4 / 2 - 0.5}
+
+
+@pytest.mark.parametrize("frames", [1, 2, 101])
+def test_a_run_takes_as_many_substeps_as_it_has_frames_after_the_first(frames, monkeypatch):
+    """Of timed frames the median time of a substep, and the mean number of them."""
+    monkeypatch.setattr(cost_module, "_timed_frames", lambda *_: (0.5, [1e-3, 9e-3, 2e-3], [5001, 5002, 5007]))
+    monkeypatch.setattr(cost_module, "_picture_seconds", lambda *_: 0.25)
+    found = estimate_cost(flag("cpu"), frames, startup_seconds=3.0)
+    assert (found.substep_seconds, found.substeps, found.startup_seconds) == (2e-3, 5003, 3.5)
+    simulated = {1: 0.0, 2: 5003 * 2e-3, 101: 100 * 5003 * 2e-3}[frames]
+    assert found.simulation_seconds == pytest.approx(simulated, rel=1e-12)
+    assert found.total_seconds == pytest.approx(3.5 + simulated + 0.25 * frames)
+
+
+def flag(device):
+    """A flag in code."""
+    pole = PinnedRegion(Box([None] * 3, [0.06, None, None]))
+    return Simulation(
+        FlagScene(spacing=0.02),
+        Material(E=6e3, density=30.0, thickness=0.01),
+        MPMSolver(dx=0.05, boundaries=[pole], damping=0.2),
+        wind=[5.0, 1.0, 0.0],
+        device=device,
+    )
+
+
+def vase(device):
+    """Flowers in a vase."""
+    foot = PinnedRegion(Box([None] * 3, [None, None, 0.3]), kind="nodes")
+    return Simulation(
+        VaseScene(spacing=0.025),
+        Material(E=1e5, density=400.0, thickness=0.006),
+        MPMSolver(dx=0.04, boundaries=[foot], damping=1.0, gravity=(0.0, 0.0, 0.0)),
+        wind=[3.0, 0.0, 0.0],
+        device=device,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [flag, vase])
+def test_the_estimate_is_within_a_factor_of_two_of_the_run(make, tmp_path):
+    """By the processor's time, on one thread; without what other programs take of it. The median of three estimates."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        simulation, frames = make("cpu"), 60
+        estimates = [estimate_cost(simulation, frames).total_seconds for _ in range(3)]
+        begin = time.process_time()
+        simulation.run(tmp_path / "run", frames, progress=False)
+        taken = time.process_time() - begin
+    finally:
+        torch.set_num_threads(threads)
+    assert 0.5 < statistics.median(estimates) / taken < 2
+
+
+@pytest.mark.gpu
+def test_kernels_are_loaded_before_a_gpu_is_timed():
+    """They are a part of the start, and not of a frame; ``bench.py previews`` compares the estimate with runs."""
+    first, second = (estimate_cost(flag("cuda"), 250) for _ in range(2))
+    assert 0 < first.startup_seconds <= cost_module.WARM_UP
+    assert 0 < second.startup_seconds <= cost_module.WARM_UP
+    assert first.substeps == second.substeps

@@ -1,0 +1,259 @@
+"""Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up."""
+
+import argparse
+import dataclasses
+import math
+import shlex
+
+import pytest
+import torch
+
+from gaussian_swaying.cli.preview import _joined, build_options
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.preview.doubts import doubts, preview_command
+from gaussian_swaying.preview.hold import guess_hold, hanging_cord
+from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
+from gaussian_swaying.scenes.procedural import FlagScene
+
+
+def tube(low, high, radius, count=600, end=None, seed=0):
+    """Points on a tube between two points, its radius ``end`` at the upper one, with both caps."""
+    draw = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(low), torch.tensor(high)
+    axis = torch.nn.functional.normalize(high - low, dim=0)
+    first = torch.linalg.cross(axis, torch.eye(3)[int(axis.abs().argmin())])
+    first = torch.nn.functional.normalize(first, dim=0)
+    second = torch.linalg.cross(axis, first)
+    share, angle = torch.rand(count, generator=draw), 2 * math.pi * torch.rand(count, generator=draw)
+    inner = torch.ones(count)
+    caps = count // 5
+    share[:caps] = torch.arange(caps) % 2
+    inner[:caps] = torch.rand(caps, generator=draw).sqrt()
+    reach = inner * (radius + share * ((radius if end is None else end) - radius))
+    ring = angle.cos()[:, None] * first + angle.sin()[:, None] * second
+    return low + share[:, None] * (high - low) + reach[:, None] * ring
+
+
+def ball(center, radius, count=600, seed=0):
+    """Points on a sphere."""
+    draw = torch.Generator().manual_seed(seed)
+    return torch.tensor(center) + radius * torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1)
+
+
+def block(low, high, count=1500, seed=0):
+    """Points on the six sides of a box."""
+    draw = torch.Generator().manual_seed(seed)
+    unit = torch.rand(count, 3, generator=draw)
+    side = torch.arange(count) % 3
+    unit[torch.arange(count), side] = (torch.arange(count) // 3 % 2).float()
+    low, high = torch.tensor(low), torch.tensor(high)
+    return low + unit * (high - low)
+
+
+def splat(*parts, size=0.02, move=(0.0, 0.0, 0.0)):
+    """Points as round, opaque Gaussians."""
+    means = torch.cat(parts) + torch.tensor(move)
+    count = len(means)
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
+    return GaussianCloud(
+        means, quats, torch.full((count, 3), math.log(size)), torch.full((count,), 2.0), torch.zeros(count, 1, 3)
+    )
+
+
+def man():
+    """1.8 high, in a stride, with a torso wider than the legs, a neck and a head, the origin between the feet."""
+    return [
+        block([0.05, -0.05, 0.0], [0.17, 0.25, 0.08]),
+        block([-0.17, -0.3, 0.0], [-0.05, 0.0, 0.08]),
+        tube([0.11, 0.05, 0.0], [0.1, 0.0, 0.9], 0.07),
+        tube([-0.11, -0.2, 0.0], [-0.1, 0.0, 0.9], 0.07),
+        tube([0.0, 0.0, 0.85], [0.0, 0.0, 1.5], 0.2, 1200),
+        tube([0.25, 0.0, 0.85], [0.25, 0.0, 1.45], 0.05),
+        tube([-0.25, 0.0, 0.85], [-0.25, 0.0, 1.45], 0.05),
+        tube([0.0, 0.0, 1.45], [0.0, 0.0, 1.6], 0.06, 200),
+        ball([0.0, 0.0, 1.68], 0.12),
+    ]
+
+
+def guitar_on_a_stand():
+    """1 high: a stand of three feet, a body and a long thin neck with a head, which lean back."""
+    return [
+        tube([0.0, 0.12, 0.35], [-0.18, -0.15, 0.0], 0.015, 300),
+        tube([0.0, 0.12, 0.35], [0.18, -0.15, 0.0], 0.015, 300),
+        tube([0.0, 0.12, 0.35], [0.0, 0.22, 0.0], 0.015, 300),
+        tube([0.0, -0.06, 0.08], [0.0, 0.02, 0.48], 0.16, 2500, 0.1),
+        tube([0.0, 0.02, 0.48], [0.0, 0.13, 0.9], 0.018, 800),
+        block([-0.04, 0.12, 0.9], [0.04, 0.15, 1.0], 300),
+    ]
+
+
+def plant_in_a_pot():
+    """A pot that widens upwards, a stem and a crown; the origin somewhere else."""
+    return [
+        tube([0.0, 0.0, 0.0], [0.0, 0.0, 0.2], 0.1, 900, 0.14),
+        tube([0.0, 0.0, 0.18], [0.0, 0.0, 0.6], 0.015, 400),
+        ball([0.0, 0.0, 0.7], 0.25, 1500),
+    ]
+
+
+def lamp(shade="bulb"):
+    """A bulb or a conical shade on a cord 0.6 long, under a small plate at the ceiling."""
+    body = ball([0.0, 0.0, 0.12], 0.12, 1200)
+    if shade == "cone":
+        body = tube([0.0, 0.0, 0.0], [0.0, 0.0, 0.25], 0.25, 1500, 0.03)
+    return [
+        body,
+        tube([0.0, 0.0, 0.2], [0.0, 0.0, 0.9], 0.006, 600),
+        tube([0.0, 0.0, 0.88], [0.0, 0.0, 0.92], 0.04, 300),
+    ]
+
+
+def ground(low=-0.06, half=1.0, step=0.05):
+    """A level plate of flat Gaussians, as a splat."""
+    side = torch.arange(-half, half + step / 2, step)
+    x, y = torch.meshgrid(side, side, indexing="ij")
+    means = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((x.numel(),), low)], -1)
+    cloud = splat(means)
+    scales = torch.tensor([0.6 * step, 0.6 * step, 0.002]).log().expand(len(means), 3)
+    return GaussianCloud(cloud.means, cloud.quats, scales, cloud.opacities, cloud.sh)
+
+
+def together(*clouds):
+    """Several splats as one."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return GaussianCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in names))
+
+
+def flag(move=(0.0, 0.0, 0.0)):
+    """The generated flag, its pole at x = 0."""
+    cloud = FlagScene(spacing=0.05).generate()
+    return GaussianCloud(cloud.means + torch.tensor(move), cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
+
+
+AWAY = (3.0, 4.0, 5.0)
+
+
+def held(cloud):
+    """Where a splat with z up is held, all of it taken as the object."""
+    cell = float((cloud.means.amax(0) - cloud.means.amin(0)).amax()) / CELLS
+    return guess_hold(cloud.means, visible_weight(cloud), (0.0, 0.0, 1.0), cell)
+
+
+@pytest.mark.parametrize(
+    ("thing", "end", "confidence"),
+    [
+        (man(), "bottom", "medium"),
+        (guitar_on_a_stand(), "bottom", "medium"),
+        (plant_in_a_pot(), "bottom", "medium"),
+        ([block([0.0, 0.0, 0.0], [1.0, 0.8, 0.6])], "bottom", "medium"),
+        ([tube([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 0.4, 1500, 0.02)], "bottom", "medium"),  # a cone, as a fir
+        ([tube([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 0.02, 1500, 0.4)], "bottom", "medium"),  # on its tip, as on a stalk
+        (lamp(), "top", "medium"),
+        (lamp("cone"), "top", "medium"),
+        ([block([0.0, 0.0, 0.0], [1.0, 0.01, 1.6])], "top", "low"),  # a curtain
+        ([ball([0.0, 0.0, 0.0], 1.0)], "bottom", "low"),
+        ([block([0.0, 0.0, 0.0], [2.0, 0.01, 1.4]), block([0.8, 0.0, 0.5], [1.2, 0.5, 1.0])], "bottom", "low"),
+    ],
+)
+def test_things_stand_or_hang(thing, end, confidence):
+    found = held(splat(*thing, move=AWAY))
+    assert (found.end, found.confidence) == (end, confidence), found
+    assert found.direction == ((0, 0, 1) if end == "top" else (0, 0, -1))
+
+
+@pytest.mark.parametrize("thing", [man, guitar_on_a_stand])
+def test_origin_at_the_feet_makes_it_sure(thing):
+    found = held(splat(*thing()))
+    assert (found.end, found.confidence) == ("bottom", "high")
+    assert "the origin lies at its lower end" in found.reason
+    hung = splat(*thing())
+    top = float(hung.means[:, 2].amax())
+    found = held(splat(*thing(), move=(0.0, 0.0, -top)))
+    assert found.confidence == "low"  # the origin at the upper end speaks against the base
+    assert found.scores["top"] == 1.0
+
+
+def test_flag_is_held_at_its_pole_only_if_the_origin_is_there():
+    found = suggest(flag()).hold
+    assert (found.end, found.direction, found.confidence) == ("side", (-1, 0, 0), "medium")
+    lost = held(flag(AWAY))
+    assert (lost.end, lost.confidence) == ("top", "low")
+    assert lost.options == ("top", "-x")  # the next best is one of its upright sides
+
+
+def test_what_leans_or_ends_beside_the_centre_is_no_cord():
+    """The guitar's neck is as thin as a cord, and leans; a lamp with its cord at the rim would hang askew."""
+    assert "cord" not in held(splat(*guitar_on_a_stand())).reason
+    askew = lamp()
+    askew[1] = askew[1] + torch.tensor([0.11, 0.0, 0.0])
+    askew[2] = askew[2] + torch.tensor([0.11, 0.0, 0.0])
+    assert held(splat(*askew, move=AWAY)).scores["top"] == 0
+
+
+def test_floor_holds_what_touches_it_and_not_what_hangs_over_it():
+    standing = suggest(together(splat(*man(), move=(3.0, 4.0, 0.0)), dataclasses.replace(ground(), means=(
+        ground().means + torch.tensor([3.0, 4.0, 0.0]))))).hold  # fmt: skip
+    assert standing.end == "bottom"
+    assert standing.scores["bottom"] == 4.5  # 2 for the floor, 1 the origin in its plane, 1 the base, 0.5
+    over = suggest(together(splat(*lamp(), move=(0.0, 0.0, 0.5)), ground()), "+z")
+    assert bool(over.up.ground.any())
+    assert over.hold.end == "top"
+    assert "left out" not in over.hold.reason
+
+
+def test_what_a_region_cuts_off_above_holds_it_there():
+    whole = splat(tube([0.0, 0.0, 0.0], [0.0, 0.0, 2.0], 0.3, 6000), move=AWAY)
+    below = suggest(whole, "+z", region=([2.0, 3.0, 4.9], [4.0, 5.0, 6.0])).hold
+    assert (below.end, below.scores["top"]) == ("top", 2.0)
+    above = suggest(whole, "+z", region=([2.0, 3.0, 6.0], [4.0, 5.0, 7.1])).hold
+    assert (above.end, above.confidence) == ("bottom", "high")
+
+
+def test_photos_from_below_say_that_it_hangs():
+    points, weight = ball([0.0, 0.0, 3.0], 0.5), torch.ones(600)
+    ring = torch.tensor([[math.cos(a), math.sin(a), 0.0] for a in torch.arange(0, 6, 0.5).tolist()]) * 3
+    up = (0.0, 0.0, 1.0)
+    assert guess_hold(points, weight, up, 0.05).end == "bottom"
+    hung = guess_hold(points, weight, up, 0.05, eyes=ring + torch.tensor([0.0, 0.0, 1.5]))
+    assert (hung.end, hung.scores["top"]) == ("top", 1.0)
+    stands = guess_hold(points, weight, up, 0.05, eyes=ring + torch.tensor([0.0, 0.0, 4.0]))
+    assert stands.scores["bottom"] == 1.0
+    wall = guess_hold(points, weight, up, 0.05, wall=(0.0, 1.0, 0.0))
+    assert (wall.end, wall.direction) == ("side", (0, 1, 0))
+
+
+def test_weak_guesses_print_the_commands_of_both():
+    defaults = build_options().parse_args([])
+    options = build_options().parse_args(shlex.split("'my ball.ply' --longest-side 0.3 --region -2 -2 -2 9 9 9"))
+    found = suggest(splat(ball([0.0, 0.0, 0.0], 1.0), move=AWAY))
+    lines = doubts(found, options, defaults)
+    commands = [shlex.split(line.partition("#")[0]) for line in lines if "python" in line]
+    told = [build_options().parse_args(_joined(command[2:])) for command in commands]
+    assert {told[0].up[0], told[1].up[0]} == {"+z", "-y"}
+    assert [again.hold for again in told] == [None, None, "bottom", "top"]
+    for again in told:
+        assert (again.scene, again.longest_side, again.region) == ("my ball.ply", 0.3, [-2, -2, -2, 9, 9, 9])
+    assert sum(line.startswith("warning") for line in lines) == 2
+    sure = suggest(splat(*man()).select(torch.arange(0, 7400, 5)), "+z")
+    assert doubts(sure, options, defaults) == []
+    assert preview_command(argparse.Namespace(scene="a.ply"), defaults) == "python tools/preview.py a.ply"
+
+
+@pytest.mark.parametrize(
+    ("body", "cord", "is_cord"),
+    [
+        (0.5, 0.039, True),  # thinner than 0.04 of the length
+        (0.5, 0.041, False),
+        (0.1, 0.024, True),  # and than a quarter of the widest part
+        (0.1, 0.026, False),
+    ],
+)
+def test_a_cord_is_thin_for_the_length_and_for_what_hangs_on_it(body, cord, is_cord):
+    """Two upright square bars, the upper one thin, 3 long together; of each, only the four edges."""
+    corners = torch.tensor([[-0.5, -0.5], [0.5, -0.5], [-0.5, 0.5], [0.5, 0.5]], dtype=torch.float64)
+    height = torch.linspace(0, 3, 601, dtype=torch.float64)
+    width = 3 * torch.where(height > 1.2, cord, body)
+    points = torch.cat([(width[:, None, None] * corners), height[:, None, None].expand(-1, 4, 1)], -1).reshape(-1, 3)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    found = hanging_cord(points, torch.ones(len(points), dtype=torch.float64), up)
+    assert (found is not None) == is_cord

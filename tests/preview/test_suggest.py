@@ -1,0 +1,435 @@
+"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known."""
+
+import dataclasses
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import LOOSE
+from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.geometry.neighbours import particle_spacing
+from gaussian_swaying.geometry.patches import smallest_axis_normal
+from gaussian_swaying.geometry.regions import Box, Cylinder
+from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.preview import calibration
+from gaussian_swaying.preview.hold import PIN_DEPTH, end_region
+from gaussian_swaying.preview.shape import SHEET, bounds, sheet_normal
+from gaussian_swaying.preview.starter import DRAFT_FRAMES, draft_yaml, starter_yaml
+from gaussian_swaying.preview.suggest import (
+    CELLS,
+    CLOTH_E,
+    KEPT_AREA,
+    MAX_BOXES,
+    MOST_CELLS,
+    QUALITIES,
+    SHELL_E,
+    broad_side,
+    connected_parts,
+    finest_spacing,
+    gaussian_statistics,
+    given_region,
+    suggest,
+    suggest_region,
+    suggest_threshold,
+    visible_weight,
+)
+from gaussian_swaying.preview.up import CONVENTION, floor_mask, guess_up
+from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.scene import SPECK
+from gaussian_swaying.simulation.simulation import Simulation
+
+AXES = {"+x": [1, 0, 0], "-x": [-1, 0, 0], "+y": [0, 1, 0], "-y": [0, -1, 0], "+z": [0, 0, 1], "-z": [0, 0, -1]}
+FLOOR, TRUNK, CROWN = slice(0, 1681), slice(1681, 1981), slice(1981, 2781)
+
+
+def turn_to(name):
+    """Rotation that takes z to an axis by a permutation of axes and signs, and its quaternion wxyz."""
+    half = math.sqrt(0.5)
+    turns = {
+        "+z": [1.0, 0, 0, 0],
+        "-z": [0, 1.0, 0, 0],
+        "+x": [half, 0, half, 0],
+        "-x": [half, 0, -half, 0],
+        "+y": [half, -half, 0, 0],
+        "-y": [half, half, 0, 0],
+    }
+    quat = torch.tensor(turns[name])
+    return quat_to_rotation(quat), quat
+
+
+def turned(cloud, name):
+    """A splat with z up turned so that an axis is up."""
+    rotation, (w, x, y, z) = turn_to(name)
+    a, b, c, d = cloud.quats.unbind(-1)
+    quats = torch.stack(
+        [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
+         w * d + x * c - y * b + z * a], -1)  # fmt: skip
+    return GaussianCloud(cloud.means @ rotation.T, quats, cloud.scales, cloud.opacities, cloud.sh)
+
+
+def splat(means, log_scales, quats=None, opacity=0.9):
+    count = len(means)
+    flat = torch.tensor([1.0, 0, 0, 0]).expand(count, 4) if quats is None else quats
+    logit = math.log(opacity / (1 - opacity))
+    return GaussianCloud(means, flat, log_scales, torch.full((count,), logit), torch.zeros(count, 1, 3))
+
+
+def tree(floor=True, offset=5.0):
+    """A floor of 2 x 2, a trunk of 0.1 x 0.1 x 0.8 on it, a crown of radius 0.35 at 1.1; z up, off the origin."""
+    side = torch.linspace(-1, 1, 41)
+    x, y = torch.meshgrid(side, side, indexing="ij")
+    ground = torch.stack([x.reshape(-1), y.reshape(-1), torch.zeros(1681)], -1)
+    draw = torch.Generator().manual_seed(0)
+    trunk = (torch.rand(300, 3, generator=draw) - 0.5) * torch.tensor([0.1, 0.1, 0.76]) + torch.tensor([0, 0, 0.43])
+    ball = torch.nn.functional.normalize(torch.randn(800, 3, generator=draw), dim=-1)
+    crown = 0.35 * ball * torch.rand(800, 1, generator=draw) ** (1 / 3) + torch.tensor([0, 0, 1.1])
+    scales = torch.tensor([0.03, 0.03, 0.003]).log()
+    quats = torch.cat([torch.tensor([[1.0, 0, 0, 0]]).expand(1681, 4), torch.randn(1100, 4, generator=draw)])
+    cloud = splat(torch.cat([ground, trunk, crown]) + offset, scales.expand(2781, 3), quats)
+    return cloud if floor else cloud.select(torch.arange(1681, 2781))
+
+
+def up_of(cloud):
+    return guess_up(cloud.means, smallest_axis_normal(cloud.quats, cloud.scales), visible_weight(cloud))
+
+
+# ---- the flag
+
+
+def test_flag_has_known_up_pins_region_and_spacing():
+    found = suggest(FlagScene(spacing=0.05).generate())
+    assert found.up.direction == (0, 0, 1)
+    assert found.up.confidence == "medium"
+    assert found.region.region() is None  # one sheet and nothing else
+    assert int(found.region.simulated.sum()) == 24 * 16
+    assert found.hold.end == "side"
+    assert found.hold.direction == (-1, 0, 0)  # the pole
+    assert found.sheet
+    # 24 columns span 1.15 m, which become 1 m: twice their distance is coarser than 1/24 m
+    assert found.spacing == pytest.approx(0.05 / 1.15, rel=1e-4)
+    assert found.dx == 0.087
+    # one and a half cells from the 0.5 % that lie farthest out (here the first column)
+    assert isinstance(found.pin, Box)
+    assert found.pin.max[0] == pytest.approx(0.025 + 1.5 * 0.087 * 1.15, abs=1e-3)
+    assert found.pin.max[1:] == (math.inf, math.inf)
+    # from the pole along the flag, a little onto it
+    assert found.flow[0] == pytest.approx(6 * math.cos(0.25), abs=0.01)
+    assert abs(found.flow[1]) == pytest.approx(6 * math.sin(0.25), abs=0.01)
+
+
+def test_fine_flag_gets_the_cells_of_its_longest_side():
+    found = suggest(FlagScene(spacing=0.0125).generate(), longest_side=1.2)
+    assert found.dx == float(f"{1.2 / CELLS:.2g}")
+    assert found.metres_per_unit == pytest.approx(1.2 / (1.2 - 0.0125))
+
+
+def test_holes_between_large_gaussians_are_filled_without_asking(tmp_path):
+    """A sheet of few, huge Gaussians."""
+    cloud = FlagScene(spacing=0.05).generate()
+    few = torch.arange(len(cloud)) % 5 == 0
+    sparse = dataclasses.replace(cloud, scales=cloud.scales + math.log(4)).select(few)
+    write_ply(tmp_path / "flag.ply", sparse)
+    found = dataclasses.replace(suggest(sparse), dx=0.06)
+    (tmp_path / "starter.yaml").write_text(starter_yaml(found, tmp_path / "flag.ply"))
+    assert "particle_spacing" not in (tmp_path / "starter.yaml").read_text()
+    scene = Simulation.from_yaml(tmp_path / "starter.yaml", device="cpu").scene
+    assert scene.further > 0.5 * len(sparse)
+
+
+def test_a_quality_is_a_grid_and_nothing_else():
+    cloud = FlagScene(spacing=0.015).generate()
+    found = {name: suggest(cloud, quality=name) for name in QUALITIES}
+    assert {name: one.dx for name, one in found.items()} == {"draft": 0.062, "normal": 0.042, "fine": 0.025}
+    assert found["fine"].dx == pytest.approx(2 * found["fine"].spacing, rel=0.02)  # its Gaussians are too far apart
+    assert suggest(cloud).dx == found["normal"].dx
+    for name, one in found.items():
+        assert one.quality == name
+        same = dataclasses.replace(one, dx=0.042, quality="normal")
+        assert starter_yaml(same, "flag.ply") == starter_yaml(found["normal"], "flag.ply")
+        text = starter_yaml(one, "flag.ply")
+        assert text.startswith(f"# A first configuration. Quality: {name}.\n")
+        assert f"# m; quality {name}: " in text
+        assert yaml.safe_load(text)["solver"]["dx"] == one.dx
+        assert draft_yaml(one, "flag.ply") == draft_yaml(found["normal"], "flag.ply")
+    assert finest_spacing(found["normal"]) == found["fine"].dx
+    assert finest_spacing(dataclasses.replace(found["normal"], spacing=1e-4)) == float(f"{1 / MOST_CELLS:.2g}")
+    with pytest.raises(ValueError, match="Expected `--quality` to be one of draft, normal, fine, but got 'best'"):
+        suggest(cloud, quality="best")
+
+
+def test_given_values_replace_guesses():
+    cloud = FlagScene(spacing=0.05).generate()
+    found = suggest(cloud, up="+x", hold="top", region=([0, -1, 0], [0.6, 1, 1]), longest_side=2.0, speed=3.0)
+    assert found.up.direction == (1, 0, 0)
+    assert found.up.confidence == found.hold.confidence == "given"
+    assert found.hold.direction == (1, 0, 0)
+    assert int(found.region.simulated.sum()) == 12 * 16
+    assert found.pin.min[0] > 0.3
+    assert max(found.size) == pytest.approx(2.0)
+    assert math.hypot(*found.flow) == pytest.approx(3.0, abs=0.01)
+    assert suggest(cloud, up=[0, 0, 2], hold="none").pin is None
+    assert suggest(cloud, hold="+x").pin.min[0] > 1
+
+
+# ---- up and floor
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_floor_tells_up_whatever_the_axes(name):
+    cloud = turned(tree(), name)
+    found = up_of(cloud)
+    assert found.direction == tuple(AXES[name])
+    assert found.confidence != "low"
+    assert bool(found.ground[FLOOR].all())
+    assert not bool(found.ground[CROWN].any())
+
+
+def test_without_a_floor_convention_decides_and_says_so():
+    ball = splat(torch.randn(500, 3) + 9, torch.zeros(500, 3) - 4)
+    found = up_of(ball)
+    assert found.confidence == "low"
+    assert found.scores["+z"] == found.scores["-y"] == max(found.scores.values())
+    assert not bool(found.ground.any())
+
+
+def test_origin_at_the_lower_end_and_longest_side_are_evidence():
+    column = torch.rand(2000, 3) * torch.tensor([1.0, 4.0, 1.0]) + torch.tensor([3.0, -4.0, 3.0])  # y from -4 to 0
+    found = up_of(splat(column, torch.full((2000, 3), -4.0)))
+    assert found.direction == (0, -1, 0)
+    # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next, 0.5 for a base, which the top is too
+    assert found.scores["-y"] == pytest.approx(3.75)
+    assert found.scores["+y"] == pytest.approx(2.5)
+
+
+def test_a_base_tells_which_end_is_down():
+    """A cone, off the origin: it does not stand on its tip."""
+    height = torch.rand(3000, 1, generator=torch.Generator().manual_seed(0)).sqrt()
+    cone = torch.cat([0.6 * height * (torch.rand(3000, 2) - 0.5), 1 - height], -1) + 5
+    found = up_of(splat(cone, torch.full((3000, 3), -4.0)))
+    assert found.scores["+z"] - found.scores["-z"] == pytest.approx(0.75 + 1 + 0.5)
+    assert any("base" in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize("change", ["narrow", "table", "rough"])
+def test_what_is_no_floor(change):
+    means, normal = tree(offset=0.0).means.clone(), torch.tensor([0.0, 0, 1]).repeat(2781, 1)
+    assert bool(floor_mask(means, normal, torch.ones(2781), (0, 0, 1)).any())
+    if change == "narrow":  # than what stands on it
+        means[FLOOR] *= 0.2
+    elif change == "table":  # something below it
+        means[FLOOR, 2] += 0.8
+    else:
+        normal[FLOOR] = torch.tensor([0.6, 0.8, 0.0])
+    assert not bool(floor_mask(means, normal, torch.ones(2781), (0, 0, 1)).any())
+
+
+# ---- region
+
+
+def test_region_leaves_out_floor_and_specks():
+    cloud = tree()
+    specks = torch.tensor([[0.3, 0.3, 0.3], [-0.3, -0.3, 0.35], [0.8, 0.8, 2.5]]) + 5.0  # two in the box, one above
+    extra = splat(specks.repeat_interleave(4, 0) + 0.002 * torch.randn(12, 3), torch.full((12, 3), -5.0))
+    both = GaussianCloud(*(torch.cat([getattr(c, n) for c in (cloud, extra)]) for n in
+                           ("means", "quats", "scales", "opacities", "sh")))  # fmt: skip
+    found = suggest(both)
+    assert found.up.direction == (0, 0, 1)
+    assert found.hold.end == "bottom"
+    assert found.region.specks == 12
+    assert len(found.region.holes) == 2
+    simulated = found.region.simulated
+    assert bool(simulated[CROWN].all())
+    assert not bool(simulated[FLOOR].any())
+    assert not bool(simulated[2781:].any())
+    assert float(simulated[TRUNK].double().mean()) > 0.9  # the foot lies in the layer of the floor
+    # what the region of the configuration picks is what is said
+    region = found.region.region()
+    assert torch.equal(region.contains(both.means), simulated)
+    # the pinned end is the foot of the trunk
+    pinned = found.pin.contains(both.means) & simulated
+    assert bool(pinned[TRUNK].any())
+    assert not bool(pinned[CROWN].any())
+
+
+def test_too_little_above_the_floor_is_refused():
+    cloud = tree().select(torch.arange(0, 1700))
+    with pytest.raises(ValueError, match="too few for an object"):
+        suggest(cloud.select(torch.arange(10)))
+    with pytest.raises(ValueError, match=r"box of `--region` contains 0 Gaussians.*splat spans"):
+        given_region(cloud.means, torch.ones(1700), torch.ones(1700), [90, 90, 90], [91, 91, 91])
+    with pytest.raises(ValueError, match="are at one point"):
+        suggest(splat(torch.ones(50, 3), torch.zeros(50, 3)))
+
+
+def test_threshold_keeps_the_visible_area():
+    opacity = torch.tensor([0.5, 0.07, 0.03, 0.005])
+    assert suggest_threshold(opacity, torch.tensor([96.0, 2, 1, 1])) == 0.1
+    assert suggest_threshold(opacity, torch.tensor([90.0, 6, 3, 1])) == 0.05
+    assert suggest_threshold(opacity, torch.tensor([90.0, 3, 6, 1])) == 0.02
+    assert suggest_threshold(opacity, torch.tensor([50.0, 0, 0, 50])) == 0.0
+
+
+def test_connected_parts_against_a_search():
+    points = torch.rand(120, 3)
+    part = connected_parts(points, 0.1)
+    cell = ((points.double() - points.amin(0).double()) / 0.1).floor().long()
+    label = list(range(120))  # the definition: cells that touch are connected
+    for _ in range(120):
+        for i, j in itertools.combinations(range(120), 2):
+            if label[i] != label[j] and bool(((cell[i] - cell[j]).abs() <= 1).all()):
+                label[i] = label[j] = min(label[i], label[j])
+        if all(
+            label[i] == label[j]
+            for i, j in itertools.combinations(range(120), 2)
+            if bool(((cell[i] - cell[j]).abs() <= 1).all())
+        ):
+            break
+    label = torch.tensor(label)
+    assert 1 < len(label.unique()) < 120
+    assert torch.equal(part[:, None] == part, label[:, None] == label)
+
+
+def test_a_long_chain_is_one_part():
+    chain = torch.arange(3000.0)[:, None] * torch.tensor([1.0, 0.3, -0.2])
+    assert int(connected_parts(chain, 1.01).max()) == 0
+    assert int(connected_parts(chain, 0.45).max()) > 0
+
+
+# ---- pins
+
+
+def test_end_region_of_a_tilted_axis_holds_that_end():
+    points = torch.rand(2000, 3, dtype=torch.float64) * 2 - 1
+    axis = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    region = end_region(points, axis.tolist(), 0.05)
+    assert isinstance(region, Cylinder)
+    along = points @ axis
+    solid = along.sort().values[round(0.995 * 1999)]
+    depth = max(0.06 * float(along.max() - along.min()), 1.5 * 0.05)
+    held = region.contains(points)
+    assert bool(held.any())
+    sure = (along - (solid - depth)).abs() > 1e-3  # coordinates are rounded to a hundredth of a cell
+    assert torch.equal(held[sure], (along >= solid - depth)[sure])
+
+
+# ---- numbers
+
+
+def test_statistics_of_known_gaussians():
+    scales = torch.tensor([0.04, 0.4, 0.1]).log().expand(100, 3)
+    opacities = torch.logit(torch.linspace(0.005, 0.995, 100))
+    means = torch.rand(100, 3) * torch.tensor([2.0, 8.0, 1.0])
+    own = gaussian_statistics(GaussianCloud(means, torch.ones(100, 4), scales, opacities, torch.zeros(100, 4, 3)))
+    assert (own["count"], own["sh_degree"], own["normals"]) == (100, 1, False)
+    assert own["S1_over_S2"] == pytest.approx([4.0] * 3)
+    assert own["S2_over_S3"] == pytest.approx([2.5] * 3)
+    assert own["opacity_below"]["0.1"] == pytest.approx(0.10)
+    assert own["opacity"][1] == pytest.approx(0.5, abs=0.01)
+    side = float(means[:, 1].max() - means[:, 1].min())
+    assert own["size_share"][1] == pytest.approx(0.4 / side, rel=0.05)
+
+
+def test_robust_bounds_ignore_a_far_speck():
+    points = torch.rand(1000, 3)
+    points[0] = 1e6
+    corner = bounds(points)
+    assert corner["max"] == [1e6] * 3
+    assert max(corner["robust_max"]) <= 1
+    assert corner["min"] == points.amin(0).tolist()
+
+
+def test_spacing_of_a_lattice():
+    grid = torch.cartesian_prod(*(torch.arange(8.0) * 0.3,) * 3)
+    assert particle_spacing(grid) == pytest.approx(0.3)
+    assert suggest_spacing(1.0, 0.001, 24) == 0.042
+    assert suggest_spacing(1.0, 0.1, 24) == 0.2
+    with pytest.raises(ValueError, match="longest_side"):
+        suggest_spacing(0.0, 0.1, 24)
+
+
+def test_sheet_and_broad_side():
+    plate = torch.rand(500, 3) * torch.tensor([1.0, 0.02, 2.0])
+    assert sheet_normal(plate) == (0, 1, 0)
+    assert sheet_normal(torch.rand(500, 3)) is None
+    assert abs(broad_side(plate)) == pytest.approx(90, abs=2)  # seen along y
+    angle = math.radians(30)
+    turn = torch.tensor([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    assert broad_side(plate @ turn.T) == pytest.approx(-60, abs=2)
+
+
+def test_specks_beyond_the_boxes_follow_their_neighbours(make_scene):
+    draw = torch.Generator().manual_seed(1)
+    angle = torch.arange(10.0) * 0.6
+    centre = torch.stack([0.3 * angle.cos(), 0.3 * angle.sin(), 0.2 + 0.045 * torch.arange(10.0)], -1) + 5.0
+    means = centre.repeat_interleave(3, 0) + 0.002 * torch.randn(30, 3, generator=draw)
+    base, extra = tree(), splat(means, torch.full((30, 3), -5.0))
+    names = ("means", "quats", "scales", "opacities", "sh")
+    both = GaussianCloud(*(torch.cat([getattr(c, n) for c in (base, extra)]) for n in names))
+    points, weight = both.means, visible_weight(both)
+    ground = floor_mask(points, smallest_axis_normal(both.quats, both.scales), weight, (0, 0, 1))
+    found = suggest_region(points, both.opacities.sigmoid(), weight, ground, 0.05)
+    assert len(found.holes) == MAX_BOXES
+    scene = make_scene(both, dx=0.12, region=found.region(), loose="carry")
+    assert scene.loose == 3 * (10 - MAX_BOXES)
+    assert bool((scene.carried >= len(base)).all())
+    assert found.specks == 30
+
+
+def test_page_states_the_numbers_of_the_rules():
+    page = (Path(__file__).parents[3] / "docs/own_scene.md").read_text(encoding="utf-8")
+    for text in (
+        f"z up (Blender), y down (COLMAP) | {CONVENTION['+z']:g} |",
+        f"y up (glTF) | {CONVENTION['+y']:g} |",
+        f"up to {MAX_BOXES} small boxes",
+        *(f"| `{name}` | {cells} |" for name, cells in QUALITIES.items()),
+        f"at most {MOST_CELLS} cells",
+        f"{KEPT_AREA:.0%}".replace("%", " % of the visible area"),
+        f"default is {calibration.SWAY:.0%}".replace("%", " %"),
+        f"from {calibration.SOFTEST:.0e} to {calibration.STIFFEST:.0e} Pa".replace("e+0", "e"),
+        f"{100 * calibration.THINNEST:g} to {100 * calibration.THICKEST:g} % of the longest side",
+        f"first {calibration.SECONDS:g} s",
+        f"between {calibration.STRETCH[0]:g} and {calibration.STRETCH[1]:g}",
+        f"less than {LOOSE:.0%}".replace("%", " % of what the largest part has"),
+        f"side `dx` / {1 / SPECK:g}",
+        f"{PIN_DEPTH:.0%}".replace("%", " % of the length deep"),
+        f"below {SHEET:g} of the next",
+    ):
+        assert text in page, text
+    assert CONVENTION["-y"] == CONVENTION["+z"]
+    example = page.split("```python\n")[1].split("```")[0]
+    exec(compile(example, "own_scene.md", "exec"), {})
+
+
+def test_draft_is_the_starter_on_a_coarser_grid():
+    found = suggest(FlagScene(spacing=0.0125).generate())
+    starter, draft = (yaml.safe_load(make(found, "flag.ply")) for make in (starter_yaml, draft_yaml))
+    assert draft["solver"]["dx"] == float(f"{1 / QUALITIES['draft']:.2g}") > starter["solver"]["dx"]
+    assert draft["frames"] == DRAFT_FRAMES < starter["frames"]
+    assert draft["camera"]["init_args"]["height"] < starter["camera"]["init_args"]["height"]
+    assert draft["scene"]["points"] == starter["scene"]["points"] == "grid"
+    for part in ("material", "wind", "aero", "shader"):
+        assert draft[part] == starter[part]
+    assert draft["solver"]["boundaries"] == starter["solver"]["boundaries"]
+    coarse = suggest(FlagScene(spacing=0.1).generate())  # too few Gaussians for a coarser grid to be any
+    assert yaml.safe_load(draft_yaml(coarse, "flag.ply"))["solver"]["dx"] == coarse.dx
+
+
+def test_only_cloth_and_what_falls_has_weight():
+    """All else was captured in balance with its weight."""
+
+    def gravity(found):
+        return yaml.safe_load(starter_yaml(found, "it.ply"))["solver"]["gravity"][2]
+
+    flag = suggest(FlagScene(spacing=0.05).generate())
+    assert (flag.youngs_modulus, gravity(flag)) == (CLOTH_E, -9.8)
+    for hold, weight in (("bottom", 0.0), ("top", 0.0), ("none", -9.8)):
+        found = suggest(tree(), hold=hold)
+        assert found.youngs_modulus == SHELL_E
+        assert gravity(found) == weight
+        assert math.hypot(*found.flow) == pytest.approx(6, abs=0.01)

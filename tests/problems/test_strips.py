@@ -1,0 +1,23 @@
+"""A strip on hinges sags by its closed form; one that is clamped sags by a fifth of it."""
+
+import pytest
+from bench.problems.settings import Settings
+from bench.problems.strips import hinged_strip
+
+
+@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+def test_a_hinge_takes_no_moment(shift):
+    """Wherever the strip lies on the grid, with its middle plane on nodes or between them."""
+    run = hinged_strip(16, Settings(), shift=shift)
+    assert run["residual"] < 1e-3
+    assert run["error"] < 0.005
+    assert run["slope"] == pytest.approx(1, abs=0.01)
+    assert run["moment"] < 0.05
+
+
+@pytest.mark.parametrize("hold", ["clamp", "nodes"])
+def test_what_holds_the_slope_fails_by_far(hold):
+    run = hinged_strip(4, Settings(), hold=hold)
+    assert run["error"] > 0.75
+    assert run["slope"] < 0.1
+    assert run["moment"] > 0.5

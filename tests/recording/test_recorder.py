@@ -1,0 +1,695 @@
+"""What a run leaves on disk, and what it leaves when something breaks."""
+
+import csv
+import gc
+import json
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.gaussians.ply import read_ply, write_ply
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.recording import recorder as recorder_module
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.recording.trajectory import load_trajectory
+from gaussian_swaying.recording.video import VideoEncoder
+from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.run import Run
+
+
+def _names(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def _run(simulation, folder, frames=3, recorder=None, **settings):
+    return simulation.run(folder, frames, progress=False, **settings, recorder=recorder or Recorder())
+
+
+# ---- files
+
+
+def _failing(monkeypatch, target, name):
+    """Make a writer fail after it has written half a file."""
+
+    def fail(path, *_, **__):
+        assert not str(path).endswith("00001.png")  # never under its own name
+        path.write_bytes(b"half")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(target, name, fail)
+
+
+@pytest.mark.parametrize("what", ["image", "trajectory", "checkpoint", "ply", "summary"])
+def test_a_failing_write_leaves_no_half_file(what, make_simulation, tmp_path, monkeypatch):
+    recorder = Recorder(ply_every=1, video=False)
+    recorder.open(tmp_path / "run")
+    before = _names(tmp_path)
+    if what == "image":
+        _failing(monkeypatch, iio, "imwrite")
+        write = lambda: recorder.write_image(1, torch.zeros(2, 2, 3))  # noqa: E731
+    elif what == "trajectory":
+        _failing(monkeypatch, np, "savez")
+        write = lambda: recorder.write_trajectory(1, torch.zeros(2, 3), torch.zeros(2, 3, 3))  # noqa: E731
+    elif what == "checkpoint":
+        monkeypatch.setattr(torch, "save", lambda _, path: (path.write_bytes(b"half"), 1 / 0))
+        write = lambda: recorder.write_checkpoint({"frame": 1})  # noqa: E731
+    elif what == "ply":
+        import plyfile
+
+        simulation = make_simulation()
+
+        def fail(self, path):
+            with open(path, "wb") as stream:
+                stream.write(b"half")
+            raise OSError("No space left on device")
+
+        monkeypatch.setattr(plyfile.PlyData, "write", fail)
+        write = lambda: recorder.write_ply(1, lambda p: write_ply(p, simulation.scene.rest().to_cloud()))  # noqa: E731
+    else:
+        write = lambda: recorder.write_summary({"a": object()})  # noqa: E731
+
+    def write_and_wait():
+        write()
+        recorder.wait()
+
+    with pytest.raises((OSError, ZeroDivisionError, TypeError)):
+        write_and_wait()
+    assert _names(tmp_path) == before
+
+
+def test_files_of_a_run(make_simulation, tmp_path):
+    simulation = make_simulation()
+    simulation.config = "frames: 3\n"
+    _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=2))
+    assert _names(tmp_path / "run") == [
+        "checkpoint.pt",
+        "config.yaml",
+        "diagnostics.csv",
+        "frames",
+        "frames/00000.png",
+        "frames/00001.png",
+        "frames/00002.png",
+        "nodes.npz",
+        "ply",
+        "ply/00000.ply",
+        "ply/00002.ply",
+        "run.json",
+        "summary.json",
+        "trajectory.npz",
+        "video.mp4",
+    ]
+    assert (tmp_path / "run" / "config.yaml").read_text() == "frames: 3\n"
+
+
+def test_diagnostics_are_a_table_too(make_simulation, tmp_path):
+    """One row per frame with the numbers of summary.json, readable by any spreadsheet."""
+    summary = _run(make_simulation(), tmp_path / "run")
+    with (tmp_path / "run" / "diagnostics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(summary["per_frame"]) == 3
+    for row, entry in zip(rows, summary["per_frame"], strict=True):
+        assert {name: float(value) for name, value in row.items()} == pytest.approx(entry)
+    assert float(rows[-1]["wind_work"]) > 0
+
+
+def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
+    recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0, nodes=False)
+    _run(make_simulation(), tmp_path / "run", recorder=recorder)
+    assert _names(tmp_path / "run") == ["config.yaml", "diagnostics.csv", "run.json", "summary.json"]
+    with pytest.raises(ValueError, match=r"`recorder.images`"):
+        Recorder(images=False)
+    for name, value in (("ply_every", -1), ("checkpoint_every", -1), ("fps", 0.0)):
+        with pytest.raises(ValueError, match=name):
+            Recorder(**{name: value})
+
+
+def test_images_are_the_pictures_rounded_to_8_bits(make_simulation, tmp_path):
+    simulation = make_simulation(background=(0.25, 0.5, 1.0))
+    _run(simulation, tmp_path / "run", 1)
+    stored = iio.imread(tmp_path / "run" / "frames" / "00000.png")
+    color = simulation.painter.render(simulation.start(), 0).color
+    assert stored.shape == (18, 32, 3)
+    assert stored[0, 0].tolist() == [64, 128, 255]
+    assert np.abs(stored / 255 - color.numpy()).max() <= 0.5 / 255 + 1e-6
+
+
+# ---- trajectory and .ply
+
+
+def test_the_trajectory_holds_every_frame(make_simulation, tmp_path):
+    simulation = make_simulation()
+    _run(simulation, tmp_path / "run")
+    state = simulation.start()
+    for frame in range(3):
+        if frame:
+            state, _ = simulation.advance(state)
+        position, F = load_trajectory(tmp_path / "run" / "trajectory.npz", frame)
+        assert torch.equal(position, state.position)
+        torch.testing.assert_close(F, state.F_total, rtol=1e-3, atol=1e-3)
+    with pytest.raises(ValueError, match="has no frame 3: it has 3 frames"):
+        load_trajectory(tmp_path / "run" / "trajectory.npz", 3)
+
+
+def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_simulation, tmp_path):
+    """Log scales, logit opacities, unit quaternions wxyz, means in scene units, harmonics turned with the patches."""
+    cloud = make_cloud()
+    settings = {"pinned": False, "scene": {"up": [0.0, -1.0, 0.0], "longest_side": 0.7}}
+    simulation = make_simulation(cloud, wind=WindField([0.0, 9.0, 0.0]), **settings)
+    _run(simulation, tmp_path / "run", recorder=Recorder(ply_every=1))
+    state = simulation.start()
+    rest = read_ply(tmp_path / "run" / "ply" / "00000.ply")
+    torch.testing.assert_close(rest.sh, cloud.sh, rtol=0, atol=1e-5)
+    for _ in range(2):
+        state, _ = simulation.advance(state)
+    deformed = simulation.scene.deformed(state)
+    found = read_ply(tmp_path / "run" / "ply" / "00002.ply")
+    assert float((deformed.means - cloud.means).abs().max()) > 0.01
+    torch.testing.assert_close(found.means, deformed.means)
+    torch.testing.assert_close(found.quats.norm(dim=-1), torch.ones(40), rtol=0, atol=1e-5)
+    torch.testing.assert_close(covariance(found.quats, found.scales), deformed.covariances, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(found.opacities, cloud.opacities)
+    camera = simulation.painter.camera_at(2).to(dtype=torch.float32)
+    seen = sh_to_color(found.sh, found.means - camera.position)
+    torch.testing.assert_close(seen, simulation.painter.colors(deformed, camera), rtol=0, atol=1e-4)
+    unturned = sh_to_color(cloud.sh, found.means - camera.position)
+    assert float((seen - unturned).abs().max()) > 0.01
+    torch.testing.assert_close(found.normals, deformed.normals)
+    torch.testing.assert_close(found.normals.norm(dim=-1), torch.ones(40))
+
+
+# ---- video
+
+
+def _probe(path):
+    done = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path)], capture_output=True, text=True)
+    return next(line for line in done.stderr.splitlines() if "Video:" in line)
+
+
+def test_the_video(make_simulation, tmp_path):
+    """As many frames as pictures, even sides though the pictures are odd, in the format that every player knows."""
+    simulation = make_simulation(camera=OrbitCamera(width=33, height=19, azimuth=-70.0, radius=1.9))
+    _run(simulation, tmp_path / "run", 4)
+    frames = iio.imread(tmp_path / "run" / "video.mp4")
+    assert frames.shape == (4, 20, 34, 3)
+    line = _probe(tmp_path / "run" / "video.mp4")
+    assert "h264" in line
+    assert "yuv420p" in line
+    assert "34x20" in line
+    assert "25 fps" in line
+    assert iio.imread(tmp_path / "run" / "frames" / "00000.png").shape == (19, 33, 3)
+
+
+def test_a_video_that_cannot_be_made_loses_nothing_else(make_simulation, tmp_path, monkeypatch):
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: "false")
+    with pytest.raises(OSError, match=r"ffmpeg could not write video\.mp4"):
+        _run(make_simulation(), tmp_path / "run")
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 3
+    load_trajectory(tmp_path / "run" / "trajectory.npz", 2)
+    assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
+
+
+# ---- in the background
+
+
+LONG = 60  # s; only a test that fails waits so long
+
+
+def _grey(k):
+    return torch.full((16, 16, 3), 50 * k / 255)
+
+
+def _levels(folder):
+    return [round(float(frame.mean()) / 50) for frame in iio.imread(folder / "video.mp4")]
+
+
+def _not_again(monkeypatch):
+    monkeypatch.setattr(recorder_module, "encode_video", lambda *_: pytest.fail("the video was encoded again"))
+
+
+def _before_imwrite(monkeypatch, action):
+    """Do something in the thread that writes a PNG, given its frame number."""
+    write = iio.imwrite
+
+    def wrapped(path, *arguments, **settings):
+        action(int(path.name.split(".")[1]))
+        write(path, *arguments, **settings)
+
+    monkeypatch.setattr(iio, "imwrite", wrapped)
+
+
+def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
+    """Frame 0 is compressed after frame 4; the video is encoded while the run goes on, and not a second time."""
+    later, finished = threading.Event(), []
+
+    def reverse(frame):
+        if frame == 0:
+            assert later.wait(LONG)
+        finished.append(frame)
+        if frame == 4:
+            later.set()
+
+    _before_imwrite(monkeypatch, reverse)
+    _not_again(monkeypatch)
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run", real_time_fps=10.0)
+    for k in range(5):
+        recorder.write_image(k, _grey(k))
+    recorder.close(5, {})
+    assert finished[-1] == 0
+    assert _levels(tmp_path / "run") == [0, 1, 2, 3, 4]
+    assert "10 fps" in _probe(tmp_path / "run" / "video.mp4")
+    for k in range(5):
+        assert (iio.imread(tmp_path / "run" / "frames" / f"{k:05d}.png") == 50 * k).all()
+
+
+def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypatch):
+    gate = threading.Event()
+    _before_imwrite(monkeypatch, lambda _: gate.wait(LONG))
+    recorder = Recorder()
+    recorder.open(tmp_path / "run")
+    image, position, F, log = _grey(2), torch.ones(4, 3), torch.ones(4, 3, 3).half(), [1]
+    try:
+        recorder.write_image(0, image)
+        recorder.write_trajectory(0, position, F)
+        recorder.write_checkpoint({"frame": 0, "state": {"position": position}, "log": log})
+        for tensor in (image, position, F):
+            tensor.zero_()
+        log.append(2)
+    finally:
+        gate.set()
+    recorder.close(1, {})
+    assert (iio.imread(tmp_path / "run" / "frames" / "00000.png") == 100).all()
+    assert _levels(tmp_path / "run") == [2]
+    for stored, shape in zip(load_trajectory(tmp_path / "run" / "trajectory.npz", 0), [(4, 3), (4, 3, 3)], strict=True):
+        assert torch.equal(stored, torch.ones(shape))
+    checkpoint = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert torch.equal(checkpoint["state"]["position"], torch.ones(4, 3))
+    assert checkpoint["log"] == [1]
+
+
+def test_a_frame_that_cannot_be_written_is_in_no_checkpoint(tmp_path, monkeypatch):
+    """What came before it is kept, with its video; nothing is half-written; the error comes once, in one sentence."""
+    fail = threading.Event()
+
+    def disk_full(frame):
+        if frame == 1:
+            assert fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    _before_imwrite(monkeypatch, disk_full)
+    recorder = Recorder()
+    recorder.open(tmp_path / "run")
+    for k in range(2):
+        recorder.write_image(k, _grey(k))
+        recorder.write_trajectory(k, torch.zeros(4, 3), torch.zeros(4, 3, 3))
+        recorder.write_checkpoint({"frame": k})
+    fail.set()
+    with pytest.raises(OSError, match=r"^frames/00001\.png could not be written: No space left on device$"):
+        recorder.wait()
+    with pytest.raises(OSError, match=r"frames/00001\.png"):
+        recorder.write_image(2, _grey(2))
+    recorder.close(2, {})
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True) == {"frame": 0}
+    assert _levels(tmp_path / "run") == [0]
+    load_trajectory(tmp_path / "run" / "trajectory.npz", 0)
+    assert _names(tmp_path / "run" / "frames") == ["00000.png"]
+    assert not [name for name in _names(tmp_path / "run") if name.split("/")[-1].startswith(".")]
+
+
+def test_close_tells_what_nobody_asked_about_before(tmp_path, monkeypatch):
+    fail = threading.Event()
+
+    def disk_full(frame):
+        if frame == 1:
+            assert fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    _before_imwrite(monkeypatch, disk_full)
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    for k in range(2):
+        recorder.write_image(k, _grey(k))
+    fail.set()
+    with pytest.raises(OSError, match=r"frames/00001\.png could not be written: No space left on device"):
+        recorder.close(2, {"a": 1})
+    assert _names(tmp_path / "run") == ["frames", "frames/00000.png", "run.json", "summary.json", "video.mp4"]
+
+
+@pytest.mark.parametrize("frame", [2, 3])
+def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_path, monkeypatch):
+    """Also if the last frame is the one that cannot be written, and that shows only after the simulation."""
+    fail = threading.Event()
+
+    def disk_full(k):
+        if k == frame:
+            assert k < 3 or fail.wait(LONG)
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        wait = Recorder.wait
+        patch.setattr(Recorder, "wait", lambda self: (fail.set() if self._folder else None, wait(self)))
+        _before_imwrite(patch, disk_full)
+        with pytest.raises(OSError, match=f"frames/0000{frame}.png could not be written: No space left on device"):
+            _run(make_simulation(), tmp_path / "run", 4)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["status"] == "failed"
+    assert "No space left" in summary["reason"]
+    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["frame"] < frame
+    _run(make_simulation(), tmp_path / "run", 4, resume=True)
+    _run(make_simulation(), tmp_path / "whole", 4)
+    videos = [iio.imread(tmp_path / name / "video.mp4") for name in ("run", "whole")]
+    assert len(videos[0]) == 4
+    assert np.array_equal(*videos)
+
+
+def test_a_resumed_run_has_the_whole_video(tmp_path):
+    for first in (0, 2):
+        recorder = Recorder(trajectory=False)
+        checkpoint = recorder.open(tmp_path / "run", resume=first > 0)
+        assert (checkpoint is None) == (first == 0)
+        for k in range(first, first + 3):  # frame 2 is done again
+            recorder.write_image(k, _grey(k if first else 0))
+            recorder.write_checkpoint({"frame": 1, "state": {}, "log": [], "config": "", "wall_s": {}})
+        recorder.close(first + 3, {})
+    assert _levels(tmp_path / "run") == [0, 0, 2, 3, 4]
+
+
+def test_ffmpeg_that_breaks_off_costs_no_frame(tmp_path, monkeypatch):
+    """The video is made of the PNGs then."""
+    write, calls = VideoEncoder.write, []
+
+    def breaks_off(self, image):
+        calls.append(1)
+        if len(calls) == 3:
+            self._process.kill()
+            self._process.wait()
+        write(self, image)
+
+    monkeypatch.setattr(VideoEncoder, "write", breaks_off)
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    for k in range(5):
+        recorder.write_image(k, _grey(k))
+    recorder.close(5, {})
+    assert _levels(tmp_path / "run") == [0, 1, 2, 3, 4]
+    assert len(calls) == 10
+
+
+@pytest.mark.parametrize(
+    ("order", "frames", "expected"), [([1, 0, 2], 3, [0, 1, 2]), ([0, 1, 1], 2, [0, 1]), ([0, 1, 2], 2, [0, 1])]
+)
+def test_the_video_shows_the_frames_that_were_asked_for(order, frames, expected, tmp_path):
+    """In whatever order they came, and without one that was begun after the last complete one."""
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    for k in order:
+        recorder.write_image(k, _grey(k))
+    recorder.close(frames, {})
+    assert _levels(tmp_path / "run") == expected
+
+
+def test_the_rate_may_be_given_at_the_end(tmp_path):
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run", real_time_fps=10.0)
+    recorder.write_image(0, _grey(1))
+    recorder.close(1, {}, 50.0)
+    assert "50 fps" in _probe(tmp_path / "run" / "video.mp4")
+
+
+def test_closing_twice_changes_nothing(tmp_path):
+    recorder = Recorder()
+    recorder.open(tmp_path / "run")
+    for k in range(2):
+        recorder.write_image(k, _grey(k))
+        recorder.write_trajectory(k, torch.zeros(4, 3), torch.zeros(4, 3, 3))
+    made = recorder.close(2, {"a": 1})
+    names = _names(tmp_path / "run")
+    assert recorder.close(2, {"a": 1}) == made
+    assert _names(tmp_path / "run") == names
+    assert _levels(tmp_path / "run") == [0, 1]
+    load_trajectory(tmp_path / "run" / "trajectory.npz", 1)
+
+
+@pytest.mark.parametrize("how", ["forgotten", "opened again", "closed in vain"])
+def test_a_recorder_that_is_not_closed_leaves_its_frames_and_no_process(how, tmp_path):
+    recorder = Recorder(trajectory=False)
+    recorder.open(tmp_path / "run")
+    recorder.write_image(0, _grey(1))
+    recorder.wait()
+    process = recorder._films["frames"].encoder._process
+    assert process.poll() is None
+    if how == "forgotten":
+        del recorder
+        gc.collect()
+    elif how == "opened again":
+        recorder.open(tmp_path / "other")
+    else:
+        with pytest.raises(TypeError):
+            recorder.close(1, {"a": object()})
+    assert process.poll() is not None
+    assert _names(tmp_path / "run") == ["frames", "frames/00000.png", "run.json"]
+
+
+def test_a_program_that_ends_without_closing_loses_no_frame(tmp_path):
+    """Nor does it hang, or leave half a video."""
+    code = (
+        "import time, torch, imageio.v3 as iio\n"
+        "from gaussian_swaying.recording.recorder import Recorder\n"
+        "write = iio.imwrite\n"
+        "iio.imwrite = lambda *a, **k: (time.sleep(0.5), write(*a, **k))\n"
+        "recorder = Recorder()\n"
+        f"recorder.open({str(tmp_path / 'run')!r})\n"
+        "for k in range(3): recorder.write_image(k, torch.zeros(16, 16, 3))\n"
+        "raise SystemExit(7)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, timeout=LONG).returncode == 7
+    assert _names(tmp_path / "run" / "frames") == ["00000.png", "00001.png", "00002.png"]
+    assert not [name for name in _names(tmp_path / "run") if "mp4" in name]
+
+
+def test_a_run_holds_no_more_than_the_queue(make_simulation, tmp_path, monkeypatch):
+    most = []
+
+    class Watched(recorder_module.FrameWriter):
+        def submit(self, *arguments, **settings):
+            super().submit(*arguments, **settings)
+            most.append(self.pending)
+
+    monkeypatch.setattr(recorder_module, "FrameWriter", partial(Watched, limit=3, workers=1))
+    _before_imwrite(monkeypatch, lambda _: time.sleep(0.05))
+    _not_again(monkeypatch)
+    _run(make_simulation(), tmp_path / "run", 5)
+    assert max(most) == 3
+    assert len(most) == 25
+    assert len(iio.imread(tmp_path / "run" / "video.mp4")) == 5
+
+
+@pytest.mark.gpu
+def test_recording_never_makes_the_host_wait_for_the_gpu(tmp_path):
+    """The picture, trajectory and checkpoint are what they were at the call, though all is changed right after it."""
+    recorder = Recorder(video=False)
+    recorder.open(tmp_path / "run")
+    image, position, F = torch.rand(1080, 1920, 3), torch.rand(100_000, 3), torch.rand(100_000, 3, 3)
+    on_gpu = [tensor.cuda() for tensor in (image, position, F)]
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        recorder.write_image(0, on_gpu[0])
+        recorder.write_trajectory(0, on_gpu[1], on_gpu[2])
+        recorder.write_checkpoint({"frame": 0, "state": {"F": on_gpu[2]}})
+        for tensor in on_gpu:
+            tensor.zero_()
+        recorder.wait()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    recorder.close(1, {})
+    stored = torch.from_numpy(iio.imread(tmp_path / "run" / "frames" / "00000.png"))
+    assert torch.equal(stored, (image * 255 + 0.5).to(torch.uint8))
+    found = load_trajectory(tmp_path / "run" / "trajectory.npz", 0)
+    assert torch.equal(found[0], position)
+    assert torch.equal(found[1], F.half().float())
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["state"]
+    assert state["F"].device.type == "cpu"
+    assert torch.equal(state["F"], F)
+
+
+# ---- summary
+
+
+def test_kernels_are_loaded_without_a_trace(make_simulation, tmp_path):
+    """A run that did so first has the frames and the log of one that did not."""
+    runs = []
+    for load in (False, True):
+        simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
+        if load:
+            Run(simulation, 3).warm_up(simulation.start(), 0)
+        runs.append(_run(simulation, tmp_path / str(load), 3))
+    assert runs[0]["per_frame"] == runs[1]["per_frame"]
+    for name in ("00000", "00002"):
+        one, two = ((tmp_path / str(load) / "frames" / f"{name}.png").read_bytes() for load in (False, True))
+        assert one == two
+
+
+@pytest.mark.gpu
+def test_startup_is_not_counted_as_simulation(make_simulation, tmp_path):
+    summary = _run(make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7)).to("cuda"), tmp_path / "run", 3)
+    assert set(summary["wall_s"]) == {"startup", "simulation", "shading", "rendering", "writing"}
+    assert summary["wall_s"]["startup"] > 0
+
+
+def test_the_summary(make_simulation, tmp_path):
+    simulation = make_simulation(wind=WindField([6.0, 1.5, 0.0], seed=7))
+    returned = _run(simulation, tmp_path / "run", 3, settings={"note": "kept"})
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary == json.loads(json.dumps(returned))
+    assert (summary["status"], summary["reason"], summary["note"]) == ("complete", None, "kept")
+    assert summary["device"]
+    assert summary["versions"]["torch"] == torch.__version__
+    assert {"python", "gaussian_swaying", "gsplat", "numpy"} <= set(summary["versions"])
+    assert (summary["seed"], summary["particles"], summary["gaussians"]) == (7, 96, 96)
+    assert summary["grid"]["dx_m"] == 0.2
+    assert len(summary["grid"]["resolution"]) == 3
+    assert (summary["frames"], summary["frames_wanted"]) == (3, 3)
+    assert summary["simulated_s"] == pytest.approx(0.08)
+    assert set(summary["wall_s"]) == {"simulation", "shading", "rendering", "writing"}
+    assert all(seconds > 0 for seconds in summary["wall_s"].values())
+    assert summary["peak_memory_bytes"]["host"] > 2**20
+    assert summary["peak_memory_bytes"]["device"] is None
+    state, log = simulation.start(), []
+    start = simulation.solver.energies(state)
+    for _ in range(2):
+        state, health = simulation.advance(state)
+        log.append(health)
+    end = simulation.solver.energies(state)
+    for name in ("kinetic", "elastic", "potential"):
+        assert summary["energy_start_J"][name] == pytest.approx(float(start[name]), abs=1e-9)
+        assert summary["energy_end_J"][name] == pytest.approx(float(end[name]))
+    assert summary["substeps"] == sum(health.substeps for health in log)
+    assert summary["largest_cfl"] == pytest.approx(max(health.cfl for health in log))
+    assert 0.2 < summary["largest_cfl"] <= 0.5
+    assert len(summary["per_frame"]) == 3
+
+
+# ---- a run that ends badly
+
+
+def _fail_at(simulation, monkeypatch, frame, error):
+    advance, done = simulation.advance, []
+
+    def fail(state):
+        if len(done) == frame - 1:
+            raise error
+        done.append(1)
+        return advance(state)
+
+    monkeypatch.setattr(simulation, "advance", fail)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (SimulationDiverged(0.12, 3, "broken", "mend it"), "diverged"),
+        (KeyboardInterrupt(), "interrupted"),
+        (ValueError("something else"), "failed"),
+    ],
+)
+def test_what_was_recorded_before_the_end_is_kept(error, status, make_simulation, tmp_path, monkeypatch):
+    simulation, folder = make_simulation(), tmp_path / "run"
+    _fail_at(simulation, monkeypatch, 3, error)
+    with pytest.raises(type(error)):
+        _run(simulation, folder, 10, Recorder(ply_every=1))
+    assert len(list((folder / "frames").glob("*.png"))) == 3
+    assert len(list((folder / "ply").glob("*.ply"))) == 3
+    assert len(iio.imread(folder / "video.mp4")) == 3
+    load_trajectory(folder / "trajectory.npz", 2)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["status"], summary["frames"], summary["frames_wanted"]) == (status, 3, 10)
+    assert status == "interrupted" or str(error) == summary["reason"]
+    assert not [name for name in _names(folder) if "/." in name or name.startswith(".")]
+
+
+def test_a_run_that_diverges_by_itself_is_kept(make_simulation, tmp_path):
+    """The wind rises to a hurricane at 0.1 s with a substep that is too long for it."""
+    from gaussian_swaying.aero.wind import FlowKey
+
+    wind = WindField(schedule=[FlowKey(0.0, [2.0, 0.5, 0.0]), FlowKey(0.1, [0.0, 3000.0, 0.0])])
+    simulation = make_simulation(wind=wind, cfl=0.4)
+    with pytest.raises(SimulationDiverged, match="Remedy"):
+        _run(simulation, tmp_path / "run", 40)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["status"] == "diverged"
+    assert 3 <= summary["frames"] < 40
+    json.loads((tmp_path / "run" / "summary.json").read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert "Remedy" in summary["reason"]
+    assert math.isfinite(summary["largest_cfl"])
+    assert len(iio.imread(tmp_path / "run" / "video.mp4")) == summary["frames"]
+
+
+# ---- the folder
+
+
+def test_an_earlier_run_is_moved_aside(make_simulation, tmp_path, capsys):
+    _run(make_simulation(), tmp_path / "run", 2)
+    (tmp_path / "run" / "mine.txt").write_text("precious")
+    _run(make_simulation(), tmp_path / "run", 1)
+    _run(make_simulation(), tmp_path / "run", 1)
+    assert len(list((tmp_path / "run.1" / "frames").glob("*.png"))) == 2
+    assert (tmp_path / "run.1" / "mine.txt").read_text() == "precious"
+    assert len(list((tmp_path / "run.2" / "frames").glob("*.png"))) == 1
+    assert "run.1" in capsys.readouterr().out
+
+
+def test_a_folder_behind_a_link(make_simulation, tmp_path):
+    """A run through it, one that continues there, and one that moves both aside."""
+    disk, link = tmp_path / "disk", tmp_path / "link"
+    disk.mkdir()
+    link.symlink_to(disk / "flag")
+    recorder = Recorder(video=False, ply_every=1)
+    _run(make_simulation(), link, 2, recorder)
+    _run(make_simulation(), link, 3, recorder, resume=True)
+    _run(make_simulation(), link, 1, recorder)
+    assert link.is_symlink()
+    assert len(list((disk / "flag.1" / "frames").iterdir())) == 3
+    assert len(list((disk / "flag" / "frames").iterdir())) == 1
+    assert sorted(path.name for path in disk.iterdir()) == ["flag", "flag.1"]
+    load_trajectory(disk / "flag.1" / "trajectory.npz", 2)
+
+
+def test_foreign_files_are_left_alone(make_simulation, tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("precious")
+    _run(make_simulation(), folder, 1)
+    assert (folder / "notes.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize("name", ["summary.json", "frames/00000.png", "trajectory/walk.npz", "config.yaml"])
+def test_foreign_files_are_not_overwritten(name, make_simulation, tmp_path):
+    """They bear a name that the run would write, but no run made them."""
+    file = tmp_path / "mine" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("precious")
+    with pytest.raises(ValueError, match=r"mine contains \w+.* choose another with --output"):
+        _run(make_simulation(), tmp_path / "mine", 1)
+    assert file.read_text() == "precious"
+    assert len([path for path in (tmp_path / "mine").rglob("*") if path.is_file()]) == 1
+
+
+def test_a_recorder_without_a_folder():
+    with pytest.raises(RuntimeError, match=r"`open\(folder\)`"):
+        Recorder().write_summary({})
