@@ -150,18 +150,24 @@ def cantilever(
     )
 
 
-def timoshenko_frequency(length: float, thickness: float, second_moment: float, elements: int = 200) -> float:
-    r"""Lowest circular frequency of a clamped-free beam of unit width, with E = rho = 1 and G = 1/2.
+def timoshenko_mode(
+    length: float, thickness: float, second_moment: float, elements: int = 200
+) -> tuple[float, torch.Tensor]:
+    r"""Lowest bending mode of a clamped-free beam of unit width, with E = rho = 1 and G = 1/2.
 
     Timoshenko's beam (1921; shear coefficient 5/6) in linear elements with reduced integration of the shear (Hughes,
-    Taylor & Kanoknukulchai 1977); 200 elements are within 1e-4 of the limit. For a slender beam it is Euler's
-    :math:`3.516\,\sqrt{I / h} / L^2`.
+    Taylor & Kanoknukulchai 1977); 200 elements are within 1e-4 of the limit. For a slender beam the frequency is
+    Euler's :math:`3.516\,\sqrt{I / h} / L^2`.
 
     Args:
         length: Length L.
         thickness: Thickness h.
         second_moment: Second moment of area I.
         elements: Elements along the beam.
+
+    Returns:
+        The circular frequency, and displacement and rotation at the nodes of the elements, shape (elements + 1, 2), with
+        a displacement of one at the tip.
     """
     size = length / elements
     K, M = torch.zeros(2, 2 * elements + 2, 2 * elements + 2, dtype=torch.float64)
@@ -174,7 +180,9 @@ def timoshenko_frequency(length: float, thickness: float, second_moment: float, 
         K[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += stiffness
         M[2 * k : 2 * k + 4, 2 * k : 2 * k + 4] += mass
     half = torch.linalg.inv(torch.linalg.cholesky(M[2:, 2:]))
-    return math.sqrt(float(torch.linalg.eigvalsh(half @ K[2:, 2:] @ half.T)[0]))
+    values, vectors = torch.linalg.eigh(half @ K[2:, 2:] @ half.T)
+    mode = torch.nn.functional.pad((half.T @ vectors[:, 0]).reshape(-1, 2), (0, 0, 1, 0))
+    return math.sqrt(float(values[0])), mode / mode[-1, 0]
 
 
 def held_cantilever(
@@ -233,20 +241,22 @@ def held_cantilever(
     )
     pin = PinnedRegion(_Chosen(~free), kind)
     solver = settings.solver(1.0, boundaries=[Axial((1,)), pin])
-    # mode of Euler's beam, normalised to the tip: Young & Felgar (1949)
-    x = 1.875104 / span * (beam[:, 0] - edge)
-    mode = torch.where(free, (x.cosh() - x.cos() - 0.734096 * (x.sinh() - x.sin())) / 2, 0.0)
-    across_beam = turn[:, 2]
-    omega = timoshenko_frequency(span, thickness, moment)
-    velocity = (1e-5 * omega * span * mode[:, None] * across_beam).to(like)
-    weight = points.mass.double().cpu() * mode
+    # only the lowest mode moves, with the rotation of its sections, and only the lowest mode is listened to: the others
+    # would shift the time at which the velocity passes zero
+    omega, mode = timoshenko_mode(span, thickness, moment)
+    at = ((beam[:, 0] - edge) / span).clamp(0, 1) * (len(mode) - 1)
+    before = at.long().clamp(max=len(mode) - 2)
+    bent = torch.lerp(mode[before], mode[before + 1], (at - before)[:, None]) * free[:, None]
+    shape = bent[:, :1] * turn[:, 2] - (bent[:, 1] * beam[:, 2])[:, None] * turn[:, 0]
+    velocity = (1e-5 * omega * span * shape).to(like)
+    weight = points.mass.double().cpu()[:, None] * shape
     many, until = 40, 2.4  # the velocity passes zero at 1.57 if the frequency is right
     run = follow(
         solver,
         solver.init_state(points, velocity),
         until / omega / many,
         many,
-        lambda state: (weight[:, None] * state.velocity.double().cpu()).sum(0) @ across_beam,
+        lambda state: (weight * state.velocity.double().cpu()).sum(),
     )
     series = run.series.reshape(-1)
     past = int((series <= 0).int().argmax())
