@@ -166,8 +166,8 @@ def timoshenko_mode(
         elements: Elements along the beam.
 
     Returns:
-        The circular frequency, and displacement and rotation at the nodes of the elements, shape (elements + 1, 2), with
-        a displacement of one at the tip.
+        The circular frequency, and displacement and rotation at the nodes of the elements, scaled to a displacement of
+        one at the tip, shape (elements + 1, 2).
     """
     size = length / elements
     K, M = torch.zeros(2, 2 * elements + 2, 2 * elements + 2, dtype=torch.float64)
