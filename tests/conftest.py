@@ -18,6 +18,9 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # kernels run on the CPU; read when triton is imported
 
 
+from made_scenes import flag_ply, make_cloud, make_scene, make_simulation  # noqa: F401  (fixtures)
+
+
 def pytest_collection_modifyitems(config, items):
     """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` tests to `-m slow`."""
     require_gpu = os.environ.get("GS_REQUIRE_GPU") == "1"

@@ -298,6 +298,13 @@ class WindField(nn.Module):
         other.effects = nn.ModuleList(effect.in_frame(frame) for effect in self.effects)  # type: ignore[operator]
         return other
 
+    def with_flow(self, flow: VectorLike) -> WindField:
+        """The same wind with another steady flow [m/s], in place of a schedule, too; a tensor keeps its gradient."""
+        other = copy(self)
+        flows = flow_rows("flow", [flow]).to(self.flows.device)
+        other._buffers = self._buffers | {"flows": flows, "times": self.times.new_zeros(1)}
+        return other
+
     def mean_flow(self, time: Tensor) -> Tensor:
         """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""
         last = self.times.numel() - 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import json
 import os
@@ -140,6 +141,25 @@ def _groups(schema: type) -> dict[str, type]:
         if name not in NULLABLE and len(kinds) == 1 and inspect.isclass(kinds[0]) and not inspect.isabstract(kinds[0]):
             found |= {name: kinds[0]} if kinds[0].__module__ != "builtins" else {}
     return found
+
+
+def import_forces(files: Sequence[str | os.PathLike[str]]) -> None:
+    """Import the classes of ``forces`` in configuration files, so that the parameters that they register are known.
+
+    What cannot be read or imported is left to the parser, which says what is wrong.
+
+    Args:
+        files: YAML files.
+    """
+    import yaml
+
+    for file in files:
+        try:
+            content = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
+            for entry in content.get("forces") or []:
+                importlib.import_module(entry["class_path"].rpartition(".")[0])
+        except (OSError, ValueError, TypeError, AttributeError, KeyError, ImportError, yaml.YAMLError):
+            continue
 
 
 def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespace:

@@ -14,10 +14,11 @@ from gaussian_swaying.aero.patches import Patches
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_force import WindForce
-from gaussian_swaying.fitting.unknowns import Variant, aero_like, stacked, variant_of
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.formulations.formulation import Settings
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
+from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 
 SAFETY = 1.15
@@ -36,7 +37,7 @@ class SubstepTooLongError(RuntimeError):
 
 @dataclass
 class _Group:
-    """Variants with the same coefficients and damping, which the solver shares among the scenes of a batch."""
+    """Variants that differ in parameters that may differ within a batch only."""
 
     members: list[int]
     solver: MPMSolver
@@ -47,7 +48,7 @@ class _Group:
 class Ensemble:
     """Variants of a simulation that differ in a few values.
 
-    Variants with the same coefficients of the wind force and the same damping are one batch; the others take a batch
+    Variants that differ in nothing but parameters that may differ within a batch are one batch; the others take a batch
     of their own. All take the same substeps, so that their differences come from the values alone.
 
     Args:
@@ -84,8 +85,8 @@ class Ensemble:
         Raises:
             SubstepTooLongError: If the material stiffened too much; ``stiffening`` is raised for the next try.
         """
-        variants = [variant_of(self.simulation, own) for own in values]
-        groups = self._groups(variants, alike)
+        setups = [with_values(self.simulation.setup, own) for own in values]
+        groups = self._groups(values, setups, alike)
         rates = [self._rate(group) for group in groups]
         if alike:
             rates = [max(rates)] * len(groups)
@@ -101,22 +102,21 @@ class Ensemble:
                     found[member] = member_of(group.state, place)
             yield [state for state in found if state is not None]
 
-    def _groups(self, variants: Sequence[Variant], alike: bool) -> list[_Group]:
-        shared: dict[tuple[float, ...], list[int]] = {}
-        for number, variant in enumerate(variants):
-            wave = 0 if alike else _stiffness_class(variant.points)
-            shared.setdefault((*variant.aero, *variant.damping, wave), []).append(number)
-        return [self._group(members, [variants[k] for k in members]) for members in shared.values()]
+    def _groups(self, values: Sequence[Values], setups: Sequence[Setup], alike: bool) -> list[_Group]:
+        shared: dict[tuple[object, ...], list[int]] = {}
+        for number, (own, setup) in enumerate(zip(values, setups, strict=True)):
+            apart = [(name, value) for name, value in sorted(own.items()) if not parameter(name).batched]
+            shared.setdefault((*apart, 0 if alike else _stiffness_class(setup.points)), []).append(number)
+        return [self._group(members, [setups[k] for k in members]) for members in shared.values()]
 
-    def _group(self, members: list[int], variants: list[Variant]) -> _Group:
-        simulation, count = self.simulation, len(members)
-        solver = solver_like(simulation.solver, *variants[0].damping)
-        aero = aero_like(simulation.aero, variants[0].aero)
-        state = solver.init_state(stacked([v.points for v in variants]), frame=simulation.scene.frame)
-        forces = [force for force in simulation.custom_forces if isinstance(force, Force)]
-        if not aero.idle:
-            patches = _repeated(simulation.scene.patches, count)
-            forces = [WindForce(aero, [v.wind for v in variants], patches), *forces]
+    def _group(self, members: list[int], setups: list[Setup]) -> _Group:
+        first, scene = setups[0], self.simulation.scene
+        solver = solver_like(self.simulation.solver, first.solver)
+        state = solver.init_state(MaterialPoints.stack([setup.points for setup in setups]), frame=scene.frame)
+        forces = list(first.forces)
+        if not first.aero.idle:
+            winds = [setup.wind for setup in setups]
+            forces = [WindForce(first.aero, winds, _repeated(scene.patches, len(members))), *forces]
         return _Group(members, solver, forces, state)
 
     def _rate(self, group: _Group) -> float:
@@ -148,15 +148,14 @@ class Ensemble:
                 raise SubstepTooLongError(f"The Courant number reached {number:.3g}.")
 
 
-def solver_like(solver: MPMSolver, damping: float, stiffness_damping: float) -> MPMSolver:
-    """A solver with the same settings and boundaries, and another damping."""
-    settings = solver.settings
+def solver_like(solver: MPMSolver, settings: Settings) -> MPMSolver:
+    """A solver with the same boundaries and other settings."""
     return MPMSolver(
         dx=settings.dx,
         formulation=solver.formulation,
         gravity=settings.gravity,
-        damping=damping,
-        stiffness_damping=stiffness_damping,
+        damping=settings.damping,
+        stiffness_damping=settings.stiffness_damping,
         cfl=solver.cfl,
         max_nodes=settings.max_nodes,
         mls=settings.mls,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._yaml_limits import check_config_files, read_fields
-from gaussian_swaying.config.parser import check_settings, option
+from gaussian_swaying.config.parser import check_settings, import_forces, option
 from gaussian_swaying.fitting.unknowns import Unknown, default_scale
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -119,8 +119,10 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
     for name in ("fit_share", "until", "limit"):
         if name in settings and (isinstance(settings[name], bool) or not isinstance(settings[name], int | float)):
             raise ValueError(f"Expected `{name}` in {file} to be a number, but got {settings[name]!r}.")
+    base = [_beside(file, name) or find(name) for name in _names(file, "base", given.get("base"))]
+    import_forces(base)
     return Plan(
-        [_beside(file, name) or find(name) for name in _names(file, "base", given.get("base"))],
+        base,
         [_beside(file, name) or name for name in _names(file, "videos", given.get("videos"))],
         [read_unknown(name, entry) for name, entry in sought.items()],
         known,

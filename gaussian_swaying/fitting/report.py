@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
-from gaussian_swaying.config.parser import config_text, option, parse_text
+from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.fitting.identifiability import Direction
-from gaussian_swaying.fitting.unknowns import POLAR, Unknown, flow_of
+from gaussian_swaying.fitting.unknowns import Unknown
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.simulation.parameters import POLAR, flow_of, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -221,21 +222,13 @@ def write_results(
 
 def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> str:
     """The configuration of the base with the values that were found, as YAML for ``sim``."""
-    import yaml
-
-    options: dict[str, Any] = {name: value for name, value in values.items() if not name.startswith("wind.")}
+    found = settings.clone()
     if any(name in values for name in POLAR):
-        options["wind.flow"] = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
-    text = config_text(parser, settings)
-    modulations = [name for name in values if name.startswith("wind.modulations.")]
-    if modulations:
-        entries = yaml.safe_load(text)["wind"]["modulations"]
-        for name in modulations:
-            _, _, place, field = name.split(".")
-            entries[int(place)]["init_args"][field] = values[name]
-        options["wind.modulations"] = entries
+        found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
+    for name, value in values.items():
+        if name not in POLAR:
+            in_settings(found, name, value)
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
-    found = parse_text(parser, text, [option(name, value) for name, value in options.items()])
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
 
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.geometry.linalg import matmul3, symmetric_eigenvalues
 from gaussian_swaying.preview.shape import quantile
 from gaussian_swaying.preview.suggest import Suggestion
 from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.parameters import thicker, value_of, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 
 SWAY = 0.10  # wanted largest displacement, as a share of the longest side
@@ -200,16 +200,10 @@ def _badness(motion: Motion, sway: float | None) -> float:
 
 def apply_setting(simulation: Simulation, setting: Setting, base: Setting) -> None:
     """Change the setting of a run from ``base`` to another one, before it starts."""
-    points, wind = simulation.scene.points, simulation.wind
-    thicker = setting.thickness / base.thickness
-    simulation.scene.points = replace(
-        points,
-        mass=points.mass * thicker,
-        volume=points.volume * thicker,
-        youngs_modulus=points.youngs_modulus * (setting.E / base.E),
-    )
-    assert isinstance(wind, WindField)  # as in configurations written by the preview
-    wind.flows = wind.flows * (setting.wind / base.wind)
+    setup = simulation.setup
+    wind = {"wind.flow": [setting.wind / base.wind * part for part in value_of(setup, "wind.flow")]}
+    material = {"material.E": setting.E} if setting.E != base.E else {}
+    simulation.adopt(thicker(with_values(setup, wind | material), setting.thickness / base.thickness))
 
 
 @torch.inference_mode()
@@ -232,8 +226,8 @@ def measure_motion(
     Returns:
         The motion; not complete if the run was stopped or diverged.
     """
-    scene, wind = simulation.scene, simulation.wind
-    points, flows = scene.points, wind.flows
+    before, scene = simulation.setup, simulation.scene
+    points = scene.points
     apply_setting(simulation, setting, base)
     side = scene.size * scene.frame.metres_per_unit
     limit = math.inf if sway is None else STOP * sway
@@ -259,7 +253,7 @@ def measure_motion(
         return Motion(max(motion.share, min(limit, 1.0)), 0.0, 10.0, complete=False)
     finally:
         torch.set_num_threads(threads)
-        scene.points, wind.flows = points, flows
+        simulation.adopt(before)
     return motion
 
 

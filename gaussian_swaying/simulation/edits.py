@@ -200,6 +200,11 @@ class SceneEditor:
                 )
         return particles, gaussians
 
+    def rebase(self, points: MaterialPoints) -> None:
+        """Make some material that of the scene before its edits, for :meth:`reset`."""
+        if self._loaded is not None:
+            self._loaded = (points, *self._loaded[1:])
+
     def reset(self) -> None:
         """Restore the scene as it was before its first edit."""
         self.applied = 0

@@ -52,6 +52,7 @@ from gaussian_swaying.simulation.frame import Frame
 from gaussian_swaying.simulation.launch import Launched
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.parameters import Setup, with_values
 from gaussian_swaying.simulation.run import run
 from gaussian_swaying.simulation.scene import Material, SimulatedScene
 from gaussian_swaying.simulation.stepping import Stepping
@@ -188,9 +189,76 @@ class Simulation(Stepping):
                 value = float(value)
             else:
                 value = (as_wind(value, self.scene.frame) if name == "wind" else value or AeroForce()).to(self.device)
-            self._given[name] = value
-            self._changed.add(name)
+            self._note(**{name: value})
         super().__setattr__(name, value)
+
+    # ---- numbers that may change
+
+    @property
+    def setup(self) -> Setup:
+        """What drives the scene now, and what it is made of; see :mod:`gaussian_swaying.simulation.parameters`."""
+        forces = tuple(force for force in self.custom_forces if isinstance(force, Force))
+        points = self.scene.points
+        return Setup(self.scene, self.material, points, self.wind, self.aero, forces, self.solver.settings)
+
+    @in_turn
+    def change(self, state: MPMState, values: Mapping[str, Any]) -> MPMState:
+        """Change numbers between two frames; they stay changed when the simulation starts again.
+
+        Args:
+            state: The state now.
+            values: Values by the names of :mod:`gaussian_swaying.simulation.parameters`, such as ``wind.speed`` or
+                ``material.E``.
+
+        Returns:
+            The state from which the run continues.
+
+        Raises:
+            ValueError: If there is no such parameter, a value is out of range, or the simulation has no place for it;
+                everything then stays as it was.
+        """
+        changed = self.adopt(with_values(self.setup, values), state)
+        assert changed is not None
+        return changed
+
+    @in_turn
+    def adopt(self, setup: Setup, state: MPMState | None = None) -> MPMState | None:
+        """As :meth:`change`, with a setup; without a state, before the simulation starts."""
+        before, editor = self.setup, self.editor
+        if setup.points is not before.points and editor.edits:
+            raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
+        try:
+            return self._adopt(setup, state)
+        except Exception:
+            self._adopt(before, state)
+            raise
+
+    def _adopt(self, setup: Setup, state: MPMState | None) -> MPMState | None:
+        before = self.setup
+        with torch.inference_mode(False):
+            if setup.wind is not before.wind:
+                self.wind = setup.wind
+            if setup.aero is not before.aero:
+                self.aero = setup.aero
+            if any(a is not b for a, b in zip(setup.forces, before.forces, strict=True)):
+                self.custom_forces = nn.ModuleList(setup.forces).to(self.device)
+                self._note(forces=list(setup.forces))
+            if setup.points is not before.points:
+                self.scene.points = setup.points
+                self.editor.rebase(setup.points)
+                object.__setattr__(self, "material", setup.material)
+                self._note(material=setup.material)
+            if setup.solver is not before.solver:
+                self.solver.settings = setup.solver
+                self._note(solver=self.solver)
+        if state is None or (setup.points is before.points and setup.solver is before.solver):
+            return state
+        return self._take(state, torch.zeros_like(setup.points.mass, dtype=torch.bool))
+
+    def _note(self, **given: Any) -> None:
+        """Remember what has changed, so that a run with other values is not resumed."""
+        self._given.update(given)
+        self._changed.update(given)
 
     @property
     def config(self) -> str:

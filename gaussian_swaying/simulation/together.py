@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import number_of
-from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.aero.wind_batch import WindBatch
 from gaussian_swaying.aero.wind_force import WindForce
 from gaussian_swaying.mpm.forces import Force
@@ -28,7 +27,7 @@ from gaussian_swaying.simulation.diagnostics import (
     measure_scenes,
 )
 from gaussian_swaying.simulation.launch import needs_of
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.parameters import with_values
 from gaussian_swaying.simulation.run import Run, splat_checksum
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.stepping import MAX_GROWTH, MAX_SUBSTEPS
@@ -36,33 +35,25 @@ from gaussian_swaying.simulation.stepping import MAX_GROWTH, MAX_SUBSTEPS
 M = TypeVar("M", bound=nn.Module)
 
 
-def variant(
-    first: Simulation,
-    wind: WindField | SpatialWind,
-    material: Material,
-    given: Material,
-    recorder: Recorder,
-    config: str,
-) -> Simulation:
-    """A simulation of the same scene in another wind, of another stiffness or density.
+def variant(first: Simulation, values: Mapping[str, Any], recorder: Recorder, config: str) -> Simulation:
+    """A simulation of the same scene with other numbers.
 
     Args:
         first: A simulation whose :meth:`~Simulation.start` was called; it lends all its other parts.
-        wind: The wind.
-        material: The material, which differs from that of ``first`` in nothing but ``E``, ``nu`` and ``density``.
-        given: The material of ``first``.
+        values: Values of parameters that may differ within a batch, see
+            :mod:`gaussian_swaying.simulation.parameters`.
         recorder: What a run of it writes.
         config: Its configuration as YAML.
+
+    Raises:
+        ValueError: As :meth:`Simulation.change`.
     """
-    other = _shallow(first)
-    points, known = first.solver.points, (given.E, given.nu, given.density)
-    other._modules["wind"] = wind.to(first.device)
-    if (material.E, material.nu, material.density) != known:
+    other, before = _shallow(first), first.setup
+    setup = with_values(before, values)
+    other._modules["wind"] = setup.wind.to(first.device)
+    if setup.points is not before.points:
         solver = _shallow(first.solver)
-        mass = points.mass * (material.density / given.density)
-        E, nu = (torch.full_like(mass, number_of(value)) for value in (material.E, material.nu))
-        own = MaterialPoints(points.position, mass, points.volume, E, nu, points.laws, points.law_index)
-        solver.init_state(own, frame=first.scene.frame)
+        solver.init_state(setup.points, frame=first.scene.frame)
         other._modules["solver"] = solver
     vars(other).update(_wind_force=[], _wind_parts=(), _idle=None, outlook=None, recorder=recorder)
     other.config = config

@@ -14,6 +14,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._yaml_limits import check_config_files, read_fields
 from gaussian_swaying.config.parser import check_settings, config_text, option, parse_text
 from gaussian_swaying.runs.seal import sha256
+from gaussian_swaying.simulation.parameters import in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.axes import read_axis, runs_of
 
@@ -146,8 +147,11 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
         ArgumentError: If a value is not accepted.
         ValueError: If the settings do not fit together.
     """
-    options = [option(name, value) for name, value in {"frames": frames, **run}.items()]
+    own = {name: value for name, value in run.items() if name.startswith("forces.")}  # no options, but parameters
+    options = [option(name, value) for name, value in {"frames": frames, **run}.items() if name not in own]
     settings = parse_text(parser, config, options)
+    for name, value in own.items():
+        in_settings(settings, name, value)
     check_settings(Simulation, settings)
     return settings
 

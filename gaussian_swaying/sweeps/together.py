@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.simulation.defaults import as_wind
+from gaussian_swaying.simulation import parameters
+from gaussian_swaying.simulation.parameters import find, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.together import Together, variant
 from gaussian_swaying.sweeps.job import Job, unlocked
@@ -17,8 +18,11 @@ from gaussian_swaying.sweeps.record import RUNS
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-ALIKE = ("wind.flow", "wind.seed", "material.E", "material.nu", "material.density")
-"""Axes along which runs keep their shape."""
+
+def shares_rollout(name: str) -> bool:
+    """Whether runs that differ in an axis keep their shape."""
+    known = find(name)
+    return known is not None and known.batched and known.same_points and known.name in parameters.names()
 
 
 def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
@@ -36,7 +40,7 @@ def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
     """
     alike: dict[str, list[int]] = {}
     for number, run in enumerate(runs):
-        key = json.dumps({name: value for name, value in run.items() if name not in ALIKE})
+        key = json.dumps({name: value for name, value in run.items() if not shares_rollout(name)})
         alike.setdefault(key, []).append(number)
     return [numbers[k : k + size] for numbers in alike.values() for k in range(0, len(numbers), size)]
 
@@ -65,23 +69,22 @@ def make_together(job: Job, parser: ArgumentParser) -> tuple[Together, int]:
     """The simulation of all runs of a job, and how many frames they have."""
     settings = [parse_run(parser, job.config, job.frames, job.runs[0])]
     settings[0].device = job.device
+    changes: list[dict[str, Any]] = [{}]
     for run in job.runs[1:]:  # parsing takes longer than a frame of all
         settings.append(settings[0].clone())
-        for name in ALIKE:
-            if name in run:
-                settings[-1][name] = _as_parsed(name, run[name])
+        changes.append({name: value for name, value in run.items() if shares_rollout(name)})
+        for name, value in changes[-1].items():
+            in_settings(settings[-1], name, value)
     first = Simulation.from_settings(parser, settings[0])
     first.start()  # with all checks of a run
-    given = parser.instantiate(settings[0]).material
+    written = texts(parser, settings, [name for name in job.runs[0] if shares_rollout(name)])
     members = [first]
-    for one, text in zip(settings[1:], texts(parser, settings)[1:], strict=True):
-        parts = parser.instantiate(one)
-        wind = as_wind(parts.wind, first.scene.frame)
-        members.append(variant(first, wind, parts.material, given, parts.recorder, text))
+    for one, own, text in zip(settings[1:], changes[1:], written[1:], strict=True):
+        members.append(variant(first, own, parser.instantiate(one).recorder, text))
     return Together(members), settings[0].frames
 
 
-def texts(parser: ArgumentParser, settings: Sequence[Namespace]) -> list[str]:
+def texts(parser: ArgumentParser, settings: Sequence[Namespace], names: Sequence[str]) -> list[str]:
     """The configuration of each run as YAML, as :func:`~gaussian_swaying.config.parser.config_text` writes it.
 
     The parser takes longer for one than a GPU takes for a frame of all, so it writes the first one, and the values that
@@ -89,7 +92,8 @@ def texts(parser: ArgumentParser, settings: Sequence[Namespace]) -> list[str]:
 
     Args:
         parser: From :meth:`Simulation.parser`.
-        settings: Of each run; they differ in nothing but :data:`ALIKE`.
+        settings: Of each run.
+        names: What they differ in, as options.
     """
     import yaml
 
@@ -102,17 +106,10 @@ def texts(parser: ArgumentParser, settings: Sequence[Namespace]) -> list[str]:
         return [config_text(parser, one) for one in settings]
     found = []
     for one in settings:
-        for group, field in (name.split(".") for name in ALIKE):
+        for group, field in (name.split(".") for name in names):
             content[group][field] = one[group][field]
         found.append(written(content))
     return found
 
 
-def _as_parsed(name: str, value: Any) -> Any:
-    """The value of an axis as the parser would make it; its numbers were checked with the plan."""
-    if name == "wind.seed":
-        return int(value)
-    return [float(part) for part in value] if isinstance(value, list) else float(value)
-
-
-__all__ = ["grouped", "make_together", "run_together", "texts"]
+__all__ = ["grouped", "make_together", "run_together", "shares_rollout", "texts"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,38 +11,53 @@ import yaml
 
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.parameters import POLAR, find, in_settings, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-MATERIAL = ("E", "nu", "density")
-MOTION = ("gravity", "damping")
+PICTURE = ("shader", "background", "frame_dt")
+"""Fields besides the parameters that change in motion."""
+
+SHADER = "shader.init_args."
 
 
 def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mapping[str, Any]) -> Namespace:
-    """Settings with other values.
+    """Settings with other values. Parameters are checked and set; only other fields are parsed anew.
 
     Args:
         parser: From :meth:`Simulation.parser`.
         settings: What it parsed.
-        values: New values by the names of their fields, with dots.
+        values: New values by the names of their fields, with dots, or of parameters.
 
     Raises:
         ArgumentError: If a value has the wrong type.
-        ValueError: If there is no such field.
+        ValueError: If there is no such field, or a value is out of range.
     """
-    data = yaml.safe_load(parser.dump(settings, skip_validation=True))
-    for name, value in values.items():
-        *path, last = name.split(".")
-        part = data
-        for key in path:
-            if not isinstance(part.get(key), dict):
-                part[key] = {}
-            part = part[key]
-        part[last] = value
-    return parser.parse_object(data)
+    direct = {name for name in values if find(name) is not None or name.startswith(SHADER)}
+    further = {name: value for name, value in values.items() if name not in direct}
+    if further.get("wind.schedule", "") is None and settings.wind.schedule is None:
+        del further["wind.schedule"]  # nothing changes
+    if further:
+        data = yaml.safe_load(parser.dump(settings, skip_validation=True))
+        for name, value in further.items():
+            *path, last = name.split(".")
+            part = data
+            for key in path:
+                if not isinstance(part.get(key), dict):
+                    part[key] = {}
+                part = part[key]
+            part[last] = value
+        settings = parser.parse_object(data)
+    else:
+        settings = copy.deepcopy(settings)
+    for name in direct:
+        if name.startswith(SHADER):
+            settings[name] = values[name]
+        else:
+            in_settings(settings, name, values[name])
+    return settings
 
 
 def take(
@@ -50,15 +65,15 @@ def take(
 ) -> MPMState | None:
     """Change a simulation between two steps.
 
-    Wind, aerodynamic coefficients, stiffness, density, gravity, damping, shading, background and length of a frame
-    change in motion; the material only if it is the same everywhere.
+    Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
+    material only if it is the same everywhere.
 
     Args:
         simulation: The simulation.
         state: Its state now.
         parser: From :meth:`Simulation.parser`.
         settings: The settings with all changes.
-        names: The fields that have changed, with dots.
+        names: The fields and parameters that have changed, with dots.
 
     Returns:
         The state to go on from; None if another field has changed, so that the simulation has to be made anew.
@@ -66,34 +81,31 @@ def take(
     Raises:
         ValueError: If a value is out of range; the simulation then stays as it was.
     """
-    heads = {name.split(".")[0] for name in names}
-    material = [name.split(".")[1] for name in names if name.startswith("material.")]
-    motion = [name.split(".")[1] for name in names if name.startswith("solver.")]
-    known = {"wind", "aero", "shader", "background", "frame_dt", "material", "solver"}
-    if not (heads <= known and set(material) <= set(MATERIAL) and set(motion) <= set(MOTION)):
+    numbers = ["wind.flow" if name in POLAR else name for name in names if find(name) is not None]
+    heads = {name.split(".")[0] for name in names if find(name) is None}
+    if not heads <= {"wind", "aero", *PICTURE}:
         return None
-    if material and (settings.material.regions or settings.edits):  # each part has its own
-        return None
-    parts = parser.instantiate(settings)
-    device, painter = simulation.device, simulation.painter
-    edit = Edit(**{name: settings.material[name] for name in material}) if material else None
+    if any(name.startswith("material.") for name in numbers) and (settings.material.regions or settings.edits):
+        return None  # each part has its own
+    if settings.wind.schedule is not None or heads & {"wind", "aero"}:  # as a whole
+        heads |= {name.split(".")[0] for name in numbers} & {"wind", "aero"}
+        numbers = [name for name in numbers if name.split(".")[0] not in heads]
+    values = {name: of_settings(settings, name) for name in numbers}
+    parts = parser.instantiate(settings) if heads else {}
+    painter = simulation.painter
+    if values:
+        state = simulation.change(state, values)
     if "wind" in heads:
         simulation.wind = parts["wind"]
     if "aero" in heads:
         simulation.aero = parts["aero"]
     if "shader" in heads:
-        painter.shader = None if parts["shader"] is None else parts["shader"].to(device)
+        painter.shader = None if parts["shader"] is None else parts["shader"].to(simulation.device)
     if "background" in heads:
-        painter.background = torch.tensor(parts["background"], dtype=torch.float32, device=device)
+        painter.background = torch.tensor(parts["background"], dtype=torch.float32, device=simulation.device)
     if "frame_dt" in heads:
         simulation.frame_dt = float(settings.frame_dt)
-    if motion:
-        solver, scene = simulation.solver, simulation.scene
-        solver.settings = replace(solver.settings, **{name: getattr(parts["solver"], name) for name in motion})
-        solver.init_state(
-            scene.points, frame=scene.frame, surface=scene.surface_places
-        )  # takes the settings; the state stays
-    return state if edit is None else simulation.edit(state, edit)
+    return state
 
 
 def carry_over(old: Simulation, state: MPMState, new: Simulation, start: MPMState) -> MPMState | None:

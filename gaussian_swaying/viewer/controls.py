@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import yaml
 
+from gaussian_swaying.simulation.parameters import parameter, present, value_of
 from gaussian_swaying.simulation.wind_picture import speed_scale
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
@@ -50,6 +50,7 @@ class Controls:
             self._wind()
         with gui.add_folder("Material"):
             self._material()
+        self._forces()
         with gui.add_folder("Pull and hold"):
             self.holding = Holding(self)
         with gui.add_folder("Picture", expand_by_default=False):
@@ -106,6 +107,22 @@ class Controls:
         self.on(self.damping.on_update, lambda: self._set("solver.damping", self.damping.value))
         self.on(self.gravity.on_update, lambda: self._set("solver.gravity", [0.0, 0.0, -self.gravity.value]))
         self.on(self.grid.on_update, lambda: self._set("solver.dx", float(f"{self._dx * GRIDS[self.grid.value]:.6g}")))
+
+    def _forces(self) -> None:
+        """A control for each number that a force of the user's registered."""
+        self.forces: dict[str, Any] = {}
+        setup = self.session.simulation.setup
+        for name in present(setup, "forces."):
+            if not self.forces:
+                folder = self.server.gui.add_folder("Forces")
+            known = parameter(name)
+            label = name.removeprefix("forces.") + (f" [{known.unit}]" if known.unit else "")
+            low, high = (None if math.isinf(end) else end for end in (known.low, known.high))
+            with folder:
+                number = self.forces[name] = self.server.gui.add_number(
+                    label, value_of(setup, name), min=low, max=high, step=0.01
+                )
+            self.on(number.on_update, lambda name=name, number=number: self._set(name, number.value))
 
     def _picture(self) -> None:
         gui = self.server.gui
@@ -173,6 +190,8 @@ class Controls:
             (self.light, self._light_azimuth()),
             (self.shading, self.session.simulation.painter.shader is not None),
         ]
+        setup = self.session.simulation.setup
+        shown += [(control, value_of(setup, name)) for name, control in self.forces.items() if present(setup, name)]
         for control, value in shown:
             control.value = value
         self.draw_handles()
@@ -237,16 +256,19 @@ class Controls:
         return 0.0 if light is None else round(to_angles(light.tolist())[1])
 
     def _shade(self) -> None:
-        given = yaml.safe_load(self.session.yaml()).get("shader")
-        self._shader = given or self._shader or {"class_path": "DiffuseShader", "init_args": {"two_sided": True}}
+        given = self.session.settings.shader
+        if given is not None:
+            self._shader = {"class_path": given.class_path, "init_args": dict(given.init_args)}
         if not self.shading.value:
             self.session.change({"shader": None})
             return
-        arguments = dict(self._shader.get("init_args") or {})
-        old = arguments.get("light", [0.0, -1.0, 0.8])
-        light = from_angles(1.0, self.light.value, to_angles(old)[2])
-        arguments["light"] = [round(x, 4) for x in light]
-        self.session.change({"shader": self._shader | {"init_args": arguments}})
+        shader = self._shader or {"class_path": "DiffuseShader", "init_args": {"two_sided": True}}
+        old = shader["init_args"].get("light", [0.0, -1.0, 0.8])
+        light = [round(x, 4) for x in from_angles(1.0, self.light.value, to_angles(old)[2])]
+        if given is not None:
+            self.session.change({"shader.init_args.light": light})
+        else:
+            self.session.change({"shader": shader | {"init_args": shader["init_args"] | {"light": light}}})
 
     # ---- handles in the scene
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-import yaml
-
 if TYPE_CHECKING:
     from gaussian_swaying.viewer.controls import Controls
 
@@ -75,17 +73,17 @@ class Gusts:
         self.removers.append(remove)
 
     def _there(self) -> list[dict[str, Any]]:
-        wind = yaml.safe_load(self.session.yaml()).get("wind") or {}
-        return list(wind.get("modulations") or [])
+        return [_plain(modulation) for modulation in self.session.settings.wind.modulations or ()]
 
     def _changed(self) -> None:
-        changed = []
-        for modulation, controls in zip(self._shown or [], self.numbers, strict=True):
-            arguments = dict(modulation.get("init_args") or {})
-            arguments |= {field: type(arguments[field])(control.value) for field, control in controls.items()}
-            changed.append(modulation | {"init_args": arguments})
-        self._shown = changed
-        self.session.change({"wind.modulations": changed})
+        changed: dict[str, Any] = {}
+        for place, (modulation, controls) in enumerate(zip(self._shown or [], self.numbers, strict=True)):
+            arguments = modulation["init_args"]
+            for field, control in controls.items():
+                if (value := type(arguments[field])(control.value)) != arguments[field]:
+                    arguments[field] = changed[f"wind.modulations.{place}.{field}"] = value
+        if changed:
+            self.session.change(changed)
 
     def _add(self) -> None:
         if self.add.value != NONE:
@@ -98,6 +96,11 @@ class Gusts:
 
     def _set(self, modulations: list[dict[str, Any]]) -> None:
         self.session.change({"wind.modulations": modulations})
+
+
+def _plain(modulation: Any) -> dict[str, Any]:
+    """The class and the arguments of a modulation in the settings."""
+    return {"class_path": modulation["class_path"], "init_args": dict(modulation.get("init_args") or {})}
 
 
 def _name(modulation: dict[str, Any]) -> str:

@@ -120,7 +120,6 @@ class Session:
         self._number = 0
         self._first = settings  # those that `restore` goes back to
         self._past: deque[Past] = deque(maxlen=MOST_UNDONE)
-        self._edited = False  # whether the material was changed since the simulation was made
         self.simulation = simulation or Simulation.from_settings(parser, settings)
         self._begin(self.simulation.start())
         self._thread = threading.Thread(target=self._loop, name="simulation", daemon=True)
@@ -352,10 +351,7 @@ class Session:
         self._publish(state, diagnose(self.simulation.solver, state, 0, 0.0))
 
     def _reset(self) -> None:
-        if self._edited:  # `start` would go back to the material of the first settings
-            self._take_settings(self.settings, fresh=True)
-        else:
-            self._begin(self.simulation.start())
+        self._begin(self.simulation.start())
 
     def _change(self, values: Mapping[str, Any]) -> None:
         before, now = self.settings, time.monotonic()
@@ -375,7 +371,6 @@ class Session:
             self._take_settings(settings)
         else:
             self.settings = settings
-            self._edited |= any(name.startswith("material.") for name in names)
             self._publish(state, self.snapshot.health)
 
     def _undo(self) -> None:
@@ -399,7 +394,6 @@ class Session:
         """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""
         simulation = Simulation.from_settings(self.parser, settings)
         start = simulation.start()
-        self._edited = False
         state = None if self._broken or fresh else carry_over(self.simulation, self.snapshot.state, simulation, start)
         self.simulation, self.settings = simulation, settings
         if state is None:

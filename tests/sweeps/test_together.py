@@ -14,10 +14,11 @@ import torch
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
+from gaussian_swaying.simulation.parameters import in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.together import _as_parsed, grouped, make_together, texts
+from gaussian_swaying.sweeps.together import grouped, make_together, texts
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
@@ -93,7 +94,7 @@ def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path
     for run in plan.runs[6::6]:
         settings.append(settings[0].clone())
         for name, value in run.items():
-            settings[-1][name] = _as_parsed(name, value)
+            in_settings(settings[-1], name, value)
     expected = [config_text(parser, one) for one in settings]
     assert len(set(expected)) == 6
 
@@ -103,10 +104,10 @@ def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path
 
     monkeypatch.setattr("gaussian_swaying.sweeps.together.config_text", counted)
     more = ""
-    assert texts(parser, settings) == expected
+    assert texts(parser, settings, list(axes)) == expected
     assert len(calls) == 1
     more = "# a comment\n"
-    assert texts(parser, settings) == [text + more for text in expected]
+    assert texts(parser, settings, list(axes)) == [text + more for text in expected]
 
 
 def test_a_diverged_run_is_done_alone(tmp_path, sweep_file, capsys):

@@ -18,7 +18,7 @@ from bench.cases import fit_bias, fit_reference
 from bench.problems.films import write_video
 from gaussian_swaying.fitting.fit import run_fit
 from gaussian_swaying.fitting.plan import Plan, read_unknown
-from gaussian_swaying.fitting.unknowns import flow_of
+from gaussian_swaying.simulation.parameters import flow_of
 from gaussian_swaying.simulation.simulation import Simulation
 
 Row = dict[str, Any]

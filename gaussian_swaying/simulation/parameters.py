@@ -1,0 +1,574 @@
+"""The numbers of a simulation that may change: their names, units and ranges, and how each gets into a simulation.
+
+Edits, the live page, fits, sweeps, the preview's calibration and assignment in Python all use this list. A number of a
+force of your own joins it in one line::
+
+    register("forces.Breath.strength", unit="N", low=0.0)
+
+It can then be changed with :meth:`~gaussian_swaying.simulation.simulation.Simulation.change`, has a control on the live
+page, and can be an unknown of a fit and an axis of a sweep.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._checks import check_choice, check_vector, number_of, requires_grad
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.formulations.formulation import Settings
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.scene import SimulatedScene
+
+if TYPE_CHECKING:
+    from jsonargparse import Namespace
+
+M = TypeVar("M", bound=nn.Module)
+
+POLAR = ("wind.speed", "wind.azimuth", "wind.elevation")
+"""Three numbers that together are ``wind.flow``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What drives a scene and what it is made of. Nothing in it is changed in place: another value makes another setup.
+
+    Attributes:
+        scene: The scene at rest.
+        material: The material that was given.
+        points: The material of the points.
+        wind: The wind.
+        aero: The force of the wind on patches.
+        forces: The custom forces.
+        solver: Numbers of the solver.
+    """
+
+    scene: SimulatedScene
+    material: Material
+    points: MaterialPoints
+    wind: WindField | SpatialWind
+    aero: AeroForce
+    forces: tuple[Force, ...]
+    solver: Settings
+
+
+Read = Callable[[Setup], Any]
+Write = Callable[[Setup, Mapping[str, Any]], Setup]
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A number, or three, that may change.
+
+    Attributes:
+        name: The option of ``sim``, or a name of its own such as ``wind.speed``.
+        unit: Its unit; empty for a pure number.
+        low: Smallest value.
+        high: Largest value.
+        open: Whether the range lies between ``low`` and ``high``, without them.
+        scale: ``log`` for sizes of any order of magnitude, else ``linear``.
+        kind: ``number``, ``whole`` or ``vector`` (three numbers).
+        batched: Whether simulations that differ in it are steps of one rollout.
+        same_points: Whether all objects take it without other points, patches or contact.
+        differentiable: Whether it keeps the gradient of a tensor.
+        read: Gives its value; ValueError if a setup has none.
+        write: Gives a setup with other values of all parameters that have this function; ValueError if it has no place
+            for them.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    open: bool
+    scale: Literal["linear", "log"]
+    kind: Literal["number", "whole", "vector"]
+    batched: bool
+    same_points: bool
+    differentiable: bool
+    read: Read
+    write: Write
+
+    def check(self, value: Any, name: str | None = None) -> Any:
+        """A value as plain numbers, or as the tensor that it is if a gradient is required.
+
+        Args:
+            value: A number or tensor; three of them for a vector.
+            name: What to call it in messages, if not by its name.
+
+        Raises:
+            ValueError: If it is out of range.
+            TypeError: If it is no number.
+        """
+        name = name or self.name
+        if requires_grad(value) and not self.differentiable:
+            raise ValueError(f"`{name}` would lose its gradient: give a plain number (`tensor.detach()`).")
+        if self.kind == "vector":
+            plain = check_vector(name, value.detach() if isinstance(value, Tensor) else value)
+            return value if isinstance(value, Tensor) and value.requires_grad else list(plain)
+        if isinstance(value, bool) or not isinstance(value, int | float | Tensor):
+            raise TypeError(f"Expected `{name}` to be a number, but got {value!r:.60}.")
+        if self.kind == "whole" and value != int(value):
+            raise TypeError(f"Expected `{name}` to be a whole number, but got {value!r:.60}.")
+        plain_number = float(number_of(value))
+        inside = self.low < plain_number < self.high if self.open else self.low <= plain_number <= self.high
+        if not inside or not math.isfinite(plain_number):
+            raise ValueError(f"Expected `{name}` to be {self.range_in_words}, but got {plain_number:g}.")
+        if isinstance(value, Tensor) and value.requires_grad:
+            return value
+        return int(plain_number) if self.kind == "whole" else plain_number
+
+    @property
+    def range_in_words(self) -> str:
+        """The range, for messages."""
+        if self.low == -math.inf:
+            return "finite"
+        if self.high == math.inf:
+            return f"{'above' if self.open else 'at least'} {self.low:g}"
+        return f"{'between' if self.open else 'from'} {self.low:g} {'and' if self.open else 'to'} {self.high:g}"
+
+
+_KNOWN: dict[str, Parameter] = {}
+
+
+def register(
+    name: str,
+    *,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    open: bool = False,
+    scale: Literal["linear", "log"] = "linear",
+    kind: Literal["number", "whole", "vector"] = "number",
+    batched: bool = False,
+    same_points: bool = True,
+    differentiable: bool = False,
+    read: Read | None = None,
+    write: Write | None = None,
+) -> Parameter:
+    """Add a parameter, see :class:`Parameter`.
+
+    Args:
+        name: ``forces.CLASS.ATTRIBUTE`` for a number of a force of that class; any other name needs ``read`` and
+            ``write``.
+        unit: Its unit.
+        low: Smallest value.
+        high: Largest value.
+        open: Whether the range is open.
+        scale: ``log`` or ``linear``.
+        kind: ``number``, ``whole`` or ``vector``.
+        batched: Whether simulations that differ in it share a rollout.
+        same_points: Whether all objects take it without other points.
+        differentiable: Whether it keeps a gradient.
+        read: Gives its value; found by the name for a force.
+        write: Changes it; found by the name for a force.
+
+    Returns:
+        The parameter.
+
+    Raises:
+        ValueError: If the name is taken, or says nothing about how to change it.
+    """
+    check_choice("scale", scale, ("linear", "log"))
+    if name in _KNOWN:
+        raise ValueError(f"The parameter `{name}` is registered already: choose another name.")
+    parts = name.split(".")
+    if read is None and write is None and parts[0] == "forces" and len(parts) == 3:
+        read, write = _of_force(parts[1], parts[2])
+    if read is None or write is None:
+        raise ValueError(f"Expected `{name}` to be forces.CLASS.ATTRIBUTE, or to come with `read` and `write`.")
+    found = Parameter(
+        name, unit, low, high, open, scale, kind, batched, same_points, differentiable, read, write
+    )  # fmt: skip
+    _KNOWN[name] = found
+    return found
+
+
+def forget(name: str) -> None:
+    """Take a parameter off the list, as a test does at its end."""
+    _KNOWN.pop(name, None)
+
+
+def names() -> list[str]:
+    """The names of all parameters; ``*`` stands for the place of a modulation."""
+    return list(_KNOWN)
+
+
+def find(name: str) -> Parameter | None:
+    """The parameter of a name, or None. ``wind.modulations.0.FIELD`` is any number of a modulation of the wind."""
+    if name in _KNOWN:
+        return _KNOWN[name]
+    parts = name.split(".")
+    if parts[:2] == ["wind", "modulations"] and len(parts) == 4 and parts[2].isdecimal():
+        like = _KNOWN.get(f"wind.modulations.*.{parts[3]}", _KNOWN["wind.modulations.*.amplitude"])
+        known = like.name.endswith(f".{parts[3]}")
+        more: dict[str, Any] = {} if known else {"unit": "", "low": -math.inf, "open": False, "scale": "linear"}
+        return replace(like, name=name, read=_of_modulation(name), **more)
+    return None
+
+
+def parameter(name: str) -> Parameter:
+    """As :func:`find`.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    found = find(name)
+    if found is None:
+        raise ValueError(f"`{name}` is no parameter that may change: use one of {', '.join(names())}.")
+    return found
+
+
+def present(setup: Setup, start: str = "") -> list[str]:
+    """The names of the parameters that a setup has, of those that begin with some letters."""
+    found = []
+    for name in names():
+        if name.startswith(start) and "*" not in name:
+            try:
+                parameter(name).read(setup)
+            except ValueError:
+                continue
+            found.append(name)
+    return found
+
+
+def value_of(setup: Setup, name: str) -> Any:
+    """The value of a parameter in a setup.
+
+    Raises:
+        ValueError: If there is no such parameter, or the setup has none.
+    """
+    return parameter(name).read(setup)
+
+
+def with_values(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    """A setup with other values.
+
+    Args:
+        setup: The setup, which stays as it is.
+        values: Values by the names of parameters; tensors keep their gradient where the parameter is differentiable.
+
+    Raises:
+        ValueError: If there is no such parameter, a value is out of range, or the setup has no place for it.
+    """
+    together: dict[Write, dict[str, Any]] = {}
+    for name, value in values.items():
+        known = parameter(name)
+        together.setdefault(known.write, {})[name] = known.check(value)
+    for write, several in together.items():
+        setup = write(setup, several)
+    return setup
+
+
+def in_settings(settings: Namespace, name: str, value: Any) -> None:
+    """Set a parameter in parsed settings, which are changed.
+
+    Args:
+        settings: From the parser of a simulation.
+        name: The parameter.
+        value: Its value.
+
+    Raises:
+        ValueError: If the settings have no place for it.
+    """
+    value, parts = parameter(name).check(value), name.split(".")
+    if name in POLAR:
+        settings.wind.flow = flow_of(list(settings.wind.flow), {name: value})
+    elif parts[0] == "forces":
+        _arguments(settings.forces, parts[1], name)[parts[2]] = value
+    elif parts[:2] == ["wind", "modulations"]:
+        entries = settings.wind.modulations
+        if int(parts[2]) >= len(entries):
+            raise ValueError(f"The wind has no modulation {parts[2]} for `{name}`: add it to `wind.modulations`.")
+        _arguments([entries[int(parts[2])]], "", name)[parts[3]] = value
+    else:
+        settings[name] = value
+
+
+def of_settings(settings: Namespace, name: str) -> Any:
+    """The value of a parameter in parsed settings, as :func:`in_settings` sets it.
+
+    Raises:
+        ValueError: If the settings have no place for it.
+    """
+    parts = name.split(".")
+    if name in POLAR:
+        return _angles(settings.wind.flow)[POLAR.index(name)]
+    if parts[0] == "forces":
+        return _arguments(settings.forces, parts[1], name)[parts[2]]
+    if parts[:2] == ["wind", "modulations"]:
+        return settings.wind.modulations[int(parts[2])]["init_args"][parts[3]]
+    return settings[name]
+
+
+def _arguments(entries: Sequence[Any], kind: str, name: str) -> Any:
+    """The ``init_args`` of the first entry of a class; of any class if ``kind`` is empty."""
+    for entry in entries or ():
+        if not kind or entry["class_path"].rsplit(".", 1)[-1] == kind:
+            if entry.get("init_args") is None:
+                entry["init_args"] = {}
+            return entry["init_args"]
+    raise ValueError(f"`forces` has no {kind} for `{name}`: add it.")
+
+
+def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
+    """A flow [m/s] with some of ``wind.speed``, ``wind.azimuth`` and ``wind.elevation`` replaced.
+
+    Example:
+        >>> [round(x, 3) for x in flow_of([2.0, 0.0, 0.0], {"wind.azimuth": 90.0})]
+        [0.0, 2.0, 0.0]
+    """
+    x, y, z = base
+    speed = values.get("wind.speed", math.hypot(x, y, z))
+    azimuth = math.radians(values["wind.azimuth"]) if "wind.azimuth" in values else math.atan2(y, x)
+    rise = math.radians(values["wind.elevation"]) if "wind.elevation" in values else math.atan2(z, math.hypot(x, y))
+    level = speed * math.cos(rise)
+    return [level * math.cos(azimuth), level * math.sin(azimuth), speed * math.sin(rise)]
+
+
+# ---- how they are set
+
+
+def _changed(module: M, **values: Any) -> M:
+    """A copy of a module with other attributes or buffers; its other parts are shared."""
+    other = copy.copy(module)
+    for part in ("_parameters", "_buffers", "_modules"):
+        vars(other)[part] = dict(vars(module)[part])
+    for name, value in values.items():
+        old = getattr(module, name)
+        if name in other._buffers:
+            given = value.to(old) if isinstance(value, Tensor) else torch.full_like(old, value)
+            other._buffers[name] = given.reshape(old.shape)
+        elif name in other._parameters:
+            other._parameters[name] = nn.Parameter(torch.full_like(old, number_of(value)), old.requires_grad)
+        else:
+            setattr(other, name, value)
+    return other
+
+
+def _uniform_wind(setup: Setup) -> WindField:
+    if not isinstance(setup.wind, WindField):
+        raise ValueError("Expected `wind` to be a WindField: a custom wind has no numbers that could be changed.")
+    return setup.wind
+
+
+def _steady(setup: Setup, name: str) -> WindField:
+    wind = _uniform_wind(setup)
+    if len(wind.flows) > 1:
+        raise ValueError(f"`wind.schedule` gives the flow: remove it, or do not change `{name}`.")
+    return wind
+
+
+def _write_polar(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    wind = _steady(setup, next(iter(values)))
+    base = wind.flows[0].tolist()
+    if not any(base) and len(values) < 2:
+        raise ValueError("The base has no `wind.flow`: give one, or seek `wind.speed` and `wind.azimuth`.")
+    return replace(setup, wind=wind.with_flow(flow_of(base, values)))
+
+
+def _write_wind(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    wind = _uniform_wind(setup)
+    if "wind.flow" in values:
+        wind = wind.with_flow(values["wind.flow"])
+    if "wind.seed" in values:
+        wind = _changed(wind, seed=values["wind.seed"])
+    return replace(setup, wind=wind)
+
+
+def _write_modulation(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    wind = _uniform_wind(setup)
+    parts = list(wind.modulations)
+    for name, value in values.items():
+        _of_modulation(name)(setup)  # it is there
+        _, _, place, field = name.split(".")
+        parts[int(place)] = _changed(parts[int(place)], **{field: value})
+    return replace(setup, wind=_with_parts(wind, modulations=nn.ModuleList(parts)))
+
+
+def _with_parts(module: M, **parts: nn.Module) -> M:
+    other = _changed(module)
+    other._modules.update(parts)
+    return other
+
+
+def _of_modulation(name: str) -> Read:
+    def read(setup: Setup) -> float:
+        wind = _uniform_wind(setup)
+        place, field = int(name.split(".")[2]), name.split(".")[3]
+        there = wind.modulations[place] if place < len(wind.modulations) else None
+        value = getattr(there, field, None)
+        if not isinstance(value, float):
+            raise ValueError(f"The wind has no number `{name}`: add the modulation.")
+        return value
+
+    return read
+
+
+def _polar(setup: Setup) -> tuple[float, float, float]:
+    return _angles(_steady(setup, POLAR[0]).flows[0].tolist())
+
+
+def _angles(flow: Sequence[float]) -> tuple[float, float, float]:
+    """Speed, azimuth and elevation of a flow."""
+    x, y, z = flow
+    return math.hypot(x, y, z), math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
+
+
+def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    points, material = setup.points, setup.material
+
+    def everywhere(like: Tensor, value: Any) -> Tensor:
+        return torch.zeros_like(like) + value  # keeps a gradient
+
+    for name in values:
+        if any(getattr(part, name[9:]) is not None for part in material.regions):
+            raise ValueError(f"`{name}` is to change, but `material.regions` gives it too: remove it there.")
+    if "material.thickness" in values:
+        ratio = values["material.thickness"] / _thickness(setup)
+        points = thicker(setup, ratio).points
+        material = replace(material, thickness=values["material.thickness"])
+    if "material.E" in values:
+        points = replace(points, youngs_modulus=everywhere(points.youngs_modulus, values["material.E"]))
+        material = replace(material, E=values["material.E"])
+    if "material.nu" in values:
+        points = replace(points, poisson_ratio=everywhere(points.poisson_ratio, values["material.nu"]))
+        material = replace(material, nu=values["material.nu"])
+    if "material.density" in values:
+        points = replace(points, mass=points.volume * values["material.density"])
+        material = replace(material, density=values["material.density"])
+    return replace(setup, points=points, material=material)
+
+
+def thicker(setup: Setup, ratio: Any) -> Setup:
+    """A setup whose points have so many times the mass and volume, as in a sheet of so many times the thickness."""
+    points = setup.points
+    return replace(setup, points=replace(points, mass=points.mass * ratio, volume=points.volume * ratio))
+
+
+def _thickness(setup: Setup) -> float:
+    """The thickness, of a sheet that can be made thicker without other points."""
+    scene, material = setup.scene, setup.material
+    if material.volume != "patch" or scene.filled or setup.points.count != scene.on_surface + scene.filled:
+        raise ValueError(
+            "`material.thickness` can be changed only of a sheet of one layer (`scene.layers: 1`): change `material.E` "
+            "and `material.density` instead."
+        )
+    return number_of(material.thickness)
+
+
+def _write_aero(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    return replace(setup, aero=_changed(setup.aero, **{name[5:]: value for name, value in values.items()}))
+
+
+def _write_solver(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    changes: dict[str, Any] = {name[7:]: value for name, value in values.items()}
+    if "gravity" in changes:
+        changes["gravity"] = tuple(changes["gravity"])
+    return replace(setup, solver=replace(setup.solver, **changes))
+
+
+def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
+    """How a number of a force of a class is read and written."""
+
+    def read(setup: Setup) -> float:
+        for force in setup.forces:
+            if type(force).__name__ == kind:
+                return number_of(getattr(force, attribute))
+        raise ValueError(f"There is no force {kind}: add it to `forces`.")
+
+    def write(setup: Setup, values: Mapping[str, Any]) -> Setup:
+        read(setup)
+        (value,) = values.values()
+        forces = tuple(_changed(f, **{attribute: value}) if type(f).__name__ == kind else f for f in setup.forces)
+        return replace(setup, forces=forces)
+
+    return read, write
+
+
+def _mean(field: str) -> Read:
+    return lambda setup: float(getattr(setup.points, field).detach().double().mean())
+
+
+register(
+    "wind.flow",
+    unit="m/s",
+    kind="vector",
+    batched=True,
+    differentiable=True,
+    read=lambda setup: _steady(setup, "wind.flow").flows[0].tolist(),
+    write=_write_wind,
+)
+register(
+    "wind.seed", kind="whole", batched=True, read=lambda setup: _uniform_wind(setup).seed, write=_write_wind
+)  # fmt: skip
+_WIND = {"batched": True, "write": _write_polar}
+register("wind.speed", unit="m/s", low=0.0, scale="log", read=lambda setup: _polar(setup)[0], **_WIND)  # type: ignore[arg-type]
+register("wind.azimuth", unit="degrees", read=lambda setup: _polar(setup)[1], **_WIND)  # type: ignore[arg-type]
+register("wind.elevation", unit="degrees", read=lambda setup: _polar(setup)[2], **_WIND)  # type: ignore[arg-type]
+for _name, _unit, _open, _scale in (
+    ("amplitude", "", False, "log"),
+    ("delta", "", False, "log"),
+    ("std", "m/s", False, "log"),
+    ("period", "s", True, "log"),
+    ("interval", "s", True, "log"),
+    ("phase", "rad", False, "linear"),
+):
+    _place = f"wind.modulations.*.{_name}"
+    _low = -math.inf if _name == "phase" else 0.0
+    register(
+        _place, unit=_unit, low=_low, open=_open, scale=_scale, batched=True,  # type: ignore[arg-type]
+        read=_of_modulation(_place.replace("*", "0")), write=_write_modulation,
+    )  # fmt: skip
+_MATERIAL = {"batched": True, "differentiable": True, "write": _write_material}
+register("material.E", unit="Pa", low=0.0, open=True, scale="log", read=_mean("youngs_modulus"), **_MATERIAL)  # type: ignore[arg-type]
+register("material.nu", low=-1.0, high=0.5, open=True, read=_mean("poisson_ratio"), **_MATERIAL)  # type: ignore[arg-type]
+register(
+    "material.density", unit="kg/m³", low=0.0, open=True, scale="log",
+    read=lambda setup: float((setup.points.mass.double().sum() / setup.points.volume.double().sum()).detach()),
+    **_MATERIAL,  # type: ignore[arg-type]
+)  # fmt: skip
+register(
+    "material.thickness", unit="m", low=0.0, open=True, scale="log", batched=True, same_points=False,
+    read=_thickness, write=_write_material,
+)  # fmt: skip
+for _name, _low in (("C_D", 0.0), ("C_F", 0.0), ("C_L", -math.inf)):
+    register(
+        f"aero.{_name}", low=_low, scale="log", differentiable=True, write=_write_aero,
+        read=lambda setup, name=_name: number_of(getattr(setup.aero, name)),  # type: ignore[misc]
+    )  # fmt: skip
+register(
+    "solver.gravity", unit="m/s²", kind="vector", read=lambda setup: list(setup.solver.gravity), write=_write_solver
+)
+for _name, _unit in (("damping", "1/s"), ("stiffness_damping", "s")):
+    register(
+        f"solver.{_name}", unit=_unit, low=0.0, scale="log", write=_write_solver,
+        read=lambda setup, name=_name: getattr(setup.solver, name),  # type: ignore[misc]
+    )  # fmt: skip
+
+__all__ = [
+    "POLAR",
+    "Parameter",
+    "Setup",
+    "find",
+    "flow_of",
+    "forget",
+    "in_settings",
+    "names",
+    "of_settings",
+    "parameter",
+    "present",
+    "register",
+    "thicker",
+    "value_of",
+    "with_values",
+]

@@ -1,0 +1,266 @@
+"""Parameters: each is read and written in one place, and a number of a user's own force is one line away from all uses.
+
+Covers: simulation.parameters.
+"""
+
+import json
+import math
+
+import pytest
+import torch
+import yaml
+
+from gaussian_swaying.fitting.ensemble import Ensemble
+from gaussian_swaying.fitting.plan import read_plan
+from gaussian_swaying.fitting.report import scene_text
+from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.simulation import parameters
+from gaussian_swaying.simulation.parameters import (
+    find,
+    in_settings,
+    of_settings,
+    parameter,
+    present,
+    register,
+    value_of,
+    with_values,
+)
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps.together import grouped
+from gaussian_swaying.viewer.changes import changed_settings
+from gaussian_swaying.viewer.session import Session
+
+CONFIG = {
+    "frames": 3,
+    "scene": {
+        "generator": {"class_path": "FlagScene", "init_args": {"width": 0.4, "height": 0.3, "spacing": 0.05}},
+        "metres_per_unit": 1.0,
+    },
+    "material": {"E": 1e4, "nu": 0.3, "density": 25.0, "thickness": 0.01},
+    "solver": {
+        "dx": 0.1,
+        "damping": 0.5,
+        "boundaries": [
+            {
+                "class_path": "PinnedRegion",
+                "init_args": {
+                    "kind": None,
+                    "region": {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}},
+                },
+            }
+        ],
+    },
+    "wind": {
+        "flow": [4.0, 3.0, 0.0],
+        "modulations": [
+            {"class_path": "SineSway"},
+            {"class_path": "UniformGust"},
+            {"class_path": "GaussianGust"},
+        ],
+    },
+    "aero": {"C_D": 0.1, "C_F": 0.3, "C_L": 0.005},
+}
+OTHERS = {"wind.flow": [1.0, 2.0, 0.5], "wind.seed": 7, "solver.gravity": [0.0, 0.0, -1.0], "material.nu": 0.1}
+PLACES = {"amplitude": 0, "period": 0, "phase": 0, "delta": 1, "std": 2, "interval": 1}
+NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in parameters.names()]
+
+
+class Breath(Force):
+    """Lifts every point."""
+
+    def __init__(self, strength: float = 0.1) -> None:
+        super().__init__()
+        self.strength = strength
+
+    def forward(self, state):
+        return self.strength * state.position.new_tensor([0.0, 0.0, 1e-3]).expand_as(state.position)
+
+
+@pytest.fixture
+def parser():
+    return Simulation.parser()
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "base.yaml"
+    path.write_text(yaml.safe_dump(CONFIG))
+    return path
+
+
+@pytest.fixture
+def breath(tmp_path, monkeypatch):
+    """A configuration with a force from a module of the user's, which registers its number in one line."""
+    code = (
+        "import torch\n"
+        "from gaussian_swaying.mpm.forces import Force\n"
+        "from gaussian_swaying.simulation.parameters import register\n\n"
+        "class Breath(Force):\n"
+        "    def __init__(self, strength: float = 0.1) -> None:\n"
+        "        super().__init__()\n"
+        "        self.strength = strength\n\n"
+        "    def forward(self, state):\n"
+        "        return self.strength * state.position.new_tensor([0.0, 0.0, 1e-3]).expand_as(state.position)\n\n"
+        'register("forces.Breath.strength", unit="N", low=0.0, high=9.0)\n'
+    )
+    (tmp_path / "users_breath.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    path = tmp_path / "breath.yaml"
+    path.write_text(yaml.safe_dump(CONFIG | {"forces": [{"class_path": "users_breath.Breath"}]}))
+    yield path
+    parameters.forget("forces.Breath.strength")
+    import sys
+
+    sys.modules.pop("users_breath", None)
+
+
+def _close(found, wanted):
+    assert torch.allclose(torch.as_tensor(found).double(), torch.as_tensor(wanted).double(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, parser):
+    """In a setup, in a simulation that goes on, and in settings, from which a simulation is made."""
+    simulation = Simulation.from_yaml(config, device="cpu")
+    before = simulation.setup
+    old = value_of(before, name)
+    value = OTHERS.get(name, 0.5 * old + 0.01 if not isinstance(old, list) else None)
+    changed = with_values(before, {name: value})
+    _close(value_of(changed, name), value)
+    _close(value_of(before, name), old)  # as it was
+    state = simulation.advance(simulation.start())[0]
+    state = simulation.change(state, {name: value})
+    _close(value_of(simulation.setup, name), value)
+    settings = parser.parse_args(["--config", str(config), "--device=cpu"])
+    _close(of_settings(settings, name), old)
+    in_settings(settings, name, value)
+    _close(of_settings(settings, name), value)
+    made = Simulation.from_settings(parser, settings)
+    _close(value_of(made.setup, name), value)
+    for simulated in (simulation, made):  # also from rest, they are the same
+        assert simulated.start().position.isfinite().all()
+    ends = [simulated.advance(simulated.start())[0].position for simulated in (simulation, made)]
+    torch.testing.assert_close(*ends, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("material.E", 0.0, "above 0"),
+        ("material.nu", 0.5, "between -1 and 0.5"),
+        ("wind.speed", -1.0, "at least 0"),
+        ("aero.C_L", math.nan, "finite"),
+        ("wind.flow", [1.0, 2.0], "wind.flow"),
+        ("material.stiffness", 1.0, "no parameter"),
+        ("wind.modulations.7.period", 1.0, "add the modulation"),
+        ("forces.Nothing.strength", 1.0, "no parameter"),
+    ],
+)
+def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, value, words, config):
+    simulation = Simulation.from_yaml(config, device="cpu")
+    state = simulation.start()
+    before = simulation.setup
+    with pytest.raises((ValueError, TypeError), match=words):
+        simulation.change(state, {"material.density": 30.0, name: value})
+    after = simulation.setup
+    assert all(getattr(after, part) is getattr(before, part) for part in ("points", "wind", "aero", "solver"))
+
+
+@pytest.mark.parametrize(("name", "value"), [("wind.seed", 1.5), ("material.E", "soft"), ("material.E", True)])
+def test_what_is_no_number_is_refused(name, value):
+    with pytest.raises(TypeError, match=name):
+        parameter(name).check(value)
+
+
+def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):
+    region = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.2, None, None]}}
+    material = CONFIG["material"] | {"regions": [{"region": region, "E": 2e4}]}
+    path = tmp_path / "regions.yaml"
+    path.write_text(yaml.safe_dump(CONFIG | {"material": material}))
+    setup = Simulation.from_yaml(path, device="cpu").setup
+    with pytest.raises(ValueError, match=r"material\.regions"):
+        with_values(setup, {"material.E": 1e3})
+    assert with_values(setup, {"material.density": 30.0}).points is not setup.points
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if parameter(name).differentiable and name != "wind.flow"])
+def test_gradients_are_kept(name, config):
+    setup = Simulation.from_yaml(config, device="cpu").setup
+    value = torch.tensor(value_of(setup, name), dtype=torch.float64, requires_grad=True)
+    changed = with_values(setup, {name: value})
+    points, aero = changed.points, changed.aero
+    total = sum(part.double().sum() for part in (points.mass, points.volume, points.youngs_modulus))
+    total = total + points.poisson_ratio.double().sum() + aero.C_D + aero.C_F + aero.C_L
+    (slope,) = torch.autograd.grad(total, value)
+    assert float(slope.abs()) > 0
+
+
+def test_a_gradient_that_would_be_lost_is_refused(config):
+    setup = Simulation.from_yaml(config, device="cpu").setup
+    with pytest.raises(ValueError, match="lose its gradient"):
+        with_values(setup, {"wind.speed": torch.tensor(1.0, requires_grad=True)})
+
+
+def test_angles_are_set_together(config):
+    setup = Simulation.from_yaml(config, device="cpu").setup
+    found = with_values(setup, {"wind.speed": 2.0, "wind.azimuth": 90.0, "wind.elevation": 30.0})
+    _close(value_of(found, "wind.flow"), [0.0, math.sqrt(3), 1.0])
+
+
+def test_names_are_taken_once():
+    with pytest.raises(ValueError, match="registered already"):
+        register("material.E", unit="Pa")
+    with pytest.raises(ValueError, match=r"forces\.CLASS\.ATTRIBUTE"):
+        register("weather")
+    assert find("weather") is None
+
+
+def test_a_number_of_a_users_force_is_live_without_a_parse(breath, parser, monkeypatch):
+    settings = parser.parse_args(["--config", str(breath), "--device=cpu"])
+    session = Session(parser, settings)
+    assert present(session.simulation.setup, "forces.") == ["forces.Breath.strength"]
+    for name in ("parse_object", "dump", "instantiate"):
+        monkeypatch.setattr(parser, name, lambda *_, **__: pytest.fail("parsed"))
+    session._change({"forces.Breath.strength": 3.0, "material.E": 2e4, "wind.flow": [1.0, 0.0, 0.0]})
+    assert session.problem is None
+    assert session.simulation.custom_forces[0].strength == 3.0
+    assert settings.forces[0].init_args.strength == 0.1  # those before the change, for undo
+    session._undo()
+    assert session.simulation.custom_forces[0].strength == 0.1
+    _close(value_of(session.simulation.setup, "material.E"), 1e4)
+    with pytest.raises(ValueError, match="from 0 to 9"):
+        changed_settings(parser, settings, {"forces.Breath.strength": 10.0})
+
+
+def test_a_number_of_a_users_force_is_sought(breath, parser, tmp_path):
+    (tmp_path / "fit.yaml").write_text(
+        yaml.safe_dump({"base": str(breath), "videos": ["v"], "unknowns": {"forces.Breath.strength": [0.1, 5.0]}})
+    )
+    plan = read_plan(tmp_path / "fit.yaml")
+    assert plan.unknowns[0].unit == "N"
+    settings = parser.parse_args(["--config", str(breath), "--device=cpu"])
+    simulation = Simulation.from_settings(parser, settings)
+    check_unknowns(simulation, plan.unknowns)
+    ensemble = Ensemble(simulation)
+    values = [{"forces.Breath.strength": 0.0}, {"forces.Breath.strength": 5.0}, {"wind.speed": 5.0}]
+    weak, strong, same = [state.position for state in list(ensemble.run(values, [0.0, 0.08]))[-1]]
+    assert float((strong - weak)[:, 2].mean()) > 1e-3
+    assert float((same - weak).abs().max()) > 0  # 0.1 by default
+    text = scene_text({"forces.Breath.strength": 2.5}, parser, settings, simulation)
+    assert yaml.safe_load(text)["forces"][0]["init_args"]["strength"] == 2.5
+    with pytest.raises(ValueError, match="range"):
+        Unknown("forces.Breath.strength", -1.0, 5.0)
+
+
+def test_a_number_of_a_users_force_is_swept(breath, parser, tmp_path):
+    axes = {"forces.Breath.strength": [0.2, 0.4], "wind.seed": [1, 2]}
+    (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(breath), "axes": axes}))
+    plan = make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
+    found = [parse_run(parser, plan.config, 2, run).forces[0].init_args.strength for run in plan.runs]
+    assert sorted(found) == [0.2, 0.2, 0.4, 0.4]
+    assert len(grouped(plan.runs, 8)) == 2  # runs that differ in the seed go together
+    (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(breath), "axes": {"forces.Breath.strength": [99.0]}}))
+    with pytest.raises(ValueError, match="from 0 to 9"):
+        make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
