@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_poisson_ratio, check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.simulation.parameters import parameter
 from gaussian_swaying.simulation.scene import SimulatedScene
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
@@ -51,11 +52,9 @@ class Edit:
 
     def __post_init__(self) -> None:
         check_positive("edits.time", self.time, allow_zero=True)
-        for name in ("E", "density"):
+        for name in ("E", "nu", "density"):
             if getattr(self, name) is not None:
-                check_positive(f"edits.{name}", getattr(self, name))
-        if self.nu is not None:
-            check_poisson_ratio("edits.nu", self.nu)
+                parameter(f"material.{name}").check(getattr(self, name), f"edits.{name}")
         if self.color is not None and not all(0 <= part <= 1 for part in check_vector("edits.color", self.color)):
             raise ValueError(f"Expected `edits.color` to lie in [0, 1], but got {self.color}.")
         if not 0 <= self.detail <= 1:

@@ -54,7 +54,7 @@ def _flag(**changes):
 @pytest.mark.parametrize(
     ("example", "output"),
     EXAMPLES,
-    ids=["three lines", "sequence", "by hand", "wind", "forces", "supports", "batches", "gradient"],
+    ids=["three lines", "sequence", "by hand", "wind", "numbers", "forces", "supports", "batches", "gradient"],
 )
 def test_examples_of_the_page_print_what_it_shows(example, output, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -67,7 +67,7 @@ def test_examples_of_the_page_print_what_it_shows(example, output, capsys, tmp_p
 
 
 def test_the_page_has_an_example_for_each_heading():
-    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 8
+    assert len(EXAMPLES) == PAGE.count("```python") == PAGE.count("\n## ") == 9
 
 
 def test_a_file_its_gaussians_and_what_made_them_are_the_same(tmp_path):

@@ -5,6 +5,7 @@ Covers: simulation.parameters.
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -264,3 +265,13 @@ def test_a_number_of_a_users_force_is_swept(breath, parser, tmp_path):
     (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(breath), "axes": {"forces.Breath.strength": [99.0]}}))
     with pytest.raises(ValueError, match="from 0 to 9"):
         make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
+
+
+def test_the_documentation_lists_them():
+    told = (Path(__file__).parents[2] / "docs" / "python.md").read_text()
+    kinds = {"vector": "three numbers", "whole": "a whole number"}
+    for name in parameters.names():
+        known = parameter(name.replace("*", "0"))
+        found = kinds.get(known.kind, known.range_in_words)
+        marks = " | ".join("yes" if mark else "" for mark in (known.batched, known.differentiable))
+        assert f"| `{name}` | {known.unit} | {found} | {marks} |" in told
