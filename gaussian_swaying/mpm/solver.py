@@ -180,8 +180,22 @@ class MPMSolver(nn.Module):
         """Bind the material and compute everything that stays constant."""
         self._bound = self._fused = None
         bound = FORMULATIONS[self.formulation](Body(points, self._framed or self._conditions(), surface), self.settings)
-        self._fused_obstacle = bound.why_not_kernels(self.transfer)
+        self._fused_obstacle = self._why_not_kernels(bound)
         self._bound = bound
+
+    def _why_not_kernels(self, bound: Formulation) -> str | None:
+        """Why the Triton kernels are not used; ValueError if they cannot be, but ``transfer`` is triton."""
+        if self.transfer == "torch":
+            return "`transfer` is torch"
+        try:
+            from gaussian_swaying.mpm.triton.twins import why_not_kernels
+
+            obstacle = why_not_kernels(bound, interpret=self.transfer == "triton")
+        except ImportError as error:
+            obstacle = f"Triton cannot be imported ({error})"
+        if self.transfer == "triton" and obstacle is not None:
+            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
+        return obstacle
 
     @property
     def has_kernels(self) -> bool:
@@ -212,11 +226,11 @@ class MPMSolver(nn.Module):
 
     def _kernels(self) -> Fused:
         if self._fused is None or not self._fused.holds():
-            twin = self.bound.twin()
-            assert twin is not None
+            from gaussian_swaying.mpm.triton.twins import TWINS
+
             # ordinary tensors, which can be written inside and outside inference mode
             with torch.inference_mode(False), torch.no_grad():
-                self._fused = twin(self.bound)
+                self._fused = TWINS[self.bound.name](self.bound)
         return self._fused
 
     def _adjoint_for(self, state: MPMState, forces: Sequence[Force]) -> Adjoint | None:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,9 +22,6 @@ from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.state import GridSpec, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, scatter
-
-if TYPE_CHECKING:
-    from gaussian_swaying.mpm.triton.fused import Fused
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,30 +95,6 @@ class Formulation(ABC):
     def check_settings(cls, settings: Settings) -> None:
         """Raise ValueError if the formulation does not support a setting."""
         return
-
-    def twin(self) -> type[Fused] | None:
-        """The class that runs this substep in Triton kernels, or None; ImportError without Triton."""
-        return None
-
-    def why_not_kernels(self, transfer: str) -> str | None:
-        """Why the Triton kernels cannot be used with this material and a ``transfer`` of the solver; None if they can.
-
-        Raises:
-            ValueError: If they cannot, but ``transfer`` is triton.
-        """
-        if transfer == "torch":
-            return "`transfer` is torch"
-        try:
-            twin = self.twin()
-        except ImportError as error:
-            obstacle: str | None = f"Triton cannot be imported ({error})"
-        else:
-            obstacle = f"the {self.name} formulation has no kernels"
-            if twin is not None:
-                obstacle = twin.unsupported(self, interpret=transfer == "triton")
-        if transfer == "triton" and obstacle is not None:
-            raise ValueError(f"`transfer: triton` cannot be used, because {obstacle}: set it to auto or torch.")
-        return obstacle
 
     # ---- state and grid
 

@@ -6,7 +6,6 @@ import math
 import warnings
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -23,9 +22,6 @@ from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather, scatter
-
-if TYPE_CHECKING:
-    from gaussian_swaying.mpm.triton.fused import Fused
 
 
 class Total(Formulation):
@@ -196,12 +192,6 @@ class Total(Formulation):
                 "its `held_share`."
             )
         return replace(held, share=share if held.release is None else None, threshold=threshold or 0.0)
-
-    def twin(self) -> type[Fused]:
-        """Two kernels: particles and nodes."""
-        from gaussian_swaying.mpm.triton.fused_total import FusedTotal
-
-        return FusedTotal
 
     def first_grid(self, margin: int) -> GridSpec:
         """The grid of the stencils."""

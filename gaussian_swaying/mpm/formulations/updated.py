@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,9 +15,6 @@ from gaussian_swaying.mpm.formulations.formulation import Formulation, Settings,
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import bspline_stencil, g2p, scatter, scatter_momentum
-
-if TYPE_CHECKING:
-    from gaussian_swaying.mpm.triton.fused import Fused
 
 
 class Updated(Formulation):
@@ -40,12 +36,6 @@ class Updated(Formulation):
                 "`contact` needs particles that keep their neighbours, which the updated formulation does not have: "
                 "leave out `contact`, as its material meets itself on the grid, or set `solver.formulation` to total."
             )
-
-    def twin(self) -> type[Fused]:
-        """One kernel that ends a substep and starts the next, and one for the nodes."""
-        from gaussian_swaying.mpm.triton.fused_updated import FusedUpdated
-
-        return FusedUpdated
 
     def first_grid(self, margin: int) -> GridSpec:
         """The grid around the body at rest; ValueError if rounding would lose the motion of a substep."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,13 +12,13 @@ from torch import Tensor
 from gaussian_swaying._graphs import RECORDED
 from gaussian_swaying.mpm.boundaries.pinned_points import PinnedPoints
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
-from gaussian_swaying.mpm.forces import TWIN_VALUES, Force
+from gaussian_swaying.mpm.forces import TWIN_VALUES
 from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.point_holds import DenseHolds
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.triton import total_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import Adjoint, Fused, Part, check_indices
+from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
 from gaussian_swaying.mpm.triton.fused_contact import FusedContact
 
 # time per particle for a number of lanes per cell, relative to 32 lanes, on an H200
@@ -96,22 +95,9 @@ class FusedTotal(Fused):
         self._take_pins()
         self.touching = None if bound.contact is None else FusedContact(bound, self.fields, self.active)
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, device=self.device)
-        self._adjoint: Adjoint | None = None
         self._partial: dict[tuple[int, int, str], Tensor] = {}
         width = 8 if self.position else 4
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
-
-    def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
-        """The rollouts with gradients in kernels, see :mod:`~gaussian_swaying.mpm.triton.total_adjoint`."""
-        from gaussian_swaying.mpm.triton.total_adjoint import TotalAdjoint, why_not
-
-        why = why_not(self, state, forces)
-        if why is not None:
-            return None, why
-        if self._adjoint is None:
-            with torch.inference_mode(False), torch.no_grad():
-                self._adjoint = TotalAdjoint(self)
-        return self._adjoint, ""
 
     def _take_pins(self) -> None:
         """What pins without a window hold: nodes, and points."""

@@ -16,11 +16,12 @@ import triton
 from torch import Tensor
 
 from gaussian_swaying.mpm.forces import Force, ForceTwin, tensors_of
+from gaussian_swaying.mpm.formulations.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.transfer import Stencil, gather, scatter
 from gaussian_swaying.mpm.triton import adjoint_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import MAX_STEPS, at_home
+from gaussian_swaying.mpm.triton.fused import MAX_STEPS, Adjoint, at_home
 from gaussian_swaying.mpm.triton.fused_total import REGISTERS, FusedTotal
 
 Watch = Callable[[int], None] | None
@@ -464,3 +465,21 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
 def _own(tensor: Tensor, nodal: tuple[Tensor | None, ...]) -> bool:
     """Whether a field of particles is a leaf that requires a gradient."""
     return tensor.requires_grad and tensor.is_leaf and not any(tensor is t for t in nodal)
+
+
+class DifferentiableTotal(FusedTotal):
+    """A :class:`FusedTotal` whose rollouts have gradients in kernels."""
+
+    def __init__(self, bound: Formulation) -> None:
+        super().__init__(bound)
+        self._adjoint: TotalAdjoint | None = None
+
+    def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
+        """The rollouts with gradients, or None and why there are none."""
+        why = why_not(self, state, forces)
+        if why is not None:
+            return None, why
+        if self._adjoint is None:
+            with torch.inference_mode(False), torch.no_grad():
+                self._adjoint = TotalAdjoint(self)
+        return self._adjoint, ""
