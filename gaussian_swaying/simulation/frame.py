@@ -5,16 +5,28 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
+from gaussian_swaying._turns import Turn
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
+from gaussian_swaying.simulation.edits import SceneEditor
+from gaussian_swaying.simulation.painter import Painter
 
-if TYPE_CHECKING:
-    from gaussian_swaying.simulation.simulation import Simulation
+
+class Moving(Protocol):
+    """What a frame needs of the simulation that made it."""
+
+    frame_dt: float
+    painter: Painter
+    editor: SceneEditor
+
+    @property
+    def turn(self) -> Turn:
+        """Held by the thread that steps or draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +40,7 @@ class Frame:
         health: Energies, momenta, stretch and other measurements.
     """
 
-    simulation: Simulation
+    simulation: Moving
     index: int
     state: MPMState
     health: FrameDiagnostics
@@ -82,5 +94,5 @@ class Frame:
             ValueError: If the ending or the format is unknown, or no Gaussian is finite.
             ImportError: If the format is USD and usd-core is not installed.
         """
-        place, fps = self.simulation.scene.frame, 1 / self.simulation.frame_dt
+        place, fps = self.simulation.painter.scene.frame, 1 / self.simulation.frame_dt
         export_cloud(path, self.gaussians, format, fps, place.metres_per_unit, place.rotation)

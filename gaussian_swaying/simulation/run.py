@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,17 +24,15 @@ from gaussian_swaying.simulation.diagnostics import SimulationDiverged, entry_na
 from gaussian_swaying.simulation.health import advice, extremes
 from gaussian_swaying.simulation.meters import PeakMemory, WallClock
 from gaussian_swaying.simulation.progress import RunProgress
+from gaussian_swaying.simulation.stepping import Stepping
 from gaussian_swaying.simulation.wind_picture import draw_wind
-
-if TYPE_CHECKING:
-    from gaussian_swaying.simulation.simulation import Simulation
 
 MAX_LOOKS = 2_000  # largest number of frames whose cameras are checked before a run
 
 
 @torch.inference_mode()
 def run(
-    simulation: Simulation, output: Path, frames: int, resume: bool, settings: dict[str, Any], progress: bool
+    simulation: Stepping, output: Path, frames: int, resume: bool, settings: dict[str, Any], progress: bool
 ) -> dict[str, Any]:
     """See :meth:`~gaussian_swaying.simulation.simulation.Simulation.run`."""
     check_positive("frames", frames)
@@ -59,14 +57,14 @@ def run(
         recorder.release()
 
 
-def splat_checksum(simulation: Simulation) -> str | None:
+def splat_checksum(simulation: Stepping) -> str | None:
     """Checksum of the splat's file, to distinguish it from another file with the same name."""
     path = simulation.scene.source
     return None if path is None else sha256(Path(path))
 
 
 def _check_checkpoint(
-    simulation: Simulation, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
+    simulation: Stepping, checkpoint: dict[str, Any], start: MPMState, output: Path, frames: int, splat: str | None
 ) -> None:
     """Raise ValueError unless the run can continue from a checkpoint as if it had never stopped."""
     scene, held = simulation.scene, checkpoint["state"].get("position")
@@ -106,7 +104,7 @@ def _check_checkpoint(
         )
 
 
-def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
+def run_health(simulation: Stepping, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
     """Find what moved and stretched most in a run, with sentences on what to change; none if all is well.
 
     Args:
@@ -124,7 +122,7 @@ def run_health(simulation: Simulation, log: Sequence[Mapping[str, Any]]) -> tupl
 class Run:
     """Data that a run carries from frame to frame besides the state."""
 
-    def __init__(self, simulation: Simulation, frames: int, splat: str | None = None, config: str = "") -> None:
+    def __init__(self, simulation: Stepping, frames: int, splat: str | None = None, config: str = "") -> None:
         self.simulation, self.painter, self.recorder = simulation, simulation.painter, simulation.recorder
         self.frames, self.splat, self.config = frames, splat, config
         self.log: list[dict[str, Any]] = []

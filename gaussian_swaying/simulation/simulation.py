@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._turns import in_turn
@@ -23,7 +23,6 @@ from gaussian_swaying.config.parser import (
     parse_file,
     python_text,
 )
-from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.mpm.boundaries.obstacle import Obstacle
 from gaussian_swaying.mpm.contact.surface import Contact
@@ -46,10 +45,8 @@ from gaussian_swaying.simulation.defaults import (
     check_types,
     resolve_device,
 )
-from gaussian_swaying.simulation.diagnostics import diagnose
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
 from gaussian_swaying.simulation.frame import Frame
-from gaussian_swaying.simulation.launch import Launched
 from gaussian_swaying.simulation.normalisation import Normalisation
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.parameters import Setup, with_values
@@ -170,8 +167,6 @@ class Simulation(Stepping):
         self.editor = SceneEditor(model, edits)
         self.recorder = recorder or Recorder()
         self.frames_wanted = 250  # of a run; those of the file, if there is one
-        self.files: list[Path] = []  # what the last run wrote
-        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self._text, self._changed, self._given = "", set(given), given
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -333,73 +328,6 @@ class Simulation(Stepping):
         """
         check_frames("count", count)
         return self.frames_from(self.start(), 0, count)
-
-    def frames_from(
-        self, state: MPMState, first: int, count: int, drawn: torch.cuda.Stream | None = None
-    ) -> Iterator[Frame]:
-        """The frames from number ``first`` up to ``count``.
-
-        Args:
-            state: The state at rest from :meth:`start` if ``first`` is 0, otherwise the state of the frame before.
-            first: Number of the first frame.
-            count: Number of frames of the whole run.
-            drawn: A stream on which the frames are drawn and recorded. The next frame is then simulated at the same
-                time, so that the GPU does not wait for the host, and what is assigned between two frames applies from
-                the next but one on.
-        """
-        return self._loop(self._started, state, first, count, drawn)
-
-    def _loop(
-        self, started: int, state: MPMState, first: int, count: int, drawn: torch.cuda.Stream | None
-    ) -> Iterator[Frame]:
-        launched: Launched | None = None
-        for index in range(first, count):
-            with self.turn:
-                if self._started != started:
-                    raise RuntimeError(
-                        "This simulation was started again, so the earlier loop over its frames cannot go on: finish "
-                        "one loop before the next, or make a Simulation for each."
-                    )
-                if index == 0:
-                    health = diagnose(self.solver, state, 0, 0.0)
-                else:
-                    if launched is None:
-                        self._begin(index)
-                    state, health = self.advance(state) if launched is None else launched.finish()
-                    if drawn is not None:  # the frame before may still be drawn from memory that is now free
-                        torch.cuda.current_stream(self.device).wait_stream(drawn)
-                    state = self.edit_due(state)
-                if drawn is not None and index + 1 < count:
-                    drawn.wait_stream(torch.cuda.current_stream(self.device))
-                    self._begin(index + 1)
-                    launched = self.launch(state)
-                frame = Frame(self, index, state, health, self.editor.version)
-            yield frame
-
-    def _begin(self, index: int) -> None:
-        if self.progress is not None:
-            self.progress.begin(index)
-
-    # ---- what is measured
-
-    @in_turn
-    def wind_pressure(self, state: MPMState) -> Tensor:
-        """Force of the wind per area of the Gaussians as they are now [Pa], shape (N,); 0 for those without wind."""
-        scene = self.scene
-        if self.idle:
-            return scene.on_gaussians(torch.zeros_like(scene.in_wind, dtype=state.position.dtype))
-        move, F = scene.follow.motion(state)
-        normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
-        place = scene.frame.point_to_sim(scene.model.means[scene.moving].double()).to(move) + move
-        wind = self.wind_force.air(state.time, place)
-        force = self.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
-        return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
-
-    def force_scale(self) -> float:
-        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
-        speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
-        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).detach().abs().sum())
-        return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
 
     # ---- the run
 

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import weakref
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying._graphs import fingerprint, tensors_in
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.aero.force import AeroForce
 from gaussian_swaying.aero.wind import SpatialWind, WindField
 from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.mpm.timestep import rounding_speed
+from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed
+from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.diagnostics import (
     FrameDiagnostics,
     Gauge,
@@ -24,10 +30,11 @@ from gaussian_swaying.simulation.diagnostics import (
     SimulationDiverged,
     TearingGauge,
     check_spacing,
+    diagnose,
     measure,
 )
 from gaussian_swaying.simulation.edits import Edit, SceneEditor
-from gaussian_swaying.simulation.launch import Launched, Outlook, needs_of
+from gaussian_swaying.simulation.frame import Frame
 from gaussian_swaying.simulation.painter import Painter
 from gaussian_swaying.simulation.progress import RunProgress
 from gaussian_swaying.simulation.scene import SimulatedScene
@@ -40,6 +47,10 @@ MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastes
 ROUNDING_SHARE = 0.5
 """Share of the driving speed that the bound of :func:`rounding_speed` may reach in a second; rounding itself reaches a
 tenth of its bound or so."""
+
+
+MAX_RETRIES = 4  # of a frame
+CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
 
 
 class Stepping(nn.Module):
@@ -55,6 +66,8 @@ class Stepping(nn.Module):
     custom_forces: nn.ModuleList
     editor: SceneEditor
     frame_dt: float
+    recorder: Recorder
+    config: str | property
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,6 +79,8 @@ class Stepping(nn.Module):
         self._idle: tuple[tuple[object, ...], bool] | None = None
         self._tearing: TearingGauge | None = None
         self._gauge = Gauge()
+        self.files: list[Path] = []  # what the last run wrote
+        self.resumable: tuple[Path, int] | None = None  # the checkpoint of the last run, and its frame
         self._started = 0  # how often; a loop over frames ends when another one begins
 
     # ---- parts
@@ -282,7 +297,7 @@ class Stepping(nn.Module):
             courant: Its largest Courant number.
             work: Work of the wind in it [J].
             state: The state at its start.
-            parts: From :func:`~gaussian_swaying.simulation.launch.parts_of`.
+            parts: From :func:`~gaussian_swaying.simulation.stepping.parts_of`.
         """
         if self._tearing is not None or not self.foresees:
             return measure(self.solver, end, steps, courant, work, self._tearing, state)
@@ -293,6 +308,71 @@ class Stepping(nn.Module):
 
         same = None if parts is None else (idle, self.frame_dt, parts)
         return self._gauge(self.solver, end, steps, courant, work, state, needs, same)
+
+    def frames_from(
+        self, state: MPMState, first: int, count: int, drawn: torch.cuda.Stream | None = None
+    ) -> Iterator[Frame]:
+        """The frames from number ``first`` up to ``count``.
+
+        Args:
+            state: The state at rest from :meth:`start` if ``first`` is 0, otherwise the state of the frame before.
+            first: Number of the first frame.
+            count: Number of frames of the whole run.
+            drawn: A stream on which the frames are drawn and recorded. The next frame is then simulated at the same
+                time, so that the GPU does not wait for the host, and what is assigned between two frames applies from
+                the next but one on.
+        """
+        return self._loop(self._started, state, first, count, drawn)
+
+    def _loop(
+        self, started: int, state: MPMState, first: int, count: int, drawn: torch.cuda.Stream | None
+    ) -> Iterator[Frame]:
+        launched: Launched | None = None
+        for index in range(first, count):
+            with self.turn:
+                if self._started != started:
+                    raise RuntimeError(
+                        "This simulation was started again, so the earlier loop over its frames cannot go on: finish "
+                        "one loop before the next, or make a Simulation for each."
+                    )
+                if index == 0:
+                    health = diagnose(self.solver, state, 0, 0.0)
+                else:
+                    if launched is None:
+                        self._begin(index)
+                    state, health = self.advance(state) if launched is None else launched.finish()
+                    if drawn is not None:  # the frame before may still be drawn from memory that is now free
+                        torch.cuda.current_stream(self.device).wait_stream(drawn)
+                    state = self.edit_due(state)
+                if drawn is not None and index + 1 < count:
+                    drawn.wait_stream(torch.cuda.current_stream(self.device))
+                    self._begin(index + 1)
+                    launched = self.launch(state)
+                frame = Frame(self, index, state, health, self.editor.version)
+            yield frame
+
+    def _begin(self, index: int) -> None:
+        if self.progress is not None:
+            self.progress.begin(index)
+
+    @in_turn
+    def wind_pressure(self, state: MPMState) -> Tensor:
+        """Force of the wind per area of the Gaussians as they are now [Pa], shape (N,); 0 for those without wind."""
+        scene = self.scene
+        if self.idle:
+            return scene.on_gaussians(torch.zeros_like(scene.in_wind, dtype=state.position.dtype))
+        move, F = scene.follow.motion(state)
+        normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
+        place = scene.frame.point_to_sim(scene.model.means[scene.moving].double()).to(move) + move
+        wind = self.wind_force.air(state.time, place)
+        force = self.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
+        return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
+
+    def force_scale(self) -> float:
+        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
+        speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
+        coefficients = float(torch.stack([self.aero.C_D, self.aero.C_F, self.aero.C_L]).detach().abs().sum())
+        return 0.5 * self.aero.air_density * speed**2 * coefficients or 1.0
 
     def give_up(self, state: MPMState, cause: str, remedy: str | None = None) -> NoReturn:
         """Raise SimulationDiverged, naming the particle with the largest deformation."""
@@ -314,7 +394,7 @@ class Stepping(nn.Module):
 
         Args:
             state: The state at its start.
-            parts: From :func:`~gaussian_swaying.simulation.launch.parts_of`; with it, what is known is not measured.
+            parts: From :func:`~gaussian_swaying.simulation.stepping.parts_of`; with it, what is known is not measured.
         """
         if self.outlook is not None and self.outlook.holds(state, parts):
             cells, rate, blowing = self.outlook.needs
@@ -339,3 +419,139 @@ class Stepping(nn.Module):
         return self.solver.watched_rollout(
             state, self.frame_dt / steps, steps, self.forces, CFL_SAMPLES, watch, check=False
         )
+
+
+class Launched:
+    """A frame whose work is passed to the device; the host waits for it in :meth:`finish`, once.
+
+    Args:
+        simulation: The simulation.
+        before: The state at the start of the frame.
+    """
+
+    def __init__(self, simulation: Stepping, before: MPMState) -> None:
+        self._simulation, self._before = simulation, before
+        self._error: Exception | None = None
+        try:
+            with self._explained():
+                self._parts = parts_of(simulation)
+                self._steps = simulation.substeps(before, self._parts)
+                self._end, self._measurement = self._launch(0)
+        except Exception as error:  # `finish` raises it
+            self._error = error
+
+    def finish(self) -> tuple[MPMState, FrameDiagnostics]:
+        """Wait, and repeat the frame where its substep was too long or its grid too small.
+
+        Returns:
+            The state at the end of the frame, and its diagnostics.
+
+        Raises:
+            SimulationDiverged: If the simulation diverged in the frame.
+        """
+        if self._error is not None:
+            raise self._error
+        simulation, solver, margin = self._simulation, self._simulation.solver, 0
+        with simulation.turn, self._explained():
+            for retry in range(MAX_RETRIES + 1):
+                cfl, outrun = self._measurement.cfl, self._measurement.outran
+                too_long = solver.substep is None and not cfl <= max(CFL_LIMIT, 1.25 * solver.cfl)
+                if retry == MAX_RETRIES or not (outrun or too_long):
+                    break
+                if outrun:
+                    margin = 4 * max(margin, 4)
+                if too_long:
+                    growth = cfl / solver.cfl if math.isfinite(cfl) else 4.0
+                    self._steps = int(self._steps * min(growth * 1.1, 4.0)) + 1
+                self._end, self._measurement = self._launch(margin)
+        found = self._measurement.read(check=True)
+        if not cfl <= MAX_CFL:
+            cause = f"the Courant number of the frame is {cfl:.3g}, and above {MAX_CFL:g} no substep is stable"
+            simulation.give_up(self._end, cause)
+        if self._measurement.more:
+            simulation.outlook = Outlook(self._end, self._measurement.more, self._parts)
+        return self._end, found
+
+    def _launch(self, margin: int) -> tuple[MPMState, Measurement]:
+        simulation, before, steps = self._simulation, self._before, self._steps
+        if steps > simulation.most_substeps:
+            cause = f"a frame would take {steps:,} substeps, more than the limit of {simulation.most_substeps:,}"
+            simulation.give_up(before, cause, "weaken the wind or the boundary that drives the particle")
+        end, courant = simulation._roll(simulation.solver.fit_grid(before, simulation.frame_dt, margin), steps)
+        work = (end.work - before.work).sum()
+        return end, simulation.measured(end, steps, courant, work, before, self._parts)
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Turn errors of this package into SimulationDiverged.
+
+        They are: a fixed substep that became too long, a grid that grew beyond its limit, a position that is NaN.
+        """
+        try:
+            yield
+        except (FloatingPointError, ValueError) as error:
+            if not _raised_here(error):  # by a custom wind, force or boundary
+                raise
+            self._simulation.give_up(self._before, str(error).rstrip("."))
+
+
+class Outlook:
+    """What decides how many substeps the next frame takes, read with the measurements of this one.
+
+    Args:
+        state: The state at the end of the frame.
+        needs: The numbers of :func:`needs_of`.
+        parts: What :func:`parts_of` said when they were measured.
+    """
+
+    def __init__(self, state: MPMState, needs: list[float], parts: tuple[object, ...] | None) -> None:
+        self.needs, self._parts = needs, parts
+        self._read = [weakref.ref(tensor) for tensor in _read(state)]
+
+    def holds(self, state: MPMState, parts: tuple[object, ...] | None) -> bool:
+        """Whether the frame starts from this state, with nothing changed since; ``parts`` is what they are now."""
+        same = all(known() is tensor for known, tensor in zip(self._read, _read(state), strict=False))
+        return same and self._parts is not None and self._parts == parts
+
+
+def _read(state: MPMState) -> list[Tensor]:
+    """What the needs depend on in a state."""
+    found = (state.F_elastic, state.internal, state.velocity, state.time)
+    return [tensor for tensor in found if tensor is not None]
+
+
+def parts_of(simulation: Stepping) -> tuple[object, ...] | None:
+    """What the needs depend on besides the state; None if that cannot be told, or if it is on another device."""
+    wind = simulation.wind_force
+    tensors = tensors_in([wind])
+    if any(tensor.is_inference() or tensor.device != simulation.device for tensor in tensors):
+        return None
+    made = {id(tensor) for tensor in wind.refreshed()}  # from the state, in every frame
+    versions = tuple(tensor._version for tensor in tensors if id(tensor) not in made)
+    return (simulation.solver.bound, fingerprint([wind]), versions)
+
+
+def needs_of(simulation: Stepping, state: MPMState, winds: Tensor | None) -> Tensor:
+    """Cells that the fastest wave crosses per second; rate of the drag [1/s] and speed of the wind [m/s]; float64.
+
+    Args:
+        simulation: The simulation.
+        state: The state at the start of a frame.
+        winds: Air velocities during the frame [m/s], shape (K, ...), from ``WindForce.samples``; None if the wind has
+            no effect.
+    """
+    cells = simulation.solver.cells_per_second(state).double()
+    if winds is None:
+        return torch.stack([cells, *cells.new_zeros(2)])
+    wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
+    speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
+    fastest = simulation.aero.rate(speed, simulation.wind_force.area, simulation.solver.points.mass).amax()
+    return torch.stack([cells, fastest.double(), wind.double()])
+
+
+def _raised_here(error: BaseException) -> bool:
+    """Whether an error was raised by this package, and not by code that it called."""
+    place = error.__traceback__
+    while place is not None and place.tb_next is not None:
+        place = place.tb_next
+    return place is not None and str(place.tb_frame.f_globals.get("__name__")).startswith("gaussian_swaying.")

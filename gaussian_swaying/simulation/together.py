@@ -26,11 +26,10 @@ from gaussian_swaying.simulation.diagnostics import (
     SimulationDiverged,
     measure_scenes,
 )
-from gaussian_swaying.simulation.launch import needs_of
 from gaussian_swaying.simulation.parameters import with_values
 from gaussian_swaying.simulation.run import Run, splat_checksum
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.stepping import MAX_GROWTH, MAX_SUBSTEPS
+from gaussian_swaying.simulation.stepping import MAX_GROWTH, MAX_SUBSTEPS, needs_of
 
 M = TypeVar("M", bound=nn.Module)
 

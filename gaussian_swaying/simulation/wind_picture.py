@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,9 +13,7 @@ from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.colormap import colormap
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.rendering.protocol import RenderOutput
-
-if TYPE_CHECKING:
-    from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.stepping import Stepping
 
 ACROSS = 26
 """Streaks along the longer side of the picture."""
@@ -25,7 +22,7 @@ STEPS = 12
 """Straight pieces of a streak."""
 
 
-def streaks(simulation: Simulation, state: MPMState, camera: Camera) -> tuple[Tensor, Tensor]:
+def streaks(simulation: Stepping, state: MPMState, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pieces of the lines along which the air flows at one moment, near a plane through the object.
 
     The plane holds the direction of the flow, and is upright or level, whichever the camera sees better. They start at
@@ -93,13 +90,13 @@ def _plane(flow: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
-def speed_scale(simulation: Simulation) -> float:
+def speed_scale(simulation: Stepping) -> float:
     """End of the colour scale of streaks [m/s]: 1.5 times the mean flow; 0 in still air."""
     return 1.5 * float(torch.linalg.vector_norm(simulation.flows(), dim=-1).amax())
 
 
 def draw_wind(
-    simulation: Simulation, state: MPMState, camera: Camera, picture: RenderOutput, largest: float | None = None
+    simulation: Stepping, state: MPMState, camera: Camera, picture: RenderOutput, largest: float | None = None
 ) -> Tensor:
     """The picture of the object, paler, with streaks of air over it, from violet in still air to yellow.
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +16,9 @@ from gaussian_swaying.viewer.gusts import Gusts
 from gaussian_swaying.viewer.holding import Holding
 from gaussian_swaying.viewer.legends import legend
 from gaussian_swaying.viewer.materials import in_pascal, like
+from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.pictures import SHOWN
-
-if TYPE_CHECKING:
-    from gaussian_swaying.viewer.page import Page
+from gaussian_swaying.viewer.screen import Screen
 
 MOST_SPEED = 30.0  # m/s
 ARROW = 0.06  # length of the arrow of a wind of 1 m/s, in longest sides
@@ -28,16 +26,16 @@ LEAST_LOG, MOST_LOG = 2, 8  # of the stiffness [Pa] on the slider
 GRIDS = {"coarse": 1.5, "normal": 1.0, "fine": 0.7}
 
 
-class Controls:
+class Controls(Panel):
     """Builds the panel and the handles in the scene.
 
     Args:
         page: The page.
     """
 
-    def __init__(self, page: Page) -> None:
-        self.page, self.session, self.server = page, page.session, page.server
-        self.force_end = page.session.simulation.force_scale()
+    def __init__(self, page: Screen) -> None:
+        super().__init__(page)
+        page.force_end = page.session.simulation.force_scale()
         self._drawn_for: Any = None  # the simulation whose handles are drawn
         self._shader: dict[str, Any] | None = None  # the last one, while shading is off
         self._settings: Any = None  # those that the panel shows
@@ -56,7 +54,7 @@ class Controls:
         with gui.add_folder("Picture", expand_by_default=False):
             self._picture()
         with gui.add_folder("Files"):
-            self.files = Files(self)
+            self.files = Files(self, self.other_scene)
         self.show_values()
 
     # ---- groups of controls
@@ -200,7 +198,7 @@ class Controls:
         """Another scene is there: what belongs to the old one goes, and the controls show its values."""
         self.holding.forget_box()
         self._dx = float(self.session.settings.solver.dx)
-        self.force_end = self.session.simulation.force_scale()
+        self.page.force_end = self.session.simulation.force_scale()
         self.show_values()
         self.page.look_from_start()
 
@@ -208,22 +206,12 @@ class Controls:
         simulation = self.session.simulation
         parts = []
         if self.shown.value == "wind force":
-            parts.append(legend("Force of the wind", "Pa", self.force_end))
+            parts.append(legend("Force of the wind", "Pa", self.page.force_end))
         if self.streaks.value:
             parts.append(legend("Speed of the air", "m/s", speed_scale(simulation)))
         self.legends.content, self.legends.visible = "".join(parts), bool(parts)
 
     # ---- what they do
-
-    def on(self, subscribe: Callable[[Any], Any], what: Callable[..., None], tell_event: bool = False) -> None:
-        """Do something in its turn when a browser uses a control; not when the program sets its value."""
-        key = object()
-
-        async def asked(event: Any) -> None:  # awaited, and not in one of viser's threads, so that the order stays
-            if event.client is not None:
-                self.page.turns.ask(key, partial(what, event) if tell_event else what)
-
-        subscribe(asked)
 
     def _set(self, name: str, value: Any) -> None:
         self.session.change({name: value})

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.viewer.film_strip import FilmStrip
+from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.scenes import settings_of_splat
 
 if TYPE_CHECKING:
     import viser
     from jsonargparse import Namespace
 
-    from gaussian_swaying.viewer.controls import Controls
 
 Folder = tempfile.TemporaryDirectory[str]
 RECORD = "Record a video (simulated time)"
@@ -29,10 +29,11 @@ class Files:
 
     Args:
         controls: The panel; a folder of it is open.
+        loaded: Called when another scene is there.
     """
 
-    def __init__(self, controls: Controls) -> None:
-        self._controls, self.page, self.session = controls, controls.page, controls.session
+    def __init__(self, controls: Panel, loaded: Callable[[], None]) -> None:
+        self._loaded, self.page, self.session = loaded, controls.page, controls.session
         self._upload: Folder | None = None  # where the splat lies that was loaded
         gui, elsewhere = controls.server.gui, self.page.door.token is not None
         self.record = gui.add_button(
@@ -128,4 +129,4 @@ class Files:
         """Another scene is there; called in the thread of the session."""
         if str(self.session.settings.scene.ply).startswith(folder.name):
             self._upload = folder  # and the one before goes
-        self.page.turns.ask("loaded", self._controls.other_scene)
+        self.page.turns.ask("loaded", self._loaded)

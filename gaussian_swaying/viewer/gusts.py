@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from gaussian_swaying.viewer.controls import Controls
+from gaussian_swaying.viewer.panel import Panel
 
 KINDS = {"Sway": "SineSway", "Gusts": "UniformGust", "Noise": "GaussianGust"}
 FIELDS: dict[str, tuple[str, float, float, float]] = {  # label, least, most, step
@@ -27,7 +26,7 @@ class Gusts:
         controls: The panel; the folder of the wind is open.
     """
 
-    def __init__(self, controls: Controls) -> None:
+    def __init__(self, controls: Panel) -> None:
         self._controls, self.session = controls, controls.session
         self.gui = controls.server.gui
         self.folder = self.gui.add_folder("Sway and gusts", expand_by_default=False)

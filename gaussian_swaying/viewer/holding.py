@@ -9,12 +9,11 @@ import torch
 import yaml
 
 from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.viewer.panel import Panel
 from gaussian_swaying.viewer.pictures import under_cursor
 
 if TYPE_CHECKING:
     import viser
-
-    from gaussian_swaying.viewer.controls import Controls
 
 
 class Holding:
@@ -24,7 +23,7 @@ class Holding:
         controls: The panel; a folder of it is open.
     """
 
-    def __init__(self, controls: Controls) -> None:
+    def __init__(self, controls: Panel) -> None:
         self._controls, self.page = controls, controls.page
         self.session, self.server = controls.session, controls.server
         self._pin: Any = None

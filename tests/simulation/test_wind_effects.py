@@ -11,8 +11,8 @@ from gaussian_swaying.aero.obstacles import SphereObstacle
 from gaussian_swaying.aero.shelter import Shelter
 from gaussian_swaying.aero.wind import WindField
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.simulation.launch import parts_of
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.stepping import parts_of
 
 
 def _wind():
