@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying._checks import check_plain, check_positive, check_vector
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.regions import Region, whereabouts
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
@@ -54,6 +54,7 @@ class Edit:
         check_positive("edits.time", self.time, allow_zero=True)
         for name in ("E", "nu", "density"):
             if getattr(self, name) is not None:
+                check_plain(f"edits.{name}", getattr(self, name))
                 parameter(f"material.{name}").check(getattr(self, name), f"edits.{name}")
         if self.color is not None and not all(0 <= part <= 1 for part in check_vector("edits.color", self.color)):
             raise ValueError(f"Expected `edits.color` to lie in [0, 1], but got {self.color}.")

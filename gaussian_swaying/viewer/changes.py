@@ -11,7 +11,7 @@ import yaml
 
 from gaussian_swaying.mpm.formulations.total import Total
 from gaussian_swaying.mpm.state import MPMState
-from gaussian_swaying.simulation.parameters import POLAR, find, in_settings, of_settings
+from gaussian_swaying.simulation.parameters import POLAR, find, in_settings, of_settings, parameter
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -87,6 +87,8 @@ def take(
         return None
     if any(name.startswith("material.") for name in numbers) and (settings.material.regions or settings.edits):
         return None  # each part has its own
+    if not all(parameter(name).same_points for name in numbers):
+        return None
     if settings.wind.schedule is not None or heads & {"wind", "aero"}:  # as a whole
         heads |= {name.split(".")[0] for name in numbers} & {"wind", "aero"}
         numbers = [name for name in numbers if name.split(".")[0] not in heads]

@@ -9,7 +9,7 @@ pytest.importorskip("viser", reason="needs the extra [viewer]")
 from viser._messages import FileTransferPart, FileTransferStartUpload
 
 from gaussian_swaying.viewer import incoming as incoming_module
-from gaussian_swaying.viewer import page as page_module
+from gaussian_swaying.viewer import screen
 from gaussian_swaying.viewer.incoming import TOO_LARGE, Incoming, what_is_wrong
 from gaussian_swaying.viewer.pictures import draw
 
@@ -122,7 +122,7 @@ def test_cameras_that_cannot_be_are_dropped(page, client, until):
 
 def test_no_camera_makes_a_picture_larger_than_the_limit(page, connect, until, monkeypatch):
     sizes = []
-    monkeypatch.setattr(page_module, "draw", lambda *args: sizes.append((args[1].width, args[1].height)) or draw(*args))
+    monkeypatch.setattr(screen, "draw", lambda *args: sizes.append((args[1].width, args[1].height)) or draw(*args))
     client = connect(page, 1, 2_000_000)
     until(lambda: sizes)
     client.look(image_width=2_000_000, image_height=1)

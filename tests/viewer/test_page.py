@@ -15,7 +15,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.session import Session
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
-from gaussian_swaying.viewer import page as page_module
+from gaussian_swaying.viewer import screen
 from gaussian_swaying.viewer.page import Page
 from gaussian_swaying.viewer.pictures import camera_of, draw
 
@@ -103,7 +103,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
 def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, monkeypatch):
     """What a picture with them looks like is tested in test_pictures.py."""
     drawn = []
-    monkeypatch.setattr(page_module, "draw", lambda *args: drawn.append(args[4]) or draw(*args))
+    monkeypatch.setattr(screen, "draw", lambda *args: drawn.append(args[4]) or draw(*args))
     window.get_by_text("Picture", exact=True).click()
     box = window.get_by_text("Streaks of air").locator("xpath=ancestor::*[.//input][1]").locator("input").last
     for wanted in (True, False):

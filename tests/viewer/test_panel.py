@@ -167,7 +167,7 @@ def test_a_configuration_is_loaded(page, client, until):
     _upload(client, files.load_settings, yaml.safe_dump(given).encode())
     until(lambda: session.simulation is not before)
     until(lambda: page.controls.wind_speed.value == 2.5 and not files.load_settings.disabled)
-    assert page.controls.stiffness.value == 1.5e4
+    until(lambda: page.controls.stiffness.value == 1.5e4)
     assert session.changes == 0
     assert not page._bar.visible
     assert files.load_settings.value.content == b""  # it is not kept
