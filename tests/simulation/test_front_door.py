@@ -21,11 +21,9 @@ from gaussian_swaying import (
     GaussianCloud,
     Material,
     MPMSolver,
-    Normalisation,
     PinnedPoints,
     PinnedRegion,
     Recorder,
-    Sand,
     Scene,
     Simulation,
     SineSway,
@@ -35,7 +33,9 @@ from gaussian_swaying import (
     write_ply,
 )
 from gaussian_swaying.config.parser import PYTHON_ONLY, arguments_of
+from gaussian_swaying.mpm.laws.sand import Sand
 from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.simulation.normalisation import Normalisation
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "python.md").read_text()

@@ -3,18 +3,8 @@
 import pytest
 import torch
 
-from gaussian_swaying import (
-    AeroForce,
-    Box,
-    Edit,
-    FlowKey,
-    Material,
-    MPMSolver,
-    PinnedRegion,
-    Simulation,
-    SineSway,
-    WindField,
-)
+from gaussian_swaying import AeroForce, Box, Edit, Material, MPMSolver, PinnedRegion, Simulation, SineSway, WindField
+from gaussian_swaying.aero.wind import FlowKey
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.simulation.material import MaterialRegion
 

@@ -1,0 +1,51 @@
+"""The public names of the package; everything else is imported from its room."""
+
+from .aero.force import AeroForce as AeroForce
+from .aero.force import aero_force as aero_force
+from .aero.wind import GaussianGust as GaussianGust
+from .aero.wind import SineSway as SineSway
+from .aero.wind import SpatialWind as SpatialWind
+from .aero.wind import UniformGust as UniformGust
+from .aero.wind import WindField as WindField
+from .aero.wind_force import WindForce as WindForce
+from .captures.capture import read_capture as read_capture
+from .evaluation.compare import compare_run as compare_run
+from .fitting.fit import fit as fit
+from .gaussians.cloud import GaussianCloud as GaussianCloud
+from .gaussians.compact import read_gaussians as read_gaussians
+from .gaussians.export import export_cloud as export_cloud
+from .gaussians.model import GaussianSurfaceModel as GaussianSurfaceModel
+from .gaussians.ply import write_ply as write_ply
+from .geometry.frame import SimFrame as SimFrame
+from .geometry.regions import Box as Box
+from .geometry.regions import Cylinder as Cylinder
+from .geometry.regions import Sphere as Sphere
+from .metrics.chamfer import chamfer_distance as chamfer_distance
+from .metrics.frechet_video import frechet_distance as frechet_distance
+from .mpm.boundaries.boundary import Boundary as Boundary
+from .mpm.boundaries.pinned_points import PinnedPoints as PinnedPoints
+from .mpm.boundaries.pinned_region import PinnedRegion as PinnedRegion
+from .mpm.contact.surface import Contact as Contact
+from .mpm.forces import Force as Force
+from .mpm.laws.law import ConstitutiveLaw as ConstitutiveLaw
+from .mpm.solver import MPMSolver as MPMSolver
+from .mpm.state import MaterialPoints as MaterialPoints
+from .mpm.state import MPMState as MPMState
+from .mpm.state import support_force as support_force
+from .recording.recorder import Recorder as Recorder
+from .recording.trajectory import load_trajectory as load_trajectory
+from .rendering.cameras.camera_path import LookAtCamera as LookAtCamera
+from .rendering.cameras.camera_path import OrbitCamera as OrbitCamera
+from .rendering.shading import DiffuseShader as DiffuseShader
+from .rendering.shading import PhongShader as PhongShader
+from .simulation.diagnostics import SimulationDiverged as SimulationDiverged
+from .simulation.edits import Edit as Edit
+from .simulation.frame import Frame as Frame
+from .simulation.parameters import register as register
+from .simulation.scene import Material as Material
+from .simulation.scene import Scene as Scene
+from .simulation.simulation import Simulation as Simulation
+from .training.data.datamodule import CaptureDataModule as CaptureDataModule
+from .training.module import SplatTrainer as SplatTrainer
+
+__version__: str
