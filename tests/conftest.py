@@ -19,14 +19,17 @@ if not torch.cuda.is_available():
 
 
 def pytest_collection_modifyitems(config, items):
-    """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` tests to `-m slow`."""
+    """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` ones to the nightly run.
+
+    What is slow in the interpreter is quick on a GPU: `gpu` tests run there whether they are `slow` or not.
+    """
     require_gpu = os.environ.get("GS_REQUIRE_GPU") == "1"
     marks = config.getoption("-m") or ""
     for item in items:
         if "gpu" in item.keywords and not torch.cuda.is_available() and not require_gpu:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
-        if "slow" in item.keywords and "slow" not in marks:
-            item.add_marker(pytest.mark.skip(reason="slow: run with -m slow"))
+        if "slow" in item.keywords and "gpu" not in item.keywords and "slow" not in marks:
+            item.add_marker(pytest.mark.skip(reason="slow: run with -m slow, as .ci/nightly does"))
 
 
 @pytest.fixture(scope="session")

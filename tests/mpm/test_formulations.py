@@ -223,7 +223,7 @@ def test_total_keeps_a_soft_flag_whole(dx, density):
     assert _whole(dx, density, 25, "cpu")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_total_keeps_a_soft_flag_whole")
 @pytest.mark.parametrize("dx", [0.08, 0.04, 0.02, 0.01])
 @pytest.mark.parametrize("density", [20.0, 50.0])
 def test_total_keeps_a_soft_flag_whole_for_ten_seconds(dx, density):

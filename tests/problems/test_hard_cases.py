@@ -905,7 +905,7 @@ def _minutes(series, blocks=12):
     return means.mean(-1), means.std(-1) / math.sqrt(blocks)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_gusts_that_turn_round_every_frame")
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_ten_minutes_of_a_gusty_flag(damping):
@@ -927,7 +927,7 @@ def test_ten_minutes_of_a_gusty_flag(damping):
     assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_gusts_that_turn_round_every_frame")
 @pytest.mark.timeout(3600)
 def test_ten_minutes_do_not_heat_a_damped_flag():
     """The mean mechanical energy of the tenth minute is that of the second, within 4 standard errors.

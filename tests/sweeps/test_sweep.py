@@ -151,7 +151,7 @@ def test_killed_workers_change_nothing(undisturbed, tmp_path, sweep_file):
         _same_motion(undisturbed, tmp_path / "out", f"{number:05d}")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_killed_workers_change_nothing")
 @pytest.mark.timeout(1800)
 def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
     file = sweep_file(tmp_path / "tiny.yaml", draws=10)

@@ -161,7 +161,7 @@ def _train(folder, capture, *more):
     return subprocess.run(command, capture_output=True, text=True, timeout=800, cwd=folder.parent)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_gradients_are_averaged")
 @pytest.mark.timeout(1800)
 def test_two_processes_make_one_splat(tmp_path):
     """The quick training on one and two processes: as many images, half the steps, about the same picture."""

@@ -112,7 +112,7 @@ def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, mon
     assert window.problems == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_film_is_as_long_as_the_simulated_time")
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
@@ -131,7 +131,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_film_ends_at_its_greatest_length")
 def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.5)
     with window.expect_download(timeout=240_000):
@@ -141,7 +141,7 @@ def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkey
     assert page.recording is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_many_clients_at_once_are_served_in_turn")
 def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
@@ -155,7 +155,7 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     assert page.session.problem is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_splat_that_is_loaded_tells_how_far_it_is")
 def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     path = tmp_path / "../flag.ply"
     write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
@@ -221,7 +221,7 @@ def test_a_client_that_reads_slowly_slows_nobody(page, connect, until):
     until(lambda: page.session.snapshot.number > number + 2)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_client_that_reads_slowly_slows_nobody")
 @pytest.mark.timeout(900)
 def test_memory_does_not_grow_in_ten_minutes(page, connect):
     """Measured after a minute, when everything has been used once."""

@@ -96,7 +96,7 @@ def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march):
     assert max(heights[lowest:]) > heights[lowest] + 0.15  # and back up
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_ball_dropped_on_a_sheet_dents_it_and_bounces")
 def test_a_ball_dropped_on_a_damped_sheet_comes_to_rest(march):
     """Motion decays at 4 per second. After 0.72 s energy no longer grows, and the ball stays where it lies."""
     solver, state, triangles = _drop(gravity=(0, 0, -9.8), damping=8.0)

@@ -133,7 +133,7 @@ def test_a_pile_at_rest_stays_at_rest(sheet, scene, march):
     assert moved < 0.01 * THICKNESS
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_pile_at_rest_stays_at_rest")
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize(("dtype", "seconds"), [(torch.float64, 11.5), (torch.float32, 60.0)])
 def test_a_pile_rests_for_long(sheet, scene, march, dtype, seconds):
