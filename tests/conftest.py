@@ -10,6 +10,7 @@ sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools"
 os.environ["GAUSSIAN_SWAYING_CHECKS"] = "1"
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, and for the same reason
 
+import nightly
 import pytest
 import torch
 from quick_interpreter import quicken
@@ -28,7 +29,7 @@ def pytest_collection_modifyitems(config, items):
     for item in items:
         if "gpu" in item.keywords and not torch.cuda.is_available() and not require_gpu:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
-        if "slow" in item.keywords and "gpu" not in item.keywords and "slow" not in marks:
+        if nightly.is_left(item) and "gpu" not in item.keywords and "slow" not in marks:
             item.add_marker(pytest.mark.skip(reason="slow: run with -m slow, as .ci/nightly does"))
 
 
