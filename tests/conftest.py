@@ -86,3 +86,7 @@ def dtype(request):
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+# now that the environment is set
+from small_scenes import flag_ply, make_cloud, make_scene, make_simulation  # noqa: E402, F401

@@ -176,6 +176,7 @@ def test_a_killed_driver_loses_only_what_was_running(undisturbed, tmp_path, swee
     assert (folder / "sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
 
 
+@pytest.mark.slow(gate=["15-143"])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, number, code):
     """Ctrl-C reaches the workers too, SIGTERM only the driver."""
