@@ -43,6 +43,7 @@ def test_every_scene_has_its_preset():
     assert {path.stem for path in (CONFIGS / "preview").glob("*.yaml")} == {*PAPER, *SHAPED, *TOUCHING}
 
 
+@pytest.mark.slow(gate=["flag_behind_pole"])
 @pytest.mark.parametrize("name", SHAPED)
 def test_the_presets_of_winds_with_a_shape_move(name):
     """They are held, and the wind differs from place to place."""
