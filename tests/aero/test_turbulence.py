@@ -2,6 +2,8 @@
 
 A box holds the waves between its sides and its cells, and leaves the others out. So each number has two targets: the
 closed form of endless turbulence, where what is left out does not matter, and the sum over the waves of the box.
+
+Covers: aero.carried, aero.lookup, aero.spectra, aero.turbulence_box.
 """
 
 import math

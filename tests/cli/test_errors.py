@@ -1,4 +1,7 @@
-"""One place turns errors into a sentence and an exit code, and no stream stops a command."""
+"""One place turns errors into a sentence and an exit code, and no stream stops a command.
+
+Covers: cli.streams, cli.suggestions.
+"""
 
 import errno
 import io

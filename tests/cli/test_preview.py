@@ -1,4 +1,7 @@
-"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input."""
+"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input.
+
+Covers: preview.results.
+"""
 
 import dataclasses
 import json

@@ -1,4 +1,7 @@
-"""The command line: what it accepts, and the one sentence it answers bad input with."""
+"""The command line: what it accepts, and the one sentence it answers bad input with.
+
+Covers: config.common_help, config.parser.
+"""
 
 import json
 import os

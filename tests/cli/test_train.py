@@ -1,4 +1,7 @@
-"""tools/train.py: the shipped configurations, a whole run on a CPU, and bad input."""
+"""tools/train.py: the shipped configurations, a whole run on a CPU, and bad input.
+
+Covers: training.quiet, training.random_stream.
+"""
 
 import csv
 import json

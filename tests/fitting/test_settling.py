@@ -1,4 +1,7 @@
-"""A fit says whether its values have settled."""
+"""A fit says whether its values have settled.
+
+Covers: fitting.report.
+"""
 
 import json
 from itertools import groupby

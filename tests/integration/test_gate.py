@@ -1,9 +1,14 @@
-"""What the gate leaves to the nightly run has a small twin in the gate."""
+"""Every module has its tests, and what the gate leaves to the nightly run has a small twin in the gate."""
 
+import ast
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from nightly import without_a_twin
+
+TESTS = Path(__file__).parents[1]
+PACKAGE = TESTS.parent / "gaussian_swaying"
 
 
 def test_what_is_slow_has_a_twin_in_the_gate(request):
@@ -34,3 +39,22 @@ def test_a_twin_runs_in_the_gate(given, alone):
         return SimpleNamespace(originalname=name, get_closest_marker=marks.get, **more)
 
     assert without_a_twin([item(*each) for each in given]) == alone
+
+
+def test_every_module_has_a_test_file_of_its_name_or_is_named_in_the_one_that_covers_it():
+    """`tests/mpm/test_guard.py` is that of `mpm/guard.py`; others are in a line `Covers: mpm.body` of one."""
+    named = [name for path in TESTS.rglob("test_*.py") for name in _covered(path)]
+    modules = {path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py")}
+    modules = {".".join(path.parts): path for path in modules if path.name != "__init__"}
+    own = [
+        name for name, path in modules.items() if (TESTS / path.parent / f"test_{path.name.lstrip('_')}.py").exists()
+    ]
+    assert len(own) > 100
+    assert sorted(set(modules) - {*own, *named}) == []
+    assert sorted(set(named) - set(modules)) == []  # moved or gone
+
+
+def _covered(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    _, _, names = docstring.partition("\nCovers: ")
+    return names.partition("\n\n")[0].rstrip(".").replace("\n", " ").replace(",", " ").split()

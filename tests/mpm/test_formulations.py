@@ -1,4 +1,7 @@
-"""The two formulations against each other, with every law, and what each of them does not support."""
+"""The two formulations against each other, with every law, and what each of them does not support.
+
+Covers: mpm.body, mpm.dispatch, mpm.formulations.formulation, mpm.formulations.total, mpm.formulations.updated.
+"""
 
 import pytest
 import torch

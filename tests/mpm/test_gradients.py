@@ -1,4 +1,7 @@
-"""Gradients through whole substeps: every input against finite differences, and the memory of long rollouts."""
+"""Gradients through whole substeps: every input against finite differences, and the memory of long rollouts.
+
+Covers: mpm.recompute.
+"""
 
 import math
 import weakref

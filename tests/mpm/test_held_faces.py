@@ -1,4 +1,7 @@
-"""Clamps hold the face of a region: where it is, which bodies are sheets, and what a clamped solid does."""
+"""Clamps hold the face of a region: where it is, which bodies are sheets, and what a clamped solid does.
+
+Covers: mpm.held_rows.
+"""
 
 import math
 

@@ -1,4 +1,7 @@
-"""Whole steps of both formulations against exact solutions."""
+"""Whole steps of both formulations against exact solutions.
+
+Covers: mpm.state.
+"""
 
 import dataclasses
 

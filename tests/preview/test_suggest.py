@@ -1,4 +1,7 @@
-"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known."""
+"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known.
+
+Covers: preview.shape, preview.starter.
+"""
 
 import dataclasses
 import itertools

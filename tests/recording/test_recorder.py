@@ -1,4 +1,7 @@
-"""What a run leaves on disk, and what it leaves when something breaks."""
+"""What a run leaves on disk, and what it leaves when something breaks.
+
+Covers: _provenance, recording.trajectory, simulation.meters.
+"""
 
 import csv
 import gc

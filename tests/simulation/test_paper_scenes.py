@@ -1,4 +1,7 @@
-"""The configurations of the paper's scenes: its numbers, their presets, and runs of a few frames."""
+"""The configurations of the paper's scenes: its numbers, their presets, and runs of a few frames.
+
+Covers: .
+"""
 
 import math
 from pathlib import Path

@@ -1,4 +1,7 @@
-"""A sweep in parts, as in a SLURM array, and what decides how many jobs share a GPU."""
+"""A sweep in parts, as in a SLURM array, and what decides how many jobs share a GPU.
+
+Covers: sweeps.backend, sweeps.pool.
+"""
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor

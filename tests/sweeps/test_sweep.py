@@ -1,4 +1,7 @@
-"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing."""
+"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing.
+
+Covers: sweeps.contact_sheet, sweeps.job, sweeps.worker.
+"""
 
 import csv
 import errno

@@ -1,4 +1,7 @@
-"""Training on several devices: the images are shared, the gradients averaged, and there is one splat."""
+"""Training on several devices: the images are shared, the gradients averaged, and there is one splat.
+
+Covers: training.data.order, training.strategy.
+"""
 
 import csv
 import os

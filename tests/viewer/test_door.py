@@ -1,4 +1,7 @@
-"""Who may open the live page."""
+"""Who may open the live page.
+
+Covers: .
+"""
 
 import contextlib
 import socket

@@ -1,4 +1,7 @@
-"""The live page, in a real browser where there is one."""
+"""The live page, in a real browser where there is one.
+
+Covers: viewer.holding.
+"""
 
 import threading
 import time

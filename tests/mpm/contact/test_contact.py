@@ -1,4 +1,7 @@
-"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
+"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest.
+
+Covers: mpm.contact.stage, mpm.contact.surface.
+"""
 
 from dataclasses import replace
 from functools import partial
