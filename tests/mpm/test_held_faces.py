@@ -141,6 +141,7 @@ def test_the_frequency_of_a_slender_beam_is_eulers():
     assert dunkerley - 2 / 12 / 100 < ratio < dunkerley
 
 
+@pytest.mark.slow(gate=["2.0-0.51-place0-0.0"])
 @pytest.mark.parametrize(
     ("thick", "depth", "place", "angle"),
     [

@@ -124,6 +124,19 @@ def test_the_documented_boundaries_are_those_that_there_are():
     assert set(re.findall("`([A-Z][A-Za-z]+)`", row)) == set(boundaries.BOUNDARIES)
 
 
+@pytest.mark.slow(
+    gate=[
+        "handle-updated",
+        "slip-total",
+        "friction-updated",
+        "velocity-total",
+        "box-sticky-total",
+        "box-separate-total",
+        "sticky-total",
+        "pin-updated",
+        "box-slip-total",
+    ]
+)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize(
     "make",
