@@ -165,6 +165,7 @@ def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
     assert (tmp_path / "out/sweep.csv").read_bytes() == (tmp_path / "whole/sweep.csv").read_bytes()
 
 
+@pytest.mark.slow(twin="test_a_stopped_sweep_ends_in_order")
 def test_a_killed_driver_loses_only_what_was_running(undisturbed, tmp_path, sweep_file, capsys):
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
     driver = _start(file, folder, "--device", "cpu")

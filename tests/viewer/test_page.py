@@ -87,6 +87,7 @@ def test_the_page_moves_pauses_and_steps(page, window, until):
     assert window.problems == []
 
 
+@pytest.mark.slow(twin="test_a_value_out_of_range_gets_a_sentence")
 def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     session = page.session
     before = session.simulation.wind.flows.clone()
@@ -103,6 +104,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
+@pytest.mark.slow(twin="test_streaks_of_air_are_those_of_the_render")
 def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, monkeypatch):
     """What a picture with them looks like is tested in test_pictures.py."""
     drawn = []
@@ -174,6 +176,7 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 
+@pytest.mark.slow(twin="test_a_pull_moves_what_it_holds_and_lets_go")
 def test_a_click_takes_hold_of_the_flag(page, window, until):
     """Where it is clicked; the handle appears there, and lets go."""
     session, holding = page.session, page.controls.holding
