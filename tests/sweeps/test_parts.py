@@ -6,6 +6,8 @@ Covers: sweeps.backend, sweeps.pool.
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 
+import pytest
+
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps.backend import Outcome, drive
 from gaussian_swaying.sweeps.job import Job
