@@ -10,6 +10,7 @@ sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1] / "tools"
 os.environ["GAUSSIAN_SWAYING_CHECKS"] = "1"
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")  # as tools/sim.py, and for the same reason
 
+import nightly
 import pytest
 import torch
 from quick_interpreter import quicken
@@ -18,18 +19,18 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # kernels run on the CPU; read when triton is imported
 
 
-from made_scenes import flag_ply, make_cloud, make_scene, make_simulation  # noqa: F401  (fixtures)
-
-
 def pytest_collection_modifyitems(config, items):
-    """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` tests to `-m slow`."""
+    """Skip `gpu` tests without CUDA, unless GS_REQUIRE_GPU=1 asks for them; leave `slow` ones to the nightly run.
+
+    What is slow in the interpreter is quick on a GPU: `gpu` tests run there whether they are `slow` or not.
+    """
     require_gpu = os.environ.get("GS_REQUIRE_GPU") == "1"
     marks = config.getoption("-m") or ""
     for item in items:
         if "gpu" in item.keywords and not torch.cuda.is_available() and not require_gpu:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
-        if "slow" in item.keywords and "slow" not in marks:
-            item.add_marker(pytest.mark.skip(reason="slow: run with -m slow"))
+        if nightly.is_left(item) and "gpu" not in item.keywords and "slow" not in marks:
+            item.add_marker(pytest.mark.skip(reason="slow: run with -m slow, as .ci/nightly does"))
 
 
 @pytest.fixture(scope="session")
@@ -85,3 +86,7 @@ def dtype(request):
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+# now that the environment is set
+from small_scenes import flag_ply, make_cloud, make_scene, make_simulation  # noqa: E402, F401

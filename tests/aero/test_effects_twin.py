@@ -1,4 +1,7 @@
-"""A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU."""
+"""A wind with effects in the kernels against the same wind in torch; in Triton's interpreter without a GPU.
+
+Covers: aero.effects, aero.effects_triton, aero.obstacles_triton, aero.wind_triton.
+"""
 
 import numpy as np
 import pytest

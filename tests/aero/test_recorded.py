@@ -1,4 +1,7 @@
-"""Winds from files: what is read, and that a file that does not fit is refused with a sentence."""
+"""Winds from files: what is read, and that a file that does not fit is refused with a sentence.
+
+Covers: aero.wind_files.
+"""
 
 import math
 import struct

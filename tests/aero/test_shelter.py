@@ -35,6 +35,7 @@ def _slab(depth, drag, direction, cells=32):
     return load, state, axes
 
 
+@pytest.mark.slow(gate=["direction0-0.2", "direction1-1.0", "direction2-3.0"])
 @pytest.mark.parametrize("depth", [0.2, 1.0, 3.0])
 @pytest.mark.parametrize("direction", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, -0.64, 0.48]])
 def test_a_slab_of_leaves_follows_the_exponential_law(depth, direction):

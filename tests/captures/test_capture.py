@@ -1,4 +1,7 @@
-"""Captures in every format, against the cameras and pictures that were written."""
+"""Captures in every format, against the cameras and pictures that were written.
+
+Covers: captures.colmap, captures.transforms.
+"""
 
 import json
 import math

@@ -1,4 +1,7 @@
-"""Where training starts: points of the capture, of files, of meshes, and at random."""
+"""Where training starts: points of the capture, of files, of meshes, and at random.
+
+Covers: captures.point_cloud.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,7 @@
-"""One place turns errors into a sentence and an exit code, and no stream stops a command."""
+"""One place turns errors into a sentence and an exit code, and no stream stops a command.
+
+Covers: cli.streams, cli.suggestions.
+"""
 
 import errno
 import io
@@ -143,12 +146,24 @@ def shell(line, tmp_path, **variables):
     return done.returncode, done.stderr, done.stdout
 
 
-def test_the_program_with_broken_streams(tmp_path):
-    assert shell("sim.py --help | head -1", tmp_path)[:2] == (0, "")
-    assert shell("sim.py --bad 2>/dev/full", tmp_path)[0] == 2
-    assert shell("sim.py --bad 2>&-", tmp_path)[0] == 2
-    code, said, _ = shell("sim.py --help >/dev/full", tmp_path)
-    assert (code, said) == (2, "error: Standard output could not be written (No space left on device).\n")
+FULL = "error: Standard output could not be written (No space left on device).\n"
+
+
+@pytest.mark.slow(gate=["help-head", "help-full"])
+@pytest.mark.parametrize(
+    ("line", "ended"),
+    [
+        pytest.param("sim.py --help | head -1", (0, ""), id="help-head"),
+        pytest.param("sim.py --help >/dev/full", (2, FULL), id="help-full"),
+        pytest.param("sim.py --bad 2>/dev/full", (2, ""), id="bad-full"),
+        pytest.param("sim.py --bad 2>&-", (2, ""), id="bad-closed"),
+    ],
+)
+def test_the_program_with_broken_streams(tmp_path, line, ended):
+    assert shell(line, tmp_path)[:2] == ended
+
+
+def test_the_program_on_a_stream_of_ascii(tmp_path):
     code, _, printed = shell("sim.py --help", tmp_path, PYTHONIOENCODING="ascii")
     assert code == 0
     assert "Density [kg/m3]" in printed

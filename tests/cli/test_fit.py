@@ -1,4 +1,7 @@
-"""``gaussian-swaying fit``: the one sentence it answers bad input with."""
+"""``gaussian-swaying fit``: the one sentence it answers bad input with.
+
+Covers: fitting.plan.
+"""
 
 import pytest
 import yaml

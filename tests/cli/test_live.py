@@ -1,4 +1,7 @@
-"""``gaussian-swaying live``: what it shows, and its life from the command line."""
+"""``gaussian-swaying live``: what it shows, and its life from the command line.
+
+Covers: viewer.scenes.
+"""
 
 import os
 import signal

@@ -1,4 +1,7 @@
-"""The installed program, and configurations by name."""
+"""The installed program, and configurations by name.
+
+Covers: _program, cli.continuing, cli.shipped.
+"""
 
 import sys
 

@@ -1,4 +1,7 @@
-"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input."""
+"""tools/preview.py: what it writes, that the configuration runs unchanged, and its answers to bad input.
+
+Covers: preview.results.
+"""
 
 import dataclasses
 import json
@@ -113,6 +116,7 @@ def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
         assert json.loads((run / "summary.json").read_text())["loose_gaussians"] == 4
 
 
+@pytest.mark.slow(twin="test_a_share_is_reached_in_few_runs")
 def test_more_sway_is_softer(tmp_path):
     """A post of a few large patches, held at its foot."""
     means = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.3, 0.2, 1.0])
@@ -163,25 +167,22 @@ def _spacing(folder):
     }
 
 
+@pytest.mark.slow(gate=["normal-0.042"])
 @pytest.mark.usefixtures("untried")
-def test_a_quality_chooses_the_grid_of_the_starter(dense, tmp_path, capsys):
-    spacings = {}
-    for quality in ("draft", "normal", "fine"):
-        out = tmp_path / quality
-        assert preview(dense, out, "--quality", quality, "--frames", "10") == 0
-        report = capsys.readouterr().out
-        data = json.loads((out / "preview.json").read_text())
-        assert data["suggestion"]["quality"] == quality
-        assert f"quality         {quality}: " in report
-        assert set(data["qualities"]) == {"draft", "normal", "fine"} - {quality}
-        for name, other in data["qualities"].items():
-            assert f"with dx = {other['dx_m']:g} m (--quality {name})" in report
-            finer = other["dx_m"] < data["cost"]["dx"]
-            assert (other["total_seconds"] > data["cost"]["total_seconds"]) == finer
-        assert "(--quality " + quality not in report
-        spacings[quality] = _spacing(out)
-    assert {one["draft"] for one in spacings.values()} == {spacings["draft"]["starter"]}
-    assert [one["starter"] for one in spacings.values()] == [0.062, 0.042, 0.021]
+@pytest.mark.parametrize(("quality", "dx"), [("draft", 0.062), ("normal", 0.042), ("fine", 0.021)])
+def test_a_quality_chooses_the_grid_of_the_starter(dense, tmp_path, capsys, quality, dx):
+    assert preview(dense, tmp_path, "--quality", quality, "--frames", "10") == 0
+    report = capsys.readouterr().out
+    data = json.loads((tmp_path / "preview.json").read_text())
+    assert data["suggestion"]["quality"] == quality
+    assert f"quality         {quality}: " in report
+    assert set(data["qualities"]) == {"draft", "normal", "fine"} - {quality}
+    for name, other in data["qualities"].items():
+        assert f"with dx = {other['dx_m']:g} m (--quality {name})" in report
+        finer = other["dx_m"] < data["cost"]["dx"]
+        assert (other["total_seconds"] > data["cost"]["total_seconds"]) == finer
+    assert "(--quality " + quality not in report
+    assert _spacing(tmp_path) == {"draft": 0.062, "starter": dx}
 
 
 @pytest.mark.usefixtures("untried")
@@ -340,20 +341,18 @@ def test_script_answers_help():
     assert "--up" in done.stdout
 
 
-def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path):
+@pytest.mark.usefixtures("untried")
+def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path, capsys):
     """Once, though the draft and the starter read the same file again; a run of the splat does not repeat it."""
     cloud = FlagScene(spacing=0.1).generate()
     write_ply(tmp_path / "flag.ply", dataclasses.replace(cloud, opacities=torch.full_like(cloud.opacities, 400.0)))
     content = (tmp_path / "flag.ply").read_bytes()
     (tmp_path / "flag.ply").write_bytes(content.replace(struct.pack("<f", 400.0), struct.pack("<f", math.inf)))
-    command = [sys.executable, str(ROOT / "tools/preview.py"), "flag.ply", "--output", "out", "--device", "cpu"]
-    done = subprocess.run([*command, "--height", "96", "--frames", "2"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0
+    assert preview(tmp_path / "flag.ply", tmp_path / "out", "--frames", "2") == 0
     note = f"note: the opacity of {len(cloud)} is exactly 0 or 1, an infinite logit, which is read as ±16\n"
-    assert done.stdout.count(note) == 1
-    assert "opacity" not in done.stderr
-    command = [sys.executable, str(ROOT / "tools/sim.py"), "--config", "out/draft.yaml", "--frames", "1"]
-    small = ["--camera.init_args.width=16", "--camera.init_args.height=9", "--device=cpu", "--output=run"]
-    done = subprocess.run([*command, *small], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0
-    assert "infinite" not in done.stdout + done.stderr
+    told, said = capsys.readouterr()
+    assert told.count(note) == 1
+    assert "opacity" not in said
+    small = ["--camera.init_args.width=16", "--camera.init_args.height=9", "--device=cpu", "--frames=1"]
+    assert simulate(["--config", str(tmp_path / "out/draft.yaml"), *small, f"--output={tmp_path / 'run'}"]) == 0
+    assert "infinite logit" not in "".join(capsys.readouterr())

@@ -1,4 +1,7 @@
-"""The command line: what it accepts, and the one sentence it answers bad input with."""
+"""The command line: what it accepts, and the one sentence it answers bad input with.
+
+Covers: config.common_help, config.parser.
+"""
 
 import json
 import os
@@ -202,6 +205,14 @@ def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
         assert parts.cameras or parts.edits or parts.recorder.renders[1:] or parts.recorder.ply_every
 
 
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
+def test_every_shipped_configuration_is_read(config):
+    settings = Simulation.parser().parse_args(["--config", str(config)])
+    assert settings.solver.boundaries
+    assert settings.recorder.video
+
+
+@pytest.mark.slow(gate=["flag.yaml", "hanging_object.yaml", "sand.yaml", "cloth_over_ball.yaml"])
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
 def test_every_shipped_configuration_builds(config, tmp_path):
     """Parsed, and its components made; the splat is exchanged where the user has to give one."""

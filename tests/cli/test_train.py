@@ -1,4 +1,7 @@
-"""tools/train.py: the shipped configurations, a whole run on a CPU, and bad input."""
+"""tools/train.py: the shipped configurations, a whole run on a CPU, and bad input.
+
+Covers: training.quiet, training.random_stream.
+"""
 
 import csv
 import json
@@ -93,6 +96,7 @@ def test_the_recipe_for_photos_runs_on_a_capture(capture, tmp_path, capsys):
     assert (tmp_path / "panels" / "val_00_000004.png").exists()
 
 
+@pytest.mark.slow(twin="test_a_training_learns")
 def test_the_quick_training(tmp_path, monkeypatch, capsys):
     """200 images of a generated flag on a CPU: 6 dB and more, and a splat that the simulation takes as it is."""
     monkeypatch.chdir(tmp_path)

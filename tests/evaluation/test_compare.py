@@ -1,4 +1,7 @@
-"""Comparing folders whose differences are known."""
+"""Comparing folders whose differences are known.
+
+Covers: evaluation.threads.
+"""
 
 import json
 import math

@@ -40,6 +40,7 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     assert float(again.wind.flows[0].norm()) == pytest.approx(values["wind.speed"])
 
 
+@pytest.mark.slow(twin="test_resume_needs_the_same_plan")
 def test_stopped_and_continued(own, tmp_path):
     """A fit that is stopped after some iterations and continued ends where an undisturbed one does, bit for bit."""
     sought = [read_unknown(name, SOUGHT[name]) for name in ("wind.speed", "wind.azimuth")]

@@ -1,4 +1,7 @@
-"""Least squares on problems whose answers are known."""
+"""Least squares on problems whose answers are known.
+
+Covers: fitting.identifiability.
+"""
 
 import pytest
 import torch

@@ -1,4 +1,7 @@
-"""A fit says whether its values have settled."""
+"""A fit says whether its values have settled.
+
+Covers: fitting.report.
+"""
 
 import json
 from itertools import groupby
@@ -136,6 +139,7 @@ def test_a_camera_that_is_not_followed_is_named():
     assert "`until`" in told
 
 
+@pytest.mark.slow(twin="test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy")
 def test_a_whole_fit_tells_it_and_goes_on(own, tmp_path):
     """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
     pytest.importorskip("cv2", reason="needs the extra [fit]")

@@ -131,6 +131,7 @@ def _photographed(camera, finer=3):
     return (255 * fine.mean((1, 3))).round().to(torch.uint8)
 
 
+@pytest.mark.slow(gate=["False"])
 @pytest.mark.parametrize("real", [True, False])
 def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
     """Cameras on both sides of a flag at rest, from which the print of its splat is shifted to opposite sides.

@@ -44,6 +44,7 @@ def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
     assert _sum_on_plane(_plane(kind, side), overlap) == pytest.approx(1, abs=0.03)
 
 
+@pytest.mark.slow(gate=["regular"])
 @pytest.mark.parametrize("kind", ["regular", "random"])
 def test_sum_at_a_hundred_thousand(kind):
     assert _sum_on_plane(_plane(kind, 316)) == pytest.approx(1, abs=0.01)

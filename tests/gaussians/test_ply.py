@@ -1,4 +1,7 @@
-"""The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained."""
+"""The 3DGS .ply file: what is written comes back, other tools' files are understood, bad ones are explained.
+
+Covers: _ply_table, gaussians.cloud.
+"""
 
 import os
 import re

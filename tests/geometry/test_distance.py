@@ -1,4 +1,7 @@
-"""Signed distances of solids, against brute force and exact values."""
+"""Signed distances of solids, against brute force and exact values.
+
+Covers: geometry.keyed_path, geometry.meshes.
+"""
 
 import math
 import os

@@ -1,4 +1,7 @@
-"""Scene units to metres and back, against closed forms."""
+"""Scene units to metres and back, against closed forms.
+
+Covers: simulation.frame.
+"""
 
 import dataclasses
 

@@ -1,4 +1,7 @@
-"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel."""
+"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel.
+
+Covers: geometry.patches_triton.
+"""
 
 import os
 

@@ -1,4 +1,7 @@
-"""Regions and the choice of what is simulated."""
+"""Regions and the choice of what is simulated.
+
+Covers: gaussians.selection.
+"""
 
 import copy
 

@@ -41,7 +41,7 @@ def test_every_public_name_is_found_in_its_home():
         for name in names:
             assert getattr(gaussian_swaying, name) is getattr(module, name)
             assert getattr(module, name).__doc__
-    with pytest.raises(AttributeError, match=r"has no .*attribute '?Windmill'?"):
+    with pytest.raises(AttributeError, match="Windmill"):
         gaussian_swaying.Windmill  # noqa: B018
 
 

@@ -74,6 +74,7 @@ def whole(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow(gate=["total-1", "updated-2"])
 @pytest.mark.parametrize("every", [1, 2])
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_a_stopped_run_continues_bit_for_bit(formulation, every, whole, tmp_path, monkeypatch, capsys):
@@ -133,6 +134,7 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path):
     _same_as_uninterrupted(folder, whole)
 
 
+@pytest.mark.slow(gate=["SIGTERM"])
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGTERM")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_a_run_that_is_told_to_end(name, whole, tmp_path, capsys):

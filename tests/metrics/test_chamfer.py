@@ -1,4 +1,7 @@
-"""Chamfer distance against brute force and closed forms."""
+"""Chamfer distance against brute force and closed forms.
+
+Covers: metrics.nearest.
+"""
 
 import copy
 

@@ -1,4 +1,7 @@
-"""Gradients from the kernels of the backward pass against torch's autograd in float64."""
+"""Gradients from the kernels of the backward pass against torch's autograd in float64.
+
+Covers: aero.force_adjoint_triton, mpm.triton.adjoint_kernels, mpm.triton.total_adjoint.
+"""
 
 import dataclasses
 

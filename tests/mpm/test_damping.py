@@ -84,6 +84,7 @@ def test_stress_turns_with_the_body():
 # ---- whole steps
 
 
+@pytest.mark.slow(gate=["False-total", "True-updated"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("mls", [False, True])
 def test_rigid_motion_is_not_damped(formulation, mls):
@@ -159,6 +160,7 @@ def _peaks(amplitude):
     return torch.tensor(found, dtype=torch.float64).T
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_first_mode_of_a_bar_decays_with_its_damping_ratio(formulation):
     """Amplitude ~ exp(-zeta omega t) with zeta = beta omega / 2, without the dissipation of the formulation itself."""
@@ -178,6 +180,7 @@ def test_first_mode_of_a_bar_decays_with_its_damping_ratio(formulation):
         assert float(free[-1]) > 0.97 * float(free[0])
 
 
+@pytest.mark.slow(gate=["updated"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_damping_in_proportion_to_frequency(formulation):
     """Twice the time gives twice the decrement; and dissipated energy never comes back."""

@@ -2,6 +2,10 @@
 
 A test of many matrices at once (also singular, inverted, tiny, with repeated stretches) costs almost nothing here, even
 in the interpreter.
+
+Covers: geometry.linalg_triton, mpm.laws.triton.body, mpm.laws.triton.fixed_corotated, mpm.laws.triton.fluid,
+mpm.laws.triton.foam, mpm.laws.triton.hencky, mpm.laws.triton.metal, mpm.laws.triton.neo_hookean, mpm.laws.triton.sand,
+mpm.laws.triton.shared, mpm.laws.triton.snow, mpm.laws.triton.spring_network, mpm.laws.triton.twin.
 """
 
 import math

@@ -62,6 +62,7 @@ def test_a_free_sheet_never_overtakes_the_wind(formulation):
     assert float(state.velocity[:, 1].mean()) > 90.0
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_what_hangs_still_feels_all_of_its_weight_and_wind(formulation):
     """In equilibrium nothing moves, so the drag equals the explicit one for any substep: the same sag, with weight."""

@@ -1,4 +1,7 @@
-"""The two formulations against each other, with every law, and what each of them does not support."""
+"""The two formulations against each other, with every law, and what each of them does not support.
+
+Covers: mpm.body, mpm.dispatch, mpm.formulations.formulation, mpm.formulations.total, mpm.formulations.updated.
+"""
 
 import pytest
 import torch
@@ -74,6 +77,7 @@ def _move(points, region, gravity, formulation, dx, seconds):
     return state.position - points.position
 
 
+@pytest.mark.slow(gate=["_bar-dxs0", "_sheet-dxs2"])
 @pytest.mark.parametrize(("make", "dxs"), [(_bar, (0.1, 0.05)), (_cantilever, (0.1, 0.05)), (_sheet, (0.1, 0.05))])
 def test_formulations_agree_within_their_discretisation_error(make, dxs):
     """As long as neither tears. Each error is estimated by the grid convergence index of two grids at order one (that
@@ -216,6 +220,7 @@ def test_an_elastic_run_computes_no_svd_and_no_return_map(law, formulation, monk
     assert state.internal is None
 
 
+@pytest.mark.slow(gate=["20.0-0.08", "50.0-0.08"])
 @pytest.mark.parametrize("dx", [0.08, 0.04])
 @pytest.mark.parametrize("density", [20.0, 50.0])
 def test_total_keeps_a_soft_flag_whole(dx, density):
@@ -223,7 +228,7 @@ def test_total_keeps_a_soft_flag_whole(dx, density):
     assert _whole(dx, density, 25, "cpu")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_total_keeps_a_soft_flag_whole")
 @pytest.mark.parametrize("dx", [0.08, 0.04, 0.02, 0.01])
 @pytest.mark.parametrize("density", [20.0, 50.0])
 def test_total_keeps_a_soft_flag_whole_for_ten_seconds(dx, density):

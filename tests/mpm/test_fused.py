@@ -3,6 +3,10 @@
 Without a GPU the kernels run in Triton's interpreter, one operation after the other in numpy: slow, so the bodies are
 small there. On a GPU, compiling takes most of the time, so bodies share their options, and some cases run only in the
 interpreter.
+
+Covers: aero.force_triton, mpm.triton.damping, mpm.triton.fused, mpm.triton.fused_total, mpm.triton.fused_updated,
+mpm.triton.measure_kernels, mpm.triton.measures, mpm.triton.shared, mpm.triton.total_kernels,
+mpm.triton.updated_kernels.
 """
 
 import dataclasses

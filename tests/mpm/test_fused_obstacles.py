@@ -1,4 +1,7 @@
-"""Obstacles in the kernels against torch; on a CPU in Triton's interpreter."""
+"""Obstacles in the kernels against torch; on a CPU in Triton's interpreter.
+
+Covers: mpm.triton.obstacle_kernels, mpm.triton.obstacles.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""What is given to a rollout and makes no sense is refused in one sentence, and so is an end that means nothing."""
+"""What is given to a rollout and makes no sense is refused in one sentence, and so is an end that means nothing.
+
+Covers: _checks.
+"""
 
 import math
 

@@ -1,4 +1,7 @@
-"""Clamps hold the face of a region: where it is, which bodies are sheets, and what a clamped solid does."""
+"""Clamps hold the face of a region: where it is, which bodies are sheets, and what a clamped solid does.
+
+Covers: mpm.held_rows.
+"""
 
 import math
 
@@ -138,6 +141,7 @@ def test_the_frequency_of_a_slender_beam_is_eulers():
     assert dunkerley - 2 / 12 / 100 < ratio < dunkerley
 
 
+@pytest.mark.slow(gate=["2.0-0.51-place0-0.0"])
 @pytest.mark.parametrize(
     ("thick", "depth", "place", "angle"),
     [

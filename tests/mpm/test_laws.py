@@ -1,4 +1,9 @@
-"""Laws as modules: the functions they call, return maps on deformation gradients, bounds on the stiffness."""
+"""Laws as modules: the functions they call, return maps on deformation gradients, bounds on the stiffness.
+
+Covers: _folders, mpm.laws.fixed_corotated, mpm.laws.fluid, mpm.laws.foam, mpm.laws.hencky, mpm.laws.law,
+mpm.laws.metal, mpm.laws.neo_hookean, mpm.laws.plasticine, mpm.laws.sand, mpm.laws.shared, mpm.laws.snow,
+mpm.laws.spring_network.
+"""
 
 import math
 import re

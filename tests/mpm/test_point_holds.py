@@ -137,22 +137,23 @@ def test_groups_are_joined_until_they_are_apart():
     torch.testing.assert_close(found[:, 0], torch.tensor([0.14, 0.975, 2.0], dtype=torch.float64))
 
 
-def test_a_hinge_turns_and_a_clamp_does_not():
+@pytest.mark.slow(gate=["hinge"])
+@pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
+def test_a_hinge_turns_and_a_clamp_does_not(kind):
     """A side load of the weight: a hinged sheet hangs at 45 degrees."""
     points = _sheet(layers=3, width=4, e=1e6)
     load = torch.zeros_like(points.position)
     load[:, 1] = 9.8 * points.mass
-    slopes = {}
-    for kind in ("hinge", "clamp", "nodes"):
-        solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], damping=8.0)
-        state = solver.init_state(points)
-        state = solver.rollout(state, 4e-4, 4000, lambda _: load)
-        low = points.position[:, 2] < -0.4
-        arm = state.position[low] - points.position[TOP.contains(points.position)].mean(0)
-        slopes[kind] = math.degrees(math.atan2(float(arm[:, 1].mean()), -float(arm[:, 2].mean())))
-    assert slopes["hinge"] == pytest.approx(45, abs=1.5)
-    assert slopes["clamp"] < 20
-    assert slopes["nodes"] < 20
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], damping=8.0)
+    state = solver.init_state(points)
+    state = solver.rollout(state, 4e-4, 4000, lambda _: load)
+    low = points.position[:, 2] < -0.4
+    arm = state.position[low] - points.position[TOP.contains(points.position)].mean(0)
+    slope = math.degrees(math.atan2(float(arm[:, 1].mean()), -float(arm[:, 2].mean())))
+    if kind == "hinge":
+        assert slope == pytest.approx(45, abs=1.5)
+    else:
+        assert slope < 20
 
 
 @pytest.mark.parametrize("kind", ["hinge", "clamp"])
@@ -267,6 +268,7 @@ def test_pins_in_the_same_cells_agree():
 # ---- motion and time
 
 
+@pytest.mark.slow(gate=["hinge"])
 @pytest.mark.parametrize("kind", ["hinge", "clamp"])
 def test_a_handle_moves_its_points_exactly(kind):
     """720 degrees about a travelling pivot; a clamp also turns the deformation gradient."""
@@ -364,8 +366,10 @@ def test_points_are_released_one_by_one():
         assert bool((moved[when < time - 2 * dt] > 1e-9).all())
 
 
+@pytest.mark.slow(gate=["hinge-5", "clamp-5"])
+@pytest.mark.parametrize("hundreds", [5, 40])
 @pytest.mark.parametrize("kind", ["hinge", "clamp"])
-def test_the_longest_proven_substep_stays_stable(kind):
+def test_the_longest_proven_substep_stays_stable(kind, hundreds):
     """The projection adds no stiffness: energy stays bounded over thousands of substeps."""
     points = _sheet(layers=3, e=1e5)
     solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], gravity=(0, 0, 0))
@@ -377,7 +381,7 @@ def test_the_longest_proven_substep_stays_stable(kind):
     before = sum(float(e) for e in solver.energies(first).values())
     largest = 0.0
     state = first
-    for _ in range(40):
+    for _ in range(hundreds):
         state = solver.rollout(state, dt, 100)
         largest = max(largest, sum(float(e) for e in solver.energies(state).values()))
     assert 0 < largest < 6 * before
@@ -402,6 +406,7 @@ def test_supports_take_the_momentum_of_the_forces(formulation):
     assert float(states[-1].impulse[0, 2]) < 0
 
 
+@pytest.mark.slow(gate=["hinge"])
 @pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
 def test_two_pins_carry_weight_and_wind_at_rest(kind):
     points = _sheet(width=12, shift=(0.03, 0, 0))  # symmetric on the grid

@@ -1,4 +1,7 @@
-"""Whole steps of both formulations against exact solutions."""
+"""Whole steps of both formulations against exact solutions.
+
+Covers: mpm.state.
+"""
 
 import dataclasses
 
@@ -178,6 +181,7 @@ def test_formulations_agree_on_a_vibrating_block():
     assert here == pytest.approx(there, abs=0.06 * float(velocity.norm()) * 0.4 / (torch.pi * speed))
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_flag_hung_by_one_row_does_not_slide_off(formulation):
     """Four seconds: a pin that only resets its particles lets the sheet fall at 70 % of free fall."""

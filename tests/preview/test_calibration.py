@@ -144,7 +144,7 @@ def curtain():
     return cloud
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_run_leaves_the_scene_as_it_was_and_feels_the_setting")
 @pytest.mark.parametrize("what", ["standing", "hanging", "sheet"])
 def test_draft_and_starter_move_as_wanted(what, tmp_path):
     """From the splat to the two configurations, which are run for 2 and 4 s."""

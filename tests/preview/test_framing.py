@@ -1,4 +1,7 @@
-"""Cameras that show the whole object, and coordinates on the preview's box."""
+"""Cameras that show the whole object, and coordinates on the preview's box.
+
+Covers: preview.ticks.
+"""
 
 import math
 

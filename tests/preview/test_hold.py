@@ -1,4 +1,7 @@
-"""Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up."""
+"""Whether things stand or hang, on stand-ins made of a few tubes, balls and plates: surfaces only, z up.
+
+Covers: preview.doubts.
+"""
 
 import argparse
 import dataclasses

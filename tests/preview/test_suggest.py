@@ -1,4 +1,7 @@
-"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known."""
+"""Guesses about a splat, against scenes whose up axis, floor, object, pins and spacing are known.
+
+Covers: preview.shape, preview.starter.
+"""
 
 import dataclasses
 import itertools
@@ -382,7 +385,7 @@ def test_specks_beyond_the_boxes_follow_their_neighbours(make_scene):
 
 
 def test_page_states_the_numbers_of_the_rules():
-    page = (Path(__file__).parents[3] / "docs/own_scene.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs/own_scene.md").read_text(encoding="utf-8")
     for text in (
         f"z up (Blender), y down (COLMAP) | {CONVENTION['+z']:g} |",
         f"y up (glTF) | {CONVENTION['+y']:g} |",

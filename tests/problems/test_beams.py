@@ -32,9 +32,10 @@ def test_elastica_tends_to_the_linear_beam():
     assert elastica(1.0, steps=100)[0] == pytest.approx(elastica(1.0, steps=800)[0], rel=1e-8)
 
 
-def test_cantilever_sags_as_the_elastica():
+@pytest.mark.parametrize("slenderness", [4, pytest.param(6, marks=pytest.mark.slow)])
+def test_cantilever_sags_as_the_elastica(slenderness):
     """Two and three cells: the whole error is that of shear and of the points' second moment of area, to 0.5 %."""
-    runs = [cantilever(cells, Settings(), slenderness=6, settle=9.0) for cells in (2, 3)]
+    runs = [cantilever(cells, Settings(), slenderness=slenderness, settle=9.0) for cells in (2, 3)]
     assert runs[1]["error"] < runs[0]["error"]
     for run in runs:
         assert run["residual"] < 1e-3
@@ -45,9 +46,10 @@ def test_cantilever_sags_as_the_elastica():
     assert runs[1]["quadrature"] == pytest.approx(1 / 35, rel=0.05)
 
 
-def test_a_single_cell_needs_three_layers():
+@pytest.mark.parametrize("slenderness", [4, pytest.param(6, marks=pytest.mark.slow)])
+def test_a_single_cell_needs_three_layers(slenderness):
     """Two layers in one cell bend without strain (see `cantilever`), three carry the weight."""
-    loose = cantilever(1, Settings(), slenderness=6, settle=9.0)
-    firm = cantilever(1, Settings(), slenderness=6, settle=9.0, per_cell=3)
+    loose = cantilever(1, Settings(), slenderness=slenderness, settle=9.0)
+    firm = cantilever(1, Settings(), slenderness=slenderness, settle=9.0, per_cell=3)
     assert loose["error"] > 1.0
-    assert abs(firm["unexplained"]) < 0.05
+    assert abs(firm["unexplained"]) < 1.8 / slenderness**2

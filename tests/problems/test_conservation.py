@@ -51,6 +51,7 @@ def test_steps_conserve_both_momenta(settings):
     assert drift["angular"] < 1e-12
 
 
+@pytest.mark.slow(gate=["updated"])
 @UPDATED
 def test_without_the_affine_velocity_angular_momentum_is_lost(settings):
     """PIC as the negative control: the test above sees a defect when there is one."""
@@ -86,6 +87,7 @@ def test_motion_does_not_depend_on_the_place_by_whole_cells(settings):
     torch.testing.assert_close(a, b, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow(gate=["total", "mls"])
 @EACH
 def test_flight_without_stress_does_not_depend_on_the_place(settings):
     """Parts of a cell too, to round-off; with stress, to the error of the discretisation."""
@@ -96,15 +98,17 @@ def test_flight_without_stress_does_not_depend_on_the_place(settings):
     assert 1e-6 < difference < 0.05, difference
 
 
-def test_energy_of_a_free_block_in_total_stays():
-    """100 periods of a wave to and fro: the mean over ten changes by less than 0.1 %, the momenta by round-off."""
-    run = free_block(Settings(), cells=3)
+@pytest.mark.parametrize("periods", [30, pytest.param(100, marks=pytest.mark.slow)])
+def test_energy_of_a_free_block_in_total_stays(periods):
+    """Periods of a wave to and fro: the mean over ten of them changes by less than 0.1 %, momenta by round-off."""
+    run = free_block(Settings(), cells=3, periods=periods)
     assert run["error"] < 1e-3
     assert run["growth"] < run["swing"]
     assert run["linear"] < 1e-12
     assert run["angular"] < 1e-12
 
 
+@pytest.mark.slow(gate=["mls"])
 @UPDATED
 def test_energy_of_a_free_block_in_updated_never_grows(settings):
     """Mean energies only fall, to that of the rigid motion with the momenta of the start (Koenig's theorem).

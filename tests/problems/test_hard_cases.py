@@ -263,6 +263,7 @@ def test_contrasts_within_one_body(case, formulation):
 # ---- inverted elements
 
 
+@pytest.mark.slow(gate=["NeoHookean"])
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
 def test_an_inverted_body_turns_back(law):
     """`total`, a block mirrored onto itself and shaken: all det F are positive in the end, the energy never grows."""
@@ -280,6 +281,7 @@ def test_an_inverted_body_turns_back(law):
     _assert_no_gain(log)
 
 
+@pytest.mark.slow(gate=["1"])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_deeply_inverted_body_does_not_gain_energy(seed):
     """`total`, neo-Hookean, det F = -0.6, in frames that are short beside its motion.
@@ -358,6 +360,7 @@ def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
     assert float(height.min()) > -REACH * simulation.solver.dx
 
 
+@pytest.mark.slow(gate=["separate"])
 @pytest.mark.parametrize("kind", ["sticky", "separate"])
 def test_a_snowball_on_a_wall(kind):
     """At 20 m/s: packed, not inverted, less energy than before, and nothing beyond the nodes of the wall."""
@@ -442,6 +445,7 @@ def test_a_body_within_one_cell(side, formulation):
     torch.testing.assert_close(moved, expected, rtol=0, atol=steps * 2**-24)
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_chain_of_stiff_and_soft_links_hangs(formulation):
     """Let go at once it swings as its five free links do, in `total` to rounding.
@@ -482,6 +486,7 @@ def test_a_chain_of_stiff_and_soft_links_hangs(formulation):
 # ---- storms
 
 
+@pytest.mark.slow(gate=["explicit-total", "semi_implicit-updated"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("drag_step", ["semi_implicit", "explicit"])
 def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
@@ -503,6 +508,7 @@ def test_a_storm_on_a_sheet_of_twenty_grams(drag_step, formulation):
     assert max(health.kinetic for health in log) <= 0.5 * float(simulation.solver.points.mass.sum()) * 99.6**2
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_gusts_that_turn_round_every_frame(formulation):
     """+-12 m/s, 25 reversals: the energy is the work of the wind, which no net flow adds up."""
@@ -541,6 +547,7 @@ def test_a_modulation_that_breaks_the_wind_is_a_divergence(formulation, drag_ste
 # ---- handles and pins
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_sheet_twisted_by_720_degrees(formulation):
     """Two turns of one end: it is back where it began, and the strip between is a helicoid or shorter.
@@ -575,6 +582,7 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
     assert log[-1].J_min > 0
 
 
+@pytest.mark.slow(gate=["NeoHookean-total", "NeoHookean-updated"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
 def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
@@ -596,6 +604,7 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
     assert _energy(after[-1]) < _energy(after[0])
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_pin_that_holds_everything(formulation):
     """Nothing moves, and the wind does no work, for half a second in a gale."""
@@ -678,6 +687,7 @@ def test_a_grid_too_large_for_the_speed_names_the_speed():
         _advance(simulation, 1, _throw(simulation, [1e4, 0.0, 0.0]))
 
 
+@pytest.mark.slow(gate=["FixedCorotated-total", "NeoHookean-updated"])
 @pytest.mark.parametrize(
     ("law", "formulation"),
     [(FixedCorotated, "total"), (FixedCorotated, "updated"), (NeoHookean, "updated"), (Fluid, "updated")],
@@ -905,7 +915,7 @@ def _minutes(series, blocks=12):
     return means.mean(-1), means.std(-1) / math.sqrt(blocks)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_gusts_that_turn_round_every_frame")
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("damping", DAMPINGS)
 def test_ten_minutes_of_a_gusty_flag(damping):
@@ -927,7 +937,7 @@ def test_ten_minutes_of_a_gusty_flag(damping):
     assert abs(float(mean[-1] - mean[1])) < 4 * math.hypot(float(error[-1]), float(error[1]))
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_gusts_that_turn_round_every_frame")
 @pytest.mark.timeout(3600)
 def test_ten_minutes_do_not_heat_a_damped_flag():
     """The mean mechanical energy of the tenth minute is that of the second, within 4 standard errors.

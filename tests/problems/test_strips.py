@@ -5,7 +5,8 @@ from bench.problems.settings import Settings
 from bench.problems.strips import hinged_strip
 
 
-@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
+@pytest.mark.slow(twin="test_a_hinge_turns_where_a_clamp_does_not")
+@pytest.mark.parametrize("shift", [0.0, 0.3])
 def test_a_hinge_takes_no_moment(shift):
     """Wherever the strip lies on the grid, with its middle plane on nodes or between them."""
     run = hinged_strip(16, Settings(), shift=shift)
@@ -15,6 +16,16 @@ def test_a_hinge_takes_no_moment(shift):
     assert run["moment"] < 0.05
 
 
+def test_a_hinge_turns_where_a_clamp_does_not():
+    """The same with four cells, which is coarse, beside the clamps below."""
+    run = hinged_strip(4, Settings(), shift=0.3)
+    assert run["residual"] < 1e-3
+    assert run["error"] < 0.15
+    assert run["slope"] == pytest.approx(1, abs=0.05)
+    assert run["moment"] < 0.5
+
+
+@pytest.mark.slow(gate=["clamp"])
 @pytest.mark.parametrize("hold", ["clamp", "nodes"])
 def test_what_holds_the_slope_fails_by_far(hold):
     run = hinged_strip(4, Settings(), hold=hold)

@@ -51,6 +51,7 @@ def _fly(formulation, law, wind, gravity, seconds):
     return float((points.mass * state.velocity[:, 1]).sum() / points.mass.sum())
 
 
+@pytest.mark.slow(gate=["paper-total", "projected-updated"])
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 @pytest.mark.parametrize("law", ["paper", "projected"])
 def test_a_free_plate_approaches_the_speed_of_the_wind(formulation, law):
@@ -74,6 +75,7 @@ def test_linear_drag_does_nothing_in_still_air():
     assert _fly("total", "linear", 0.0, (0, -9.8, 0), 0.12) == pytest.approx(-9.8 * 0.12, rel=0.01)
 
 
+@pytest.mark.slow(gate=["paper"])
 @pytest.mark.parametrize("law", ["paper", "projected"])
 def test_a_falling_plate_reaches_its_terminal_velocity(law):
     """v = v_t tanh(g t / v_t) with v_t² = 2 m g / (rho A C), in still air, broadside: within 1 %."""
@@ -114,13 +116,8 @@ def test_the_angle_of_a_hinged_plate(law, k):
     assert hinged_plate_angle(k, law) == pytest.approx(ANGLES[law, k], abs=0.005)
 
 
-@pytest.mark.parametrize(
-    ("law", "k"),
-    [
-        pytest.param(*case, marks=() if case in {("paper", 0.75), ("projected", 0.5)} else pytest.mark.slow)
-        for case in ANGLES
-    ],
-)
+@pytest.mark.slow(gate=["projected-0.5"])
+@pytest.mark.parametrize(("law", "k"), ANGLES)
 def test_a_hinged_plate_comes_to_rest_at_the_angle_of_its_law(law, k):
     """The goal is one degree."""
     found = hinged_plate(k, law, cells=4)
@@ -129,7 +126,8 @@ def test_a_hinged_plate_comes_to_rest_at_the_angle_of_its_law(law, k):
     assert abs(found["slip"]) < 0.01
 
 
-@pytest.mark.parametrize(("law", "k"), [pytest.param("paper", 0.5, marks=pytest.mark.slow), ("projected", 2.0)])
+@pytest.mark.slow(twin="test_a_hinge_lets_turn_and_holds")
+@pytest.mark.parametrize(("law", "k"), [("paper", 0.5), ("projected", 2.0)])
 def test_a_hinged_plate_in_the_updated_formulation(law, k):
     found = hinged_plate(k, law, Settings(formulation="updated"), cells=4)
     assert abs(found["error"]) < 0.5
@@ -302,6 +300,7 @@ def _blow(solver, state, normal, aero, wind, steps, dt=2e-4):
     return state
 
 
+@pytest.mark.slow(gate=["paper-total", "projected-updated", "linear-total"])
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 @pytest.mark.parametrize("law", ["paper", "projected", "linear"])
 def test_nothing_moves_in_still_air(formulation, law):
@@ -337,6 +336,7 @@ def test_the_mirror_image_moves_as_the_mirrored_sheet(formulation):
     torch.testing.assert_close(ends[1], ends[0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", ["total", "updated"])
 def test_a_flat_flag_edge_on_to_a_steady_wind_stays_flat(formulation):
     """The projected law has nothing that pushes an exactly flat sheet sideways; the sheet does feel the friction.

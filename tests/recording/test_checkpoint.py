@@ -1,4 +1,7 @@
-"""A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it."""
+"""A checkpoint that is not what the run wrote is refused in one sentence, whatever has happened to it.
+
+Covers: runs.seal.
+"""
 
 import copy
 import io

@@ -1,4 +1,7 @@
-"""Formats in which a run leaves its Gaussians."""
+"""Formats in which a run leaves its Gaussians.
+
+Covers: recording.usd_film.
+"""
 
 from dataclasses import replace
 

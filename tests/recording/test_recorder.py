@@ -1,4 +1,7 @@
-"""What a run leaves on disk, and what it leaves when something breaks."""
+"""What a run leaves on disk, and what it leaves when something breaks.
+
+Covers: _provenance, recording.trajectory, simulation.meters.
+"""
 
 import csv
 import gc
@@ -476,7 +479,7 @@ def test_a_program_that_ends_without_closing_loses_no_frame(tmp_path):
         "for k in range(3): recorder.write_image(k, torch.zeros(16, 16, 3))\n"
         "raise SystemExit(7)\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
     assert subprocess.run([sys.executable, "-c", code], env=environment, timeout=LONG).returncode == 7
     assert _names(tmp_path / "run" / "frames") == ["00000.png", "00001.png", "00002.png"]
     assert not [name for name in _names(tmp_path / "run") if "mp4" in name]

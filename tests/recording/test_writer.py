@@ -1,4 +1,7 @@
-"""Jobs in the background: their order, their bound, what a failure leaves, and copies that do not wait for a GPU."""
+"""Jobs in the background: their order, their bound, what a failure leaves, and copies that do not wait for a GPU.
+
+Covers: .
+"""
 
 import os
 import signal

@@ -1,4 +1,7 @@
-"""Cameras against hand-computed geometry."""
+"""Cameras against hand-computed geometry.
+
+Covers: rendering.cameras.camera.
+"""
 
 import dataclasses
 import math

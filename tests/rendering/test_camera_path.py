@@ -1,4 +1,7 @@
-"""The camera of each frame of a run."""
+"""The camera of each frame of a run.
+
+Covers: rendering.cameras.camera_path.
+"""
 
 import math
 

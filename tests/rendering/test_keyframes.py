@@ -1,4 +1,7 @@
-"""Camera paths given by keys."""
+"""Camera paths given by keys.
+
+Covers: rendering.cameras.keyframes.
+"""
 
 import math
 from itertools import pairwise

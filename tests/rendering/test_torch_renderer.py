@@ -1,4 +1,7 @@
-"""The torch renderer against a loop over pixels and Gaussians written from the equations."""
+"""The torch renderer against a loop over pixels and Gaussians written from the equations.
+
+Covers: rendering.factory, rendering.protocol.
+"""
 
 import math
 

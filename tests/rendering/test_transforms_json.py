@@ -1,4 +1,7 @@
-"""Cameras of a transforms.json."""
+"""Cameras of a transforms.json.
+
+Covers: rendering.cameras.transforms_json.
+"""
 
 import json
 import math

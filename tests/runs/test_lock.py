@@ -1,4 +1,7 @@
-"""One writer per folder, however two of them meet."""
+"""One writer per folder, however two of them meet.
+
+Covers: runs.folder.
+"""
 
 import gc
 import os

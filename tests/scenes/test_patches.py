@@ -1,4 +1,7 @@
-"""The building blocks of the generated scenes against shapes of known area and normal."""
+"""The building blocks of the generated scenes against shapes of known area and normal.
+
+Covers: scenes.plant_parts.
+"""
 
 import math
 

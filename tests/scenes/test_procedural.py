@@ -1,4 +1,7 @@
-"""The generated flag against the sheet it stands for."""
+"""The generated flag against the sheet it stands for.
+
+Covers: scenes.printed_cloth.
+"""
 
 import math
 

@@ -1,4 +1,8 @@
-"""The generated scenes: what they hold, that they repeat, and what they refuse."""
+"""The generated scenes: what they hold, that they repeat, and what they refuse.
+
+Covers: scenes.alocasia, scenes.ficus, scenes.flag_on_stand, scenes.leaves, scenes.sand, scenes.stage,
+scenes.telephone, scenes.vase, scenes.windbreaks.
+"""
 
 import math
 

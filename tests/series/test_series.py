@@ -81,7 +81,7 @@ for name in commands:
     }, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_sample")
 @pytest.mark.timeout(4 * 3600)
 def test_the_whole_series():
     code, printed, said = series()

@@ -1,4 +1,7 @@
-"""Contact and obstacles in the front door and in a configuration."""
+"""Contact and obstacles in the front door and in a configuration.
+
+Covers: scenes.cloths, simulation.touching, viewer.changes.
+"""
 
 import warnings
 

@@ -1,4 +1,7 @@
-"""Where Gaussians read the motion of the nodes."""
+"""Where Gaussians read the motion of the nodes.
+
+Covers: .
+"""
 
 import torch
 

@@ -55,6 +55,7 @@ def test_they_go_where_their_neighbours_take_them(points, make_scene):
     torch.testing.assert_close(scene.deformed(moved).means.double(), expected, atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow(gate=["grid"])
 @pytest.mark.parametrize("points", POINTS)
 def test_the_wind_blows_specks_away_unless_they_are_carried(points, make_simulation):
     moved = {}

@@ -1,4 +1,7 @@
-"""``scene.area: open``: what wind and mass of a capture are, and how it is turned off."""
+"""``scene.area: open``: what wind and mass of a capture are, and how it is turned off.
+
+Covers: preview.as_data, preview.report.
+"""
 
 import math
 from pathlib import Path

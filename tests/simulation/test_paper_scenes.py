@@ -1,4 +1,7 @@
-"""The configurations of the paper's scenes: its numbers, their presets, and runs of a few frames."""
+"""The configurations of the paper's scenes: its numbers, their presets, and runs of a few frames.
+
+Covers: .
+"""
 
 import math
 from pathlib import Path
@@ -43,6 +46,7 @@ def test_every_scene_has_its_preset():
     assert {path.stem for path in (CONFIGS / "preview").glob("*.yaml")} == {*PAPER, *SHAPED, *TOUCHING}
 
 
+@pytest.mark.slow(gate=["flag_behind_pole"])
 @pytest.mark.parametrize("name", SHAPED)
 def test_the_presets_of_winds_with_a_shape_move(name):
     """They are held, and the wind differs from place to place."""

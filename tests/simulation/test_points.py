@@ -1,4 +1,7 @@
-"""``scene.points: grid``: as many points as the grid can use, and all Gaussians follow its nodes."""
+"""``scene.points: grid``: as many points as the grid can use, and all Gaussians follow its nodes.
+
+Covers: simulation.followers_triton.
+"""
 
 import dataclasses
 import math

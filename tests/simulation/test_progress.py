@@ -1,4 +1,7 @@
-"""What a run shows: frames, progress within one that is slow, and why it is."""
+"""What a run shows: frames, progress within one that is slow, and why it is.
+
+Covers: simulation.painter, simulation.stepping.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Several cameras and several renders in one run."""
+"""Several cameras and several renders in one run.
+
+Covers: recording.layout.
+"""
 
 import imageio.v3 as iio
 import numpy as np

@@ -1,4 +1,7 @@
-"""Frames from components: substeps, wind, cameras, colours and pictures."""
+"""Frames from components: substeps, wind, cameras, colours and pictures.
+
+Covers: .
+"""
 
 import copy
 import dataclasses

@@ -1,4 +1,7 @@
-"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML."""
+"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML.
+
+Covers: simulation.launch.
+"""
 
 import warnings
 

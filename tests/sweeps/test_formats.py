@@ -1,4 +1,7 @@
-"""The table as Parquet, and the runs as WebDataset shards, read back."""
+"""The table as Parquet, and the runs as WebDataset shards, read back.
+
+Covers: sweeps.record, sweeps.shards.
+"""
 
 import csv
 import io

@@ -1,7 +1,12 @@
-"""A sweep in parts, as in a SLURM array, and what decides how many jobs share a GPU."""
+"""A sweep in parts, as in a SLURM array, and what decides how many jobs share a GPU.
+
+Covers: sweeps.backend, sweeps.pool.
+"""
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
+
+import pytest
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps.backend import Outcome, drive
@@ -9,6 +14,7 @@ from gaussian_swaying.sweeps.job import Job
 from gaussian_swaying.sweeps.pool import Pool
 
 
+@pytest.mark.slow(twin="test_a_part_continues_and_the_last_one_finishes")
 def test_two_parts_at_the_same_time(undisturbed, tmp_path, sweep_file):
     """Both begin at once in a new folder; the one that ends last writes the table."""
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"

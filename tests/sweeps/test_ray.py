@@ -1,4 +1,7 @@
-"""Sweeps on Ray: a local cluster of two nodes on one machine."""
+"""Sweeps on Ray: a local cluster of two nodes on one machine.
+
+Covers: sweeps.ray_backend.
+"""
 
 import csv
 import json

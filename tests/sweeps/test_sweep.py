@@ -1,4 +1,7 @@
-"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing."""
+"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing.
+
+Covers: sweeps.contact_sheet, sweeps.job, sweeps.worker.
+"""
 
 import csv
 import errno
@@ -151,7 +154,7 @@ def test_killed_workers_change_nothing(undisturbed, tmp_path, sweep_file):
         _same_motion(undisturbed, tmp_path / "out", f"{number:05d}")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_killed_workers_change_nothing")
 @pytest.mark.timeout(1800)
 def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
     file = sweep_file(tmp_path / "tiny.yaml", draws=10)
@@ -162,6 +165,7 @@ def test_forty_runs_and_five_killed_workers(tmp_path, sweep_file):
     assert (tmp_path / "out/sweep.csv").read_bytes() == (tmp_path / "whole/sweep.csv").read_bytes()
 
 
+@pytest.mark.slow(twin="test_a_stopped_sweep_ends_in_order")
 def test_a_killed_driver_loses_only_what_was_running(undisturbed, tmp_path, sweep_file, capsys):
     file, folder = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out"
     driver = _start(file, folder, "--device", "cpu")
@@ -176,6 +180,7 @@ def test_a_killed_driver_loses_only_what_was_running(undisturbed, tmp_path, swee
     assert (folder / "sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
 
 
+@pytest.mark.slow(gate=["15-143"])
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, number, code):
     """Ctrl-C reaches the workers too, SIGTERM only the driver."""

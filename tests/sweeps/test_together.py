@@ -1,4 +1,7 @@
-"""Runs that are simulated together: as if each were alone, and done one by one where that fails."""
+"""Runs that are simulated together: as if each were alone, and done one by one where that fails.
+
+Covers: simulation.together.
+"""
 
 import csv
 import json

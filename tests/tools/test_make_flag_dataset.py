@@ -424,7 +424,7 @@ def test_newton_has_no_wind(tool, reference):
         sys.modules["newton_cloth"].solve_cloth(grid, grid.flat(), [], pattern.material(), pattern.run())
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_another_solver_is_named_in_the_settings")
 def test_newtons_cloth_falls_as_it_should(tool, cloth):
     """A free panel falls with the damping that is asked for; without gravity it stays, also with self-contact."""
     pytest.importorskip("newton")

@@ -201,7 +201,7 @@ def test_two_motions_are_compared(soft):
 # ---- Newton
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_newtons_moduli_give_the_stress_of_hooke_at_small_strain")
 def test_newtons_block_bends_as_a_beam_does(newton):
     """A push across a block of few cells; a mesh of 4 cells is 12 % stiffer than a beam with shear (Timoshenko)."""
     pytest.importorskip("newton")

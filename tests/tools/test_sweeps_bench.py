@@ -80,7 +80,7 @@ def test_tables():
     assert "1.60 times" in tables.goal_table([RECORD])[-2]
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_killed_workers_change_nothing")
 @pytest.mark.timeout(1800)
 def test_a_disturbed_sweep(tmp_path):
     row = sweeps.disturbed_sweep(tmp_path, runs=8, kills=2)

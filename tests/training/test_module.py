@@ -1,4 +1,7 @@
-"""Trainings that learn, stop when something is not finite, and continue exactly."""
+"""Trainings that learn, stop when something is not finite, and continue exactly.
+
+Covers: training.finite, training.rates.
+"""
 
 import math
 import os

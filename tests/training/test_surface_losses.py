@@ -1,4 +1,7 @@
-"""Losses of the surface on views whose surface is known."""
+"""Losses of the surface on views whose surface is known.
+
+Covers: captures.neighbours.
+"""
 
 import math
 from functools import cache

@@ -1,4 +1,7 @@
-"""The live page, in a real browser where there is one."""
+"""The live page, in a real browser where there is one.
+
+Covers: viewer.holding.
+"""
 
 import threading
 import time
@@ -84,6 +87,7 @@ def test_the_page_moves_pauses_and_steps(page, window, until):
     assert window.problems == []
 
 
+@pytest.mark.slow(twin="test_a_value_out_of_range_gets_a_sentence")
 def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     session = page.session
     before = session.simulation.wind.flows.clone()
@@ -100,6 +104,7 @@ def test_controls_change_the_wind_and_say_what_is_wrong(page, window, until):
     until(lambda: session.snapshot.health.time > 0.1 and not session.broken)
 
 
+@pytest.mark.slow(twin="test_streaks_of_air_are_those_of_the_render")
 def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, monkeypatch):
     """What a picture with them looks like is tested in test_pictures.py."""
     drawn = []
@@ -112,7 +117,7 @@ def test_streaks_of_air_are_drawn_where_they_are_wanted(page, window, until, mon
     assert window.problems == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_film_is_as_long_as_the_simulated_time")
 def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     iio = pytest.importorskip("imageio.v3")
     window.get_by_role("button", name="Record a video").click()
@@ -131,7 +136,7 @@ def test_a_video_and_the_configuration_come_out(page, window, until, tmp_path):
     assert yaml.safe_load(file.read_text())["solver"]["dx"] == 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_film_ends_at_its_greatest_length")
 def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.5)
     with window.expect_download(timeout=240_000):
@@ -141,7 +146,7 @@ def test_a_video_that_is_full_is_saved_and_the_page_says_so(page, window, monkey
     assert page.recording is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_many_clients_at_once_are_served_in_turn")
 def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, window, browser, until):
     second = browser.new_context(viewport={"width": 500, "height": 700})
     other = second.new_page()
@@ -155,7 +160,7 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, wind
     assert page.session.problem is None
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_splat_that_is_loaded_tells_how_far_it_is")
 def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     path = tmp_path / "../flag.ply"
     write_ply(path, FlagScene(width=0.6, height=0.6, spacing=0.05).generate())
@@ -171,6 +176,7 @@ def test_another_splat_is_loaded_from_the_page(page, window, until, tmp_path):
     assert page.session.simulation.scene.source is not None  # the scene stays
 
 
+@pytest.mark.slow(twin="test_a_pull_moves_what_it_holds_and_lets_go")
 def test_a_click_takes_hold_of_the_flag(page, window, until):
     """Where it is clicked; the handle appears there, and lets go."""
     session, holding = page.session, page.controls.holding
@@ -221,7 +227,7 @@ def test_a_client_that_reads_slowly_slows_nobody(page, connect, until):
     until(lambda: page.session.snapshot.number > number + 2)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_client_that_reads_slowly_slows_nobody")
 @pytest.mark.timeout(900)
 def test_memory_does_not_grow_in_ten_minutes(page, connect):
     """Measured after a minute, when everything has been used once."""

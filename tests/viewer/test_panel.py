@@ -1,4 +1,7 @@
-"""The panel of the live page: what its controls show and do, asked by a client and read from the session."""
+"""The panel of the live page: what its controls show and do, asked by a client and read from the session.
+
+Covers: viewer.files, viewer.gusts, viewer.legends, viewer.materials.
+"""
 
 import math
 

@@ -1,4 +1,7 @@
-"""Pictures from the camera of a browser, picking, and their size."""
+"""Pictures from the camera of a browser, picking, and their size.
+
+Covers: viewer.controls, viewer.film_strip.
+"""
 
 import math
 

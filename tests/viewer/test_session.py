@@ -1,4 +1,7 @@
-"""A simulation that goes on in a thread, and is changed there."""
+"""A simulation that goes on in a thread, and is changed there.
+
+Covers: viewer.pull.
+"""
 
 import dataclasses
 import threading

@@ -1,4 +1,10 @@
-"""PhysGaussian's configurations against what its code does with them."""
+"""PhysGaussian's configurations against what its code does with them.
+
+Covers: cli.convert, interop.physgaussian.boundaries, interop.physgaussian.camera,
+interop.physgaussian.camera_settings, interop.physgaussian.fields, interop.physgaussian.filling,
+interop.physgaussian.materials, interop.physgaussian.parts, interop.physgaussian.space, interop.physgaussian.yaml_file,
+simulation.normalisation.
+"""
 
 import copy
 import json

@@ -1,4 +1,9 @@
-"""Each boundary acts only where and when it should."""
+"""Each boundary acts only where and when it should.
+
+Covers: mpm.boundaries.ball, mpm.boundaries.block, mpm.boundaries.boundary, mpm.boundaries.capsule,
+mpm.boundaries.half_space, mpm.boundaries.mesh, mpm.boundaries.particle_boundary, mpm.boundaries.pinned_points,
+mpm.boundaries.still_gaussians.
+"""
 
 import copy
 import dataclasses
@@ -119,6 +124,19 @@ def test_the_documented_boundaries_are_those_that_there_are():
     assert set(re.findall("`([A-Z][A-Za-z]+)`", row)) == set(boundaries.BOUNDARIES)
 
 
+@pytest.mark.slow(
+    gate=[
+        "handle-updated",
+        "slip-total",
+        "friction-updated",
+        "velocity-total",
+        "box-sticky-total",
+        "box-separate-total",
+        "sticky-total",
+        "pin-updated",
+        "box-slip-total",
+    ]
+)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize(
     "make",

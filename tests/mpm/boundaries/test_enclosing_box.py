@@ -8,6 +8,7 @@ from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
 FORMULATIONS = ["total", "updated"]
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_enclosing_box_keeps_everything_in(formulation, block, run_for):
     points = block(low=(0.3, 0.3, 0.3))

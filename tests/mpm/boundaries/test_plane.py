@@ -32,6 +32,7 @@ def test_the_length_of_the_normal_does_not_matter(length):
     torch.testing.assert_close(plane.normal, torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
 
 
+@pytest.mark.slow(gate=["sticky-total", "slip-updated", "separate-total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("kind", ["sticky", "slip", "separate"])
 def test_plane_holds_a_falling_block_on_its_free_side(formulation, kind, block, run_for):
@@ -50,6 +51,7 @@ def test_plane_does_not_act_on_the_free_side(formulation, block, run_for):
     torch.testing.assert_close(state.position, free.position, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow(gate=["updated"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_slip_slides_and_sticky_sticks(formulation, block, run_for):
     """PhysGaussian's slip planes stick; ours keep the tangential speed."""

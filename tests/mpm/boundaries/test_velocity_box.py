@@ -54,6 +54,7 @@ def test_a_travelling_box_takes_its_nodes_from_where_it_is(block):
         assert torch.equal(driven[0], driven[1]) == (time == 0.1)
 
 
+@pytest.mark.slow(gate=["total"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_travelling_box_carries_a_block(formulation, block, run_for):
     """The block moves far beyond its start, because the box travels with it; a fixed box leaves the block behind."""

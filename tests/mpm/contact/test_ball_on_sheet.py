@@ -71,15 +71,16 @@ def _passed(place, triangles):
     return crossings(place, whole) - crossings(place, ball)
 
 
-def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march):
-    """It falls 13 cm. Nothing passes through; energy does not grow; the ball comes back up."""
+@pytest.mark.parametrize("seconds", [0.24, pytest.param(0.48, marks=pytest.mark.slow)])
+def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march, seconds):
+    """It falls 13 cm. Nothing passes through; energy does not grow; half a second later the ball has come back up."""
     solver, state, triangles = _drop(gravity=(0, 0, -9.8))
     count = SIDE * SIDE
     mass = solver.points.mass[count:]
     before = sum(float(part) for part in solver.energies(state).values())
     scale = 9.8 * float(mass.sum()) * 0.13
     heights, sheets, found = [], [], []
-    for later in march(solver, state, 0.48, frame=0.04):
+    for later in march(solver, state, seconds, frame=0.04):
         stage = solver.bound.contact
         place = stage.positions(later.node_displacement)
         assert _passed(place, triangles) == 0
@@ -89,14 +90,15 @@ def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(march):
         heights.append(float((mass * later.position[count:, 2]).sum() / mass.sum()))
         sheets.append(float(later.position[:count, 2].min()))
     found = torch.cat(found)
-    assert len(found) > 1000
+    assert len(found) > 2100 * seconds
     assert float((found < 0.5).double().mean()) <= 1e-3
     lowest = min(range(len(heights)), key=heights.__getitem__)
     assert sheets[lowest] < -RADIUS  # a deep dent
-    assert max(heights[lowest:]) > heights[lowest] + 0.15  # and back up
+    if seconds > 0.4:
+        assert max(heights[lowest:]) > heights[lowest] + 0.15  # and back up
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_a_ball_dropped_on_a_sheet_dents_it_and_bounces")
 def test_a_ball_dropped_on_a_damped_sheet_comes_to_rest(march):
     """Motion decays at 4 per second. After 0.72 s energy no longer grows, and the ball stays where it lies."""
     solver, state, triangles = _drop(gravity=(0, 0, -9.8), damping=8.0)

@@ -1,4 +1,7 @@
-"""Contact in the Triton substep against torch; on a CPU in Triton's interpreter."""
+"""Contact in the Triton substep against torch; on a CPU in Triton's interpreter.
+
+Covers: mpm.triton.contact_kernels, mpm.triton.contact_list_kernels, mpm.triton.fused_contact.
+"""
 
 import pytest
 import torch

@@ -37,10 +37,9 @@ def _roll(solver, state, frames, frame=0.04):
     return state
 
 
-@pytest.mark.parametrize(
-    ("formulation", "friction"),
-    [("total", 0.2), ("total", 0.5), ("updated", 0.5), pytest.param("updated", 0.2, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow(gate=["0.5-total-0.5", "-0.5-updated-0.5"])
+@pytest.mark.parametrize("friction", [0.2, 0.5])
+@pytest.mark.parametrize("formulation", FORMULATIONS)
 @pytest.mark.parametrize("degrees", [-0.5, 0.5])
 def test_a_block_slides_beyond_the_angle_of_friction(formulation, friction, degrees):
     """Half a degree above arctan(mu) it gains g (sin a - mu cos a), half a degree below it loses as much, or rests.
@@ -74,14 +73,9 @@ def test_what_an_obstacle_takes_is_what_the_body_loses(formulation):
     torch.testing.assert_close(momentum, weight * state.time - state.impulse[0], rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("formulation", "shape"),
-    [
-        *(("total", shape) for shape in ("ground", "block", "capsule")),
-        ("updated", "block"),
-        *(pytest.param("updated", shape, marks=pytest.mark.slow) for shape in ("ground", "capsule")),
-    ],
-)
+@pytest.mark.slow(gate=["total-block"])
+@pytest.mark.parametrize("shape", ["ground", "block", "capsule"])
+@pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):
     """A lift that rises at 0.5 m/s with much friction also carries the block sideways; all start at rest."""
     keys = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.05], [0.5, 0.0, 0.25]]
@@ -98,28 +92,32 @@ def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):
     )
 
 
-def test_a_block_that_rests_stays_where_it_is():
+@pytest.mark.parametrize("frames", [8, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_block_that_rests_stays_where_it_is(frames):
     """In `total` the lowest points lie on the ground within the overlap that carries their weight, of order g dt²."""
     ground = HalfSpaceObstacle([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     solver = MPMSolver(dx=0.1, stiffness_damping=5e-3, boundaries=[ground])
-    state = _roll(solver, solver.init_state(_block(bottom=0.005)), 20)
+    state = _roll(solver, solver.init_state(_block(bottom=0.005)), frames)
     lowest = state.position[:, 2].min()
     assert abs(float(lowest)) < 1e-4
     assert float(state.velocity.norm(dim=-1).max()) < 1e-3
     assert float(state.position[:, 2].mean()) > 0.1
 
 
-@pytest.mark.parametrize("thickness", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
-def test_a_sheet_over_a_ball_stays_outside(sheet, scene, march, thickness):
+@pytest.mark.slow(gate=["12-0.01"])
+@pytest.mark.parametrize("thickness", [0.0, 0.01])
+@pytest.mark.parametrize("per_side", [12, 30])
+def test_a_sheet_over_a_ball_stays_outside(sheet, scene, march, per_side, thickness):
     """Every point keeps half the thickness, but for the overlap that a substep leaves (2 % of a cell)."""
     centre = torch.tensor([0.31, 0.29, -0.26], dtype=torch.float64)
     ball = BallObstacle(centre.tolist(), 0.25)
-    points = sheet(30, 30)
+    points = sheet(per_side, per_side, (0.3 - 0.01 * per_side,) * 2 + (0.0,))
     solver, state = scene(points, boundaries=[ball], stiffness_damping=2e-3)
     if thickness == 0:
         state = solver.init_state(points)
     nearest = min(
-        float((s.position - centre).norm(dim=-1).min()) - 0.25 - thickness / 2 for s in march(solver, state, 0.4)
+        float((s.position - centre).norm(dim=-1).min()) - 0.25 - thickness / 2
+        for s in march(solver, state, 0.2 if per_side == 12 else 0.4)
     )
     assert -0.02 * solver.dx < nearest < 1e-3
 

@@ -12,6 +12,17 @@ def test_column_between_walls_stays_at_rest():
     assert found["kinetic"] < 1e-4
 
 
+def test_taller_and_weaker_columns_spread_further():
+    """A coarse grid, and not yet at rest."""
+    column = {"cells": 3, "duration": 2.0}
+    tall, low, weak = (column_collapse(a, friction_angle=f, **column) for a, f in ((1, 30), (2 / 3, 30), (1, 20)))
+    assert tall["lost"] == 0
+    assert tall["volume_ratio"] == pytest.approx(1.0, abs=0.03)
+    assert low["runout"] < 0.5 * tall["runout"] < 0.5 * tall["lube"]
+    assert weak["runout"] > 1.2 * tall["runout"]
+
+
+@pytest.mark.slow(twin="test_taller_and_weaker_columns_spread_further")
 def test_column_collapses_and_comes_to_rest():
     tall = column_collapse(1.0, cells=6, duration=4.0)
     assert tall["lost"] == 0

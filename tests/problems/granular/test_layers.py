@@ -13,6 +13,7 @@ def test_layer_stands_at_30_and_flows_at_40(device):
     assert speed[1] > 0.15
 
 
+@pytest.mark.slow(twin="test_layer_stands_at_30_and_flows_at_40")
 def test_angle_of_repose_is_that_of_simple_shear():
     found = angle_of_repose(cells=4, seconds=0.2, angles=(33, 34, 35, 36))
     assert (found["stands"], found["flows"]) == (34, 35)
@@ -20,8 +21,9 @@ def test_angle_of_repose_is_that_of_simple_shear():
     assert found["acceleration_error"] < 0
 
 
-def test_volume_correction_takes_back_the_gaps():
-    kept, grown = (tossed_layer(volume_correction=c, seconds=0.3) for c in (True, False))
+@pytest.mark.parametrize(("cells", "seconds"), [(3, 0.25), pytest.param(4, 0.3, marks=pytest.mark.slow)])
+def test_volume_correction_takes_back_the_gaps(cells, seconds):
+    kept, grown = (tossed_layer(volume_correction=c, cells=cells, seconds=seconds) for c in (True, False))
     assert kept["highest"] > 1.1
     assert abs(kept["error"]) < 0.02
     assert grown["error"] > 0.1

@@ -103,7 +103,7 @@ def test_the_film_is_the_run(show, film, run, make_flag):
     assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
-@pytest.mark.slow
+@pytest.mark.slow(twin="test_the_film_is_the_run")
 def test_controls_at_the_size_of_a_phone(show, film):
     """Slider, button and a drag; everything lies within the window."""
     page = show(film, 390, 844)

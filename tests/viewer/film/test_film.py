@@ -1,4 +1,7 @@
-"""What a film holds, against the Gaussians of the run; what is recorded for it; what cannot become a film."""
+"""What a film holds, against the Gaussians of the run; what is recorded for it; what cannot become a film.
+
+Covers: recording.nodes, viewer.film.page, viewer.film.recorded.
+"""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""Small scenes that are built from tensors."""
+"""Small scenes that are built from tensors, as fixtures of conftest.py."""
 
 import math
 

@@ -1,0 +1,60 @@
+"""Every module has its tests, and what the gate leaves to the nightly run has a small twin in the gate."""
+
+import ast
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from nightly import without_a_twin
+
+TESTS = Path(__file__).parents[1]
+PACKAGE = TESTS.parent / "gaussian_swaying"
+
+
+def test_what_is_slow_has_a_twin_in_the_gate(request):
+    """Of the tests that were collected together with this one."""
+    assert without_a_twin([item for item in request.session.items if isinstance(item, pytest.Function)]) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "alone"),
+    [
+        ([("series[large]", {}), ("series[small]", None)], []),
+        ([("series[large]", {"gate": ["small"]}), ("series[small]", {"gate": ["small"]})], []),
+        ([("series[large]", {"gate": ["tiny"]}), ("series[small]", {"gate": ["tiny"]})], ["series", "series[tiny]"]),
+        ([("series[large]", {}), ("series[cuda]", "gpu")], ["series"]),
+        ([("whole", {})], ["whole"]),
+        ([("whole", {"twin": "sample"}), ("sample", None)], []),
+        ([("whole", {"twin": "sample"}), ("sample", {})], ["whole", "sample"]),
+        ([("whole", {"twin": "sample"})], ["whole"]),
+    ],
+)
+def test_a_twin_runs_in_the_gate(given, alone):
+    """On a GPU slow tests of the interpreter are quick, so a test that needs one is no twin."""
+
+    def item(name, mark):
+        name, _, parameters = name.removesuffix("]").partition("[")
+        marks = {"gpu": mark} if mark == "gpu" else {} if mark is None else {"slow": SimpleNamespace(kwargs=mark)}
+        more = {"callspec": SimpleNamespace(id=parameters)} if parameters else {}
+        return SimpleNamespace(originalname=name, get_closest_marker=marks.get, **more)
+
+    assert without_a_twin([item(*each) for each in given]) == alone
+
+
+def test_every_module_has_a_test_file_of_its_name_or_is_named_in_the_one_that_covers_it():
+    """`tests/mpm/test_guard.py` is that of `mpm/guard.py`; others are in a line `Covers: mpm.body` of one."""
+    named = [name for path in TESTS.rglob("test_*.py") for name in _covered(path)]
+    modules = {path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py")}
+    modules = {".".join(path.parts): path for path in modules if path.name != "__init__"}
+    own = [
+        name for name, path in modules.items() if (TESTS / path.parent / f"test_{path.name.lstrip('_')}.py").exists()
+    ]
+    assert len(own) > 100
+    assert sorted(set(modules) - {*own, *named}) == []
+    assert sorted(set(named) - set(modules)) == []  # moved or gone
+
+
+def _covered(path):
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    _, _, names = docstring.partition("\nCovers: ")
+    return names.partition("\n\n")[0].rstrip(".").replace("\n", " ").replace(",", " ").split()
