@@ -136,7 +136,7 @@ class Replayed:
 
     @property
     def recorded(self) -> bool:
-        """Whether there is a recording."""
+        """True if a graph has been recorded."""
         return self._graph is not None
 
     def __call__(

@@ -193,14 +193,14 @@ class AeroForce(nn.Module):
 
     @property
     def idle(self) -> bool:
-        """Whether the force is zero in any wind, so that it need not be computed."""
+        """True if the force is zero in any wind, so that it need not be computed."""
         coefficients = (self.C_D, self.C_F, self.C_L)
         needed = any(float(c.detach()) or c.requires_grad for c in coefficients)
         return self.air_density == 0 or not needed
 
     @property
     def mostly_linear(self) -> bool:
-        """Whether less than 5 % of the force depends on the side of the patch that the flow meets."""
+        """True if less than 5 % of the force depends on the side of the patch that the flow meets."""
         drag, friction, lift = (float(c.detach()) for c in (self.C_D, self.C_F, self.C_L.abs()))
         sided = lift / max(drag + friction + lift, 1e-30)
         return self.law != "paper" and not self.unit_tangent and sided < 0.05

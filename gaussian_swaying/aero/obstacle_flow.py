@@ -22,7 +22,9 @@ PLANE_GROWTH = 0.29 / math.sqrt(2 * math.log(2))
 """Standard deviation of a plane wake per root of thickness times distance (Wygnanski and others 1986)."""
 
 ROUND_GROWTH = 0.05
-"""How fast a round wake widens: 0.03 in smooth wind, 0.05 in gusty wind (Bastankhah & Porté-Agel 2014)."""
+"""Growth of the width of a round wake per distance: 0.03 in smooth wind, 0.05 in gusty wind (Bastankhah & Porté-Agel
+2014).
+"""
 
 
 def sphere_flow(velocity: Tensor, place: Tensor, radius: float) -> Tensor:

@@ -171,11 +171,11 @@ class CylinderObstacle(Obstacle):
         return across / speed.clamp(min=1e-12), speed
 
     def turns(self, flow: Tensor, carried: Tensor) -> Tensor:
-        """How far the street is on its way to the next vortex, from 0 to 1.
+        """Return the phase of the vortex street: the share of the way to the next vortex, from 0 to 1.
 
         Args:
             flow: The mean flow [m/s], shape (..., 3), float64.
-            carried: How far it has carried the air since time zero [m], shape (..., 3), float64.
+            carried: Displacement of the air by it since time zero [m], shape (..., 3), float64.
 
         Returns:
             Shape (...).

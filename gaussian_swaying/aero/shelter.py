@@ -1,4 +1,4 @@
-"""How a body slows the wind on its way through it, so that the inner leaves of a crown feel less."""
+"""Shelter: a body slows the wind on its way through, so that the inner leaves of a crown feel less of it."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def resolved_share(length: float, spacing: tuple[float, float, float], spectrum:
 
 
 def shear_time(k: Tensor, length: float, gamma: float) -> Tensor:
-    r"""How far the mean shear turns eddies of a wave number before they break up: Mann's beta.
+    r"""Return the dimensionless life time of eddies in the mean shear, by wave number: Mann's beta.
 
     .. math::
         \beta(k) = \Gamma\, (k a)^{-2/3} \bigl[ {}_2F_1(\tfrac13, \tfrac{17}6; \tfrac43; -(k a)^{-2}) \bigr]^{-1/2}

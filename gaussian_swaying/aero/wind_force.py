@@ -106,12 +106,12 @@ class WindForce(Force):
 
     @property
     def uniform(self) -> bool:
-        """Whether the wind is the same everywhere in a scene."""
+        """True if the wind is the same everywhere in a scene."""
         return all(isinstance(w, WindBatch) or (isinstance(w, WindField) and w.uniform) for w in self._fields)
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
-        """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
+        """True if a CUDA graph can record all winds, that is, spatial winds and modulations are ``recordable``."""
         return all(
             wind.recordable and (isinstance(wind, (SpatialWind, WindBatch)) or type(wind) is WindField)
             for wind in self._fields
@@ -288,7 +288,7 @@ class WindForce(Force):
 
     @property
     def has_twin(self) -> bool:
-        """Whether the kernels can compute the force: they must know all effects, and the lists must not be too long."""
+        """True if the kernels can compute the force: they know all effects, and the lists are not too long."""
         wind = self._fields[0]
         known = self.uniform or (self._shared and isinstance(wind, WindField) and has_twin(wind))
         return known and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
@@ -340,7 +340,7 @@ class WindForce(Force):
         )
 
     def _packed(self) -> Packed:
-        """What the kernels read of the effects; what has changed is written again, in place where possible."""
+        """Return the data of the effects for the kernels; what changed is written again, in place where possible."""
         wind = self._fields[0]
         assert isinstance(wind, WindField)
         with torch.inference_mode(False), torch.no_grad():

@@ -1,4 +1,4 @@
-"""What a simulation was made from, as plain data: two that differ are told apart, also where no YAML says so."""
+"""The arguments of a simulation as plain data, so that two that differ can be told apart, also if made in Python."""
 
 from __future__ import annotations
 

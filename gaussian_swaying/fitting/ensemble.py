@@ -22,7 +22,7 @@ from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 
 SAFETY = 1.15
-"""How much stiffer than at rest the material may become before a rollout is repeated with shorter substeps."""
+"""First factor on the wave speed at rest that substeps allow for; a rollout above it is repeated with shorter ones."""
 CFL_LIMIT = 0.5
 RETRIES = 3
 MARGINS = (0, 16, 64)

@@ -1,4 +1,4 @@
-"""What a video says about variants of a simulation: differences of tracks, silhouettes and pixels, as residuals."""
+"""Residuals between variants of a simulation and a video: differences of tracks, silhouettes and pixels."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Evidence(ABC):
 
 
 class TrackEvidence(Evidence):
-    """Where the simulation carries the Gaussians that were followed, against where they were seen [pixels]."""
+    """Residuals of tracks: positions of Gaussians in the simulation minus those tracked in the video [pixels]."""
 
     kind, floor = "tracks", 0.05
 

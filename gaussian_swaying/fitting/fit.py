@@ -66,22 +66,22 @@ COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
 TOLERANCE = 3e-4
 """Shortest step of the last stage, as a share of the ranges."""
 ROUGH = 30
-"""How many times less exact the other steps are."""
+"""Factor by which the tolerance of the other steps is larger."""
 
 Say = Callable[[str], None]
 
 
 @dataclass
 class Course:
-    """Where a fit stands, as ``fit.json`` keeps it.
+    """The resume state of a fit, as ``fit.json`` stores it.
 
     Attributes:
         step: Number of the step, which is a stage at a horizon.
-        place: Shares of the ranges.
-        matched: Where the Gaussians of the current step were matched; empty if they were not.
+        place: Values of the unknowns, as shares of their ranges.
+        matched: Values (as shares) at which the Gaussians of the current step were matched; empty if they were not.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
-        ended: Why the iterations of this step ended; empty if they did not.
+        ended: The reason why the iterations of this step ended; empty if they did not.
         stiffening: See :class:`~gaussian_swaying.fitting.ensemble.Ensemble`.
         history: One row for each iteration.
         directions: The principal directions of the sensitivities.
@@ -149,7 +149,7 @@ class Fit:
         return self._tracks
 
     def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
-        """What a stage compares."""
+        """Return the residuals of a stage, one list entry for each video and kind."""
         found: list[Evidence] = []
         if stage == "pixels":
             return [PictureEvidence(video, masks=False) for video in self.videos]
@@ -433,7 +433,7 @@ def fit(
 
 
 def _described(plan: Plan, simulation: Simulation) -> dict[str, Any]:
-    """What a fit must have in common with the one that it continues."""
+    """Return the resume key: all settings that must be the same in a fit and the one that it continues."""
     own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
     sought = {u.name: [u.low, u.high, u.scale, u.start] for u in plan.unknowns}
     own = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}

@@ -71,7 +71,7 @@ class Normal:
 
 @dataclass
 class Progress:
-    """Where an optimisation stands; enough to continue it.
+    """The state of an optimisation; enough to continue it.
 
     Attributes:
         place: Shares of the ranges, shape (U,).
@@ -79,7 +79,7 @@ class Progress:
         iteration: Iterations done.
         normal: The sums at ``place``; None if they are to be computed.
         scales: Standard deviations of each kind of residual there.
-        done: Why it ended; empty if it did not.
+        done: The reason why it ended; empty if it did not.
     """
 
     place: Tensor

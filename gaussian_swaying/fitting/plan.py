@@ -1,4 +1,4 @@
-"""What a fit does: the file ``fit.yaml``, checked."""
+"""The settings of a fit: the file ``fit.yaml``, checked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 STAGES = ("tracks", "silhouettes", "matches", "pixels")
-"""What is compared, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
+"""Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
 frames of the video, three rounds; colours."""
 
 _FIELDS = (
@@ -39,7 +39,7 @@ _FIELDS = (
 
 @dataclass(frozen=True)
 class Plan:
-    """What a fit does.
+    """The settings of a fit.
 
     Args:
         base: Configuration files of ``sim``: the splat, the solver, and first values.

@@ -1,4 +1,4 @@
-"""What is sought: an option of the simulation with a range, and how its value gets into a variant of a simulation."""
+"""An unknown of a fit: a number of the simulation with a range, and how variants of a simulation get its value."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Unknown:
         return self.low + share * (self.high - self.low)
 
     def share(self, value: float) -> float:
-        """Where in the range a value lies."""
+        """Return the share of the range at which a value lies, 0 to 1; logarithmic if ``scale`` is."""
         if self.scale == "log":
             return math.log(value / self.low) / math.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)

@@ -79,7 +79,7 @@ def grid_groups(
 
 @torch.no_grad()
 def loose_points(points: Tensor, side: float) -> Tensor:
-    """Which points hang on nothing, or by a thread, so that the wind would blow them off a grid.
+    """Return a mask of points connected to nothing, or by a thread only: on a grid, the wind would blow them away.
 
     One point of each cube counts, the one nearest to the centre of its cube's points, and two of them are connected if
     they are at most two sides apart, as are points in cubes side by side. Loose are

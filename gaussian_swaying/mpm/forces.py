@@ -128,7 +128,7 @@ class Force(Recordable, nn.Module, ABC):
 
     @property
     def has_twin(self) -> bool:
-        """Whether there is a :meth:`twin`."""
+        """True if there is a :meth:`twin`."""
         return False
 
     def twin(self) -> ForceTwin:

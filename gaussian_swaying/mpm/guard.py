@@ -1,4 +1,4 @@
-"""What a rollout is checked for: what it is given before it begins, and its state at the end.
+"""Checks of a rollout: its arguments before it begins, and its state at the end.
 
 Nothing that is checked before the substeps makes the host wait, and the end is one wait for all checks together.
 """

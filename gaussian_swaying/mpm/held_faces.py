@@ -1,4 +1,4 @@
-r"""Where held material ends: the face between what a clamp holds and what is free, and whether a body is a sheet there.
+r"""Faces between clamped and free material, and the test whether a body is a sheet there.
 
 A clamped solid does not move at that face; its strain across the face is free. So a clamp holds rows on the face
 (:mod:`~gaussian_swaying.mpm.point_holds`): the mean displacement of patches of half a cell, and its slopes along the

@@ -38,7 +38,7 @@ class GridSpec:
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
     def holds(self, other: GridSpec) -> bool:
-        """Whether all nodes of another grid are among those of this one."""
+        """True if all nodes of another grid are among those of this one."""
         inside = (
             a <= b and b + m <= a + n
             for a, n, b, m in zip(self.offset, self.resolution, other.offset, other.resolution, strict=True)

@@ -170,7 +170,7 @@ def rounding_speed(speed: float, dt: float, steps: float, dx: float, dtype: torc
 
 
 def kick_time(state: MPMState, dt: float) -> float:
-    """How long forces act in a substep of ``dt`` [s] that starts at a state; see ``MPMSolver.step``."""
+    """Return the time for which forces act in a substep of ``dt`` [s] from a state; see ``MPMSolver.step``."""
     return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
 

@@ -74,7 +74,7 @@ def _begun(pid: int) -> str:
 
 
 def _alive(pid: int, begun: str) -> bool:
-    """Whether a process of this host is still running; True if that cannot be known."""
+    """True if a process of this host is still running, or if that cannot be known."""
     if os.name == "nt":  # signal 0 would end it there
         return True
     try:

@@ -79,7 +79,7 @@ class Obstacle(Boundary):
 
     @property
     def still(self) -> bool:
-        """Whether it never moves."""
+        """True if it never moves."""
         return self.path is None
 
     def fastest(self, farthest: float, start: float = -math.inf, end: float = math.inf) -> float:

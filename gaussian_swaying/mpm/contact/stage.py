@@ -22,7 +22,7 @@ LEAST_MARGIN = 0.5
 """Least distance beyond contact within which pairs are listed [cells]."""
 
 ARM = 1.2
-"""How much farther a place may move than any material point."""
+"""Bound on the motion of a contact sample, relative to the largest motion of the material points."""
 
 TOLERANCE = 5e-5
 """Violation of a constraint within a substep at which the impulses are good enough [cells]."""
@@ -36,7 +36,7 @@ APART = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Lists:
-    """What may touch until the nodes have moved half the margin.
+    """Candidates for contact: all pairs that may touch before the nodes have moved half the margin.
 
     Attributes:
         place: The places that occur, shape (A,).
@@ -131,7 +131,7 @@ class ContactStage:
             self.apart = max(APART * self.dx, 3 * thickest)
         self.lists: Lists | None = None
         self.made = 0
-        """How often the lists were made."""
+        """Number of times that the lists were made."""
 
     # ---- lists
 
@@ -292,7 +292,7 @@ class ContactStage:
         return Constraints(*fields), owner
 
     def positions(self, displacement: Tensor) -> Tensor:
-        """Where the places are now [m], shape (C, 3), from the node displacement (..., G, 3)."""
+        """Return the positions of the contact samples [m], shape (C, 3), from the node displacement (..., G, 3)."""
         return self.surface.place + weighted(displacement.reshape(-1, 3), self.node, self.weight)
 
     def normals(self, place: Tensor, displacement: Tensor) -> Tensor:

@@ -310,7 +310,7 @@ def _count_nodes(
     entry_start, entry_place, entry_weight, reached, marked, total, touched, nodes, many, WALLS: tl.constexpr,
     programs, TALL: tl.constexpr,
 ):  # fmt: skip
-    """How much unit impulses at all constraints move each node, at most; zero where there are none.
+    """Sum the weights of all constraints at each node: the most that unit impulses at them move it; zero without any.
 
     Nodes far from all constraints are not summed: they are not marked, or without obstacles have no pairs around them.
     """

@@ -89,7 +89,7 @@ class FusedTotal(Fused):
             kind == "surface" or (type(b) in pins and b.start <= 0 and b.end == math.inf)
             for b, kind in zip(body.boundaries, bound.kinds, strict=True)
         )
-        """Whether the kernels apply all boundaries but obstacles, which are contact."""
+        """True if the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
         self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
@@ -100,7 +100,7 @@ class FusedTotal(Fused):
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
 
     def _take_pins(self) -> None:
-        """What pins without a window hold: nodes, and points."""
+        """Collect the nodes and points that pins without a time window hold."""
         bound, active = self.bound, self.active.long()
         owner = torch.full((self.bound.node_mass.numel(),), -1, device=self.device)
         for k in reversed(range(len(bound.held)) if self.plain else ()):  # the first pin takes the momentum
@@ -305,7 +305,7 @@ class FusedTotal(Fused):
         return views
 
     def _fields(self, found: Tensor, taken_and_done: Tensor, part: Part) -> dict[str, Any]:
-        """What :meth:`_read` wrote, by the names of the state."""
+        """Return the fields that :meth:`_read` wrote, by the names of the state."""
         views, taken = self._views(found), self.impulse.numel()
         F, work = views["F"], {"work": taken_and_done[taken:].view(self.body.points.mass.shape[:-1])}
         return {
