@@ -184,7 +184,7 @@ class MPMSolver(nn.Module):
         self._bound = bound
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:
-        """Return why the Triton kernels are not used, if so; ValueError if they cannot be, but ``transfer`` is triton."""
+        """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is triton."""
         if self.transfer == "torch":
             return "`transfer` is torch"
         try:
