@@ -89,7 +89,7 @@ class Solids:
 
     @property
     def options(self) -> tuple[int, ...]:
-        """Return the constants of the nodes' kernels: for each solid, twice the number of its kind, plus 1 if it moves."""
+        """Return constants for compiling the nodes' kernels: for each solid, twice its kind, plus 1 if it moves."""
         return tuple(2 * kind + int(moves) for kind, moves in zip(self.kinds, self.moves, strict=True))
 
     def take(self) -> None:
