@@ -32,7 +32,7 @@ class Moment:
 
 
 class WindEffect(Recordable, nn.Module, ABC):
-    """Base of what changes the wind from place to place.
+    """Base of effects, which change the wind from place to place.
 
     A subclass has a ``forward``, and sets ``recordable = True`` if that can be recorded in a CUDA graph (see
     ``Force``). Places are in metres, z up, from the centre of the object at rest; in a configuration they are in scene

@@ -42,7 +42,7 @@ class Packed(NamedTuple):
         kinds: The number of effects, and five for each: its kind, where its table starts, and whether that repeats
             along each axis; of an obstacle, whether it has a wake, and where its street is.
         space: A header for each effect, and then their tables, float32, shape (n,).
-        keys: What the numbers of each effect depended on.
+        keys: Key of each effect; its numbers are valid as long as the key does not change.
     """
 
     kinds: tuple[int, ...]
@@ -148,7 +148,7 @@ def vectors(wind: WindField, velocity: Tensor, times: Tensor) -> Tensor:
 
     Returns:
         Velocity, place of the object's centre in a carried field [cells], its strength [m/s], and if the flow matters
-        the mean flow [m/s] and how far each street of vortices is; shape (n, 7), or (n, 10 + streets).
+        the mean flow [m/s] and the phase of each vortex street; shape (n, 7), or (n, 10 + streets).
     """
     place, strength = torch.zeros_like(velocity), torch.zeros_like(velocity[:, :1])
     if not any(isinstance(effect, CarriedField | Obstacle) for effect in wind.effects):

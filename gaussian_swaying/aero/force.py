@@ -124,13 +124,13 @@ def capped_area(area: Tensor, rest_area: Tensor, max_ratio: float) -> Tensor:
         max_ratio: Largest allowed ratio of the two; infinite for no cap.
 
     Returns:
-        Shape (..., P). The gradient with respect to ``area`` is zero where the cap holds.
+        Shape (..., P). The gradient with respect to ``area`` is zero where the cap applies.
     """
     return area if max_ratio == math.inf else torch.minimum(area, max_ratio * rest_area)
 
 
 class AeroForce(nn.Module):
-    """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
+    """Wind on surface patches: stores the coefficients and calls :func:`aero_force`.
 
     The paper's coefficients are visual parameters. For comparison, a flat plate across the flow has a C_D of about 1.2,
     and skin friction is about 0.005. In Python the three coefficients may be tensors, which keep their gradient.

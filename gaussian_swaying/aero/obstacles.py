@@ -47,7 +47,7 @@ class Obstacle(WindEffect):
 
     @abstractmethod
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
-        """Share of the speed that is missing at places from the centre, (..., P), and what swirls, (..., P, 3)."""
+        """Velocity deficit as a share of the speed (..., P), and velocity of the vortices [m/s] (..., P, 3) or None."""
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         """See :class:`~gaussian_swaying.aero.effects.WindEffect`."""

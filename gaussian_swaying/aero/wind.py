@@ -131,7 +131,7 @@ class UniformGust(Modulation):
 
     Args:
         delta: Half width of the distribution; not given in the paper.
-        interval: Time between samples [s]; each holds until the next.
+        interval: Time between samples [s]; each applies until the next.
     """
 
     recordable = True
@@ -153,7 +153,7 @@ class GaussianGust(Modulation):
 
     Args:
         std: Standard deviation [m/s]; the paper uses 0.3.
-        interval: Time between samples [s]; each holds until the next. Not given in the paper. White noise drawn once
+        interval: Time between samples [s]; each applies until the next. Not given in the paper. White noise drawn once
             per substep would fade as substeps get shorter, so samples are drawn at fixed times instead.
     """
 
@@ -175,7 +175,7 @@ class FlowKey:
     """One entry of a schedule.
 
     Args:
-        time: Time from which the flow holds [s].
+        time: Time from which the flow applies [s].
         flow: Air velocity [m/s], z up; in Python also a tensor, as in a :class:`WindField`.
     """
 
@@ -232,10 +232,10 @@ class WindField(nn.Module):
 
     Args:
         flow: Steady air velocity [m/s], z up. In Python also a tensor of shape (3,), which keeps its gradient.
-        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time. Or
-            the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
+        schedule: Flow that changes over time, used instead of ``flow``; the first entry also applies before its time.
+            Or the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
             interpolation.
-        interpolation: Between entries of the schedule: ``step`` (hold) or ``linear``.
+        interpolation: Between entries of the schedule: ``step`` (constant until the next) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.
         effects: What differs from place to place, applied in order after the modulations: a profile, turbulence,

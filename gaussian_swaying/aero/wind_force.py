@@ -254,7 +254,7 @@ class WindForce(Force):
         return tensors_in(self._shelters())
 
     def refresh(self, state: MPMState) -> None:
-        """Take in how the body stands now, for :class:`~gaussian_swaying.aero.shelter.Shelter`; once in a frame.
+        """Update each :class:`~gaussian_swaying.aero.shelter.Shelter` from the body's present shape; once in a frame.
 
         Args:
             state: The state at the start of the frame.
@@ -274,7 +274,7 @@ class WindForce(Force):
                 shelter.refresh(state.position, area, axes)
 
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
-        """See ``Force.during``: what does not depend on the place is computed for all substeps at once."""
+        """See ``Force.during``: a uniform wind is computed for all substeps at once."""
         if self.uniform:
             winds = self.winds(time, dt, steps)
             return lambda state, k: self.force(state, winds[k])

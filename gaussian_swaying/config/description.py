@@ -18,7 +18,7 @@ def describe(value: Any) -> Any:
         value: A number, text, tensor, list, mapping, dataclass, module or any other object with public attributes.
 
     Returns:
-        What YAML can hold; a tensor is its shape and a checksum. The same for equal values, in every process.
+        Plain data for YAML; a tensor becomes its shape and a checksum. Equal values give equal data, in every process.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value

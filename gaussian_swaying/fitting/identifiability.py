@@ -23,7 +23,7 @@ class Direction:
         strength: Singular value: change of the residuals, in standard deviations, when the unknowns move along the
             direction by the whole of their ranges.
         parts: Share of each unknown, of length one.
-        sentence: What the direction is, in words.
+        sentence: The direction in words.
     """
 
     strength: float

@@ -44,9 +44,9 @@ class Plan:
     Args:
         base: Configuration files of ``sim``: the splat, the solver, and first values.
         videos: Folders with transforms.json.
-        unknowns: What is sought.
+        unknowns: The unknowns.
         known: Options of ``sim`` that replace those of the base.
-        stages: What is compared, see :data:`STAGES`; silhouettes are left out if the video has none.
+        stages: The stages, see :data:`STAGES`; silhouettes are left out if the video has none.
         fit_share: Share of the frames that is fitted; the rest is predicted.
         until: Fit the frames up to this time [s] instead of a share of them.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
@@ -157,7 +157,7 @@ def read_unknown(name: str, given: Any) -> Unknown:
 
 
 def parse_base(plan: Plan, parser: ArgumentParser) -> Namespace:
-    """The settings of the base with what is known.
+    """The settings of the base, with the known options.
 
     Raises:
         ArgumentError: If ``sim`` has no such option or does not accept a value.

@@ -78,7 +78,7 @@ class Result:
 
     @property
     def values(self) -> dict[str, float]:
-        """The values."""
+        """Values of the unknowns that were found."""
         return {u.name: u.value(share) for u, share in zip(self.unknowns, self.place, strict=True)}
 
     @property
@@ -119,7 +119,7 @@ class Result:
         ]
 
     def text(self) -> str:
-        """The table and what is to be said about it, for printing."""
+        """The table with warnings and remarks, for printing."""
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())

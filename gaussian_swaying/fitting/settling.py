@@ -13,7 +13,7 @@ from gaussian_swaying.fitting.unknowns import Unknown
 FAR = 0.005
 """Step, as a share of a range, above which the values have not settled."""
 GAIN = 0.003
-"""Share of the cost that such a step must be expected to gain: it changes nothing that is seen otherwise."""
+"""Least expected relative decrease of the cost by such a step; below it, the step would change nothing visible."""
 
 _BEGIN = "put `pixels` last in `stages`, raise `search`, or give a `start` that is nearer"
 

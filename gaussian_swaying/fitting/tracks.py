@@ -37,8 +37,8 @@ OPAQUE = 0.3
 BEHIND = 0.03
 """Largest depth of a visible Gaussian behind the rendered depth, as a share of the object's size."""
 THIN = 0.25
-"""Share of the Gaussians in sight that must lie inside the object, a window away from its border, to leave the others
-out. Of a thing as thin as a window all are kept."""
+"""Gaussians near the border of the object are left out if at least this share of the visible ones lies a window away
+from it. In an object as thin as a window, all are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Tracks:
     Attributes:
         index: Their places among the moving Gaussians of the scene, shape (T,).
         position: Where each was seen [pixels], float64, shape (F, T, 2).
-        seen: Whether the track still holds, bool, shape (F, T).
+        seen: Whether the track is still valid, bool, shape (F, T).
     """
 
     index: Tensor
@@ -78,13 +78,14 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
     Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
     simulation must already be near, within a few tens of pixels.
 
-    Of Gaussians that overlap, the nearest are drawn, so the print of a splat is seen beside their centres, by a part
-    of a pixel that depends on how the surface is turned (:func:`drawn_beside`). A video of the thing does not have
-    that, and one that was made with the splat has it, too. The first frame tells: it is at rest, and simulation and
-    video are alike. What is left there comes from a camera that is not quite right: its median is taken off everywhere.
+    Where Gaussians overlap, the picture shows mostly the nearest ones. So it shows a Gaussian beside its projected
+    centre, by a part of a pixel that depends on the angle of view (:func:`drawn_beside`). A video of the real object
+    does not have this offset; one that was rendered from the splat has it, too. The first frame, at rest, shows which
+    is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
+    all frames.
 
-    Near the border of the object a window holds more border than print, and the border of a splat is not quite that
-    of the thing. Such Gaussians are left out.
+    Near the border of the object a window shows more border than texture, and the border of a splat is not quite that
+    of the real object. Such Gaussians are left out.
 
     Args:
         simulation: The scene.
@@ -174,7 +175,7 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
         start: Points in the first frame [pixels; the first pixel's centre is at 0.5], shape (T, 2).
 
     Returns:
-        NumPy arrays: positions, float64, shape (F, T, 2), and whether each still holds, shape (F, T).
+        NumPy arrays: positions, float64, shape (F, T, 2), and whether each is still valid, shape (F, T).
     """
     import numpy as np
 
@@ -260,7 +261,7 @@ def _grey(images: Tensor) -> Any:
 
 
 def opencv() -> Any:
-    """The module ``cv2``, which follows points.
+    """Import and return ``cv2`` (OpenCV), which tracks points.
 
     Raises:
         ImportError: If OpenCV is not installed.

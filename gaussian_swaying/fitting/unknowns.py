@@ -16,7 +16,7 @@ SCALES = ("log", "linear")
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that is sought.
+    """An unknown of a fit.
 
     Args:
         name: The option of ``sim``, such as ``material.E``; or ``wind.speed`` [m/s], ``wind.azimuth`` [degrees, from +x
@@ -24,7 +24,7 @@ class Unknown:
         low: Smallest value.
         high: Largest value.
         scale: ``log`` or ``linear``.
-        start: Where to start; None for a coarse search over the range.
+        start: First value; None for a coarse search over the range.
 
     Raises:
         ValueError: If the name is unknown or the range makes no sense; the message names the unknown.
@@ -86,7 +86,7 @@ def default_scale(name: str, low: float) -> str:
 
 
 def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
-    """Raise ValueError if a simulation has no place for an unknown; the message names it and the remedy."""
+    """Raise ValueError if a simulation has no such parameter as an unknown; the message names it and the remedy."""
     names = [unknown.name for unknown in unknowns]
     if not names:
         raise ValueError("Expected `unknowns` to have at least one entry, such as wind.speed: add it.")

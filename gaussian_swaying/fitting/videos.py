@@ -84,7 +84,7 @@ class _Room:
             )
 
     def take(self, path: Path, width: int, height: int) -> None:
-        """Make room for one frame of a file.
+        """Count one more frame of a file.
 
         Raises:
             ValueError: If it does not fit any more.

@@ -1,4 +1,4 @@
-"""Fewer points for a coarse grid: groups of points that share a small part of a cell, and specks that hang on nothing.
+"""Fewer points for a coarse grid: groups of points that share a small part of a cell, and specks without connection.
 
 A grid carries no more information than its nodes, and captures have many more Gaussians than a cell can tell apart.
 """
@@ -90,8 +90,8 @@ def loose_points(points: Tensor, side: float) -> Tensor:
 
     Args:
         points: Points, shape (N, 3).
-        side: Side of the cubes, in the unit of the points, less than half the spacing of the grid. What is farther
-            apart than one spacing shares only the rims of its kernels, and moves apart without strain.
+        side: Side of the cubes, in the unit of the points, less than half the spacing of the grid. Points farther apart
+            than one spacing share only nodes with small weights, and can move apart without strain.
 
     Returns:
         Booleans, shape (N,); none if otherwise all would be loose.

@@ -21,7 +21,7 @@ LARGEST_MESH = 1 << 28
 """Largest file of a mesh [bytes]; some three million vertices as .obj."""
 
 MOST_SQUARES = 10_000_000
-"""Most squares of a cell of the distance grid under all triangles of a mesh, each as a square of its longest side."""
+"""Bound on the size of a mesh: the sum of (longest side / cell of the distance grid)² over its triangles."""
 
 _DISAGREE = 0.02
 """Share of the nodes next to which the rays along the three axes may disagree; more of them mean a hole."""

@@ -266,7 +266,7 @@ class MPMSolver(nn.Module):
             velocity: Initial velocity [m/s], shape (..., P, 3); zero if None.
             margin: Cells around the object in the first grid of the ``updated`` formulation.
             frame: Transform from scene units to metres, for boundaries in scene units; None if they are in metres.
-            surface: The places that touch; None for the material points, which then touch obstacles only.
+            surface: Contact samples of the surface; None for the material points, which then touch obstacles only.
 
         Returns:
             The state, with the device and dtype of ``points``.

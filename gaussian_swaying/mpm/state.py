@@ -71,7 +71,7 @@ class GridSpec:
 
 
 def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec:
-    """The smallest box of the lattice that holds the stencils of all points between two corners.
+    """The smallest box of the lattice that contains the stencils of all points between two corners.
 
     It rounds as :func:`~gaussian_swaying.mpm.transfer.bspline_stencil` does, in the precision of the points: where a
     corner lies on a border between two stencils, another rounding would leave the points there outside of the grid.
@@ -248,7 +248,7 @@ class MPMState:
             law has one.
         substep: Length of the last substep [s]; 0 at the start.
         work: Work of the external forces since the start [J], shape (...) over the batch, float64.
-        impulse: Momentum that each boundary took from the body since the start [N s], in the order of the boundaries,
+        impulse: Reaction impulse: momentum that each boundary took from the body since the start [N s], in their order,
             shape (..., B, 3), float64; see :func:`support_force`.
     """
 

@@ -24,7 +24,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
 
 BY_BODY = "by body"
-"""The kind of a pin that holds a sheet by a hinge, and anything else by a clamp."""
+"""The kind of a pin that becomes a hinge for a sheet, and a clamp for anything else."""
 
 CLOCK = 1e-9  # round-off of a time after many additions of a substep [s]
 _Kind = TypeVar("_Kind", bound="Boundary")

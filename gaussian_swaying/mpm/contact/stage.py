@@ -1,4 +1,4 @@
-"""The contact of a body in ``total``: which places may touch, and what a substep does about it."""
+"""Contact of a body in ``total``: lists of samples that may touch, and the impulses of a substep."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOLERANCE = 5e-5
 """Violation of a constraint within a substep at which the impulses are good enough [cells]."""
 
 AHEAD = 3.0
-"""For how many substeps ahead points are followed before the lists are made again."""
+"""Substeps by which the motion of points is extrapolated, to make the lists again before they are incomplete."""
 
 APART = 2.0
 """Places closer than this at rest [cells] are neighbours: they share nodes, and a fold cannot be sharper."""
@@ -81,7 +81,7 @@ def in_fixed_order(wanted: bool) -> Iterator[None]:
 class ContactStage:
     """Contact of a body with obstacles and with itself, bound to its grid.
 
-    The lists of what may touch are a cache: a state decides alone what happens, whatever was stepped before.
+    The lists of what may touch are only a cache: the result of a substep depends on its state, not on earlier substeps.
 
     Args:
         surface: The places that touch.

@@ -126,7 +126,7 @@ class Formulation(ABC):
         )
 
     def no_impulse(self) -> Tensor:
-        """A momentum of zero for each boundary, shape (..., B, 3), float64."""
+        """A reaction impulse of zero for each boundary, shape (..., B, 3), float64."""
         position = self.body.points.position
         shape = (*position.shape[:-2], len(self.kinds), 3)
         return torch.zeros(shape, dtype=torch.float64, device=position.device)
@@ -136,7 +136,7 @@ class Formulation(ABC):
         """The state with a grid for the next ``horizon`` seconds; see ``MPMSolver.fit_grid``."""
 
     def bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
-        """The smallest grid that holds the stencils of all particles.
+        """The smallest grid that contains the stencils of all particles.
 
         Args:
             position: Particle position [m], shape (..., P, 3).

@@ -127,7 +127,7 @@ class Total(Formulation):
         return self.kinds[k] == "clamp" and held is not None and held.release is None
 
     def _soften(self) -> None:
-        """Take most of the stiffness from what clamps hold all the time, see ``held_faces.SOFTENED``."""
+        """Reduce the stiffness of material that clamps hold all the time, see ``held_faces.SOFTENED``."""
         masks = [
             held.mass > 0
             for k, (held, boundary) in enumerate(zip(self.body.held, self.body.boundaries, strict=True))
@@ -245,7 +245,7 @@ class Total(Formulation):
         return self.read_particles(state, displacement + dt * velocity, velocity)
 
     def touch(self, velocity: Tensor, displacement: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the impulses of contact; also the momentum that each boundary took, as :meth:`hold`."""
+        """Apply the impulses of contact; return velocity and reaction impulse on each boundary, as :meth:`hold`."""
         assert self.contact is not None
         velocity, taken = self.contact.apply(velocity, displacement, time, dt)
         return velocity, taken.reshape(*velocity.shape[:-2], -1, 3)

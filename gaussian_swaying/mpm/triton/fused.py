@@ -56,7 +56,7 @@ class Part:
         looks: Numbers of the substeps after which the wave speed is measured.
         loaded: Whether the work of a load is counted.
         begin: ``begin(n)`` fills what n substeps read besides the state and the schedule.
-        key: What ``begin`` depends on; None if it cannot be recorded.
+        key: Key of the data that ``begin`` reads; None if it cannot be recorded.
     """
 
     steps: int
@@ -118,7 +118,7 @@ class Fused(ABC):
         """True if rollouts can measure the wave speed."""
         self.speed = torch.zeros(1, device=self.device)
         self.impulse = bound.no_impulse()
-        """Momentum that each boundary took in the current part of the rollout, shape (..., B, 3)."""
+        """Reaction impulse: momentum that each boundary took in the current part of the rollout, shape (..., B, 3)."""
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in bound.settings.gravity]
@@ -150,7 +150,7 @@ class Fused(ABC):
         return None
 
     def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
-        """The rollouts with gradients in kernels; or None, and why they need torch."""
+        """Return the rollouts with gradients in kernels; or None, and the reason why they need torch."""
         return None, "only the total formulation has backward kernels"
 
     @property
@@ -344,7 +344,8 @@ class Fused(ABC):
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
         """Copy the state to the buffers, run the substeps, and return the fields of the new state.
 
-        ``impulse`` is what the boundaries took in this part, and ``work``, if it is loaded, the work of the load in it.
+        ``impulse`` is the reaction impulse on the boundaries in this part, and ``work``, if it is loaded, the work of
+        the load in it.
         """
 
     def _work(self) -> Tensor:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.formulations.total import Total
 
 ROOM, SLOTS = 64, 16
-"""First room for the candidates of a place, and for its constraints."""
+"""Initial number of entries for the candidates of a contact sample, and for its constraints."""
 
 MOST_ENTRIES = MAX_INDEX // 2
 """Most entries of a buffer of candidates or constraints."""
@@ -29,7 +29,7 @@ LEAST_MARGIN = 0.1
 """Least distance beyond contact within which pairs are listed [cells]."""
 
 AHEAD = 8.0
-"""For how many substeps of the fastest node lists are made, unless that is more than the reach of contact."""
+"""Substeps of the fastest node for which lists stay complete, unless that is more than the reach of contact."""
 
 BLOCK, TALL = 128, 32
 """Places, and nodes, of a program at a time."""
@@ -253,8 +253,8 @@ class FusedContact:
 def _carries(node: Tensor, weight: Tensor, nodes: int) -> Tensor:
     r"""Return a factor for each node; no contact sample moves farther than the largest factor times the node's motion.
 
-    A node that reaches the material by a hair's breadth has next to no mass, and stress moves it by metres, which
-    moves no place. With :math:`s_i` the largest weight of a node at any place, and :math:`r_i = \min(1, s_i /` LIGHT
+    A node whose support barely reaches the material has almost no mass, and stress may move it by metres, which moves
+    no sample. With :math:`s_i` the largest weight of a node at any place, and :math:`r_i = \min(1, s_i /` LIGHT
     :math:`)`, a place moves by at most :math:`\sum_i |w_i| |u_i| \le \max_i (C r_i |u_i|)`, where C is the largest sum
     of :math:`|w_i| / r_i` of a place: at most 1.27 if no weight is negative.
 

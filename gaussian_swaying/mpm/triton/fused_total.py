@@ -256,7 +256,7 @@ class FusedTotal(Fused):
         )  # fmt: skip
 
     def _impulse(self) -> Tensor:
-        """Momentum that each boundary took in this part of the rollout, shape of ``impulse``; in a fixed order."""
+        """Reaction impulse on each boundary in this part of the rollout, shape of ``impulse``; summed in a fixed order."""
         total = self.impulse.reshape(self.scenes, -1, 3).clone()
         if any(self.bound.on_nodes) and self.plain:
             for k, nodes in enumerate(self.own_nodes):
@@ -285,7 +285,7 @@ class FusedTotal(Fused):
         self.displacement.addcmul_(self.velocity, self.dt.float())
 
     def _read(self, found: Tensor, part: Part) -> None:
-        """Write all fields of the state into ``found``, and what boundaries took and the load did beside it."""
+        """Write all fields of the state into ``found``, and beside it the reaction impulses and the work of the load."""
         to = self._views(found)
         kick, implicit = self.schedule[0, 3:], part.options["IMPLICIT"]
         self._read_into(to["position"], to["velocity"], to["affine"], to["F"], kick, part.loaded, implicit)
@@ -361,10 +361,10 @@ def _sources(cell: Tensor, cells: int) -> Tensor:
 
 
 def _lanes(sizes: Tensor) -> int:
-    """Lanes per cell (one synchronisation).
+    """Return the number of lanes per cell (one synchronisation).
 
-    Those that give the least total work, with empty lanes included. A small body takes as long as its slowest program:
-    there, so many that no program has to go through its cells twice.
+    It gives the least total work, empty lanes included. A small body takes as long as its slowest program, so there it
+    is large enough that no program has to go through its cells twice.
     """
     lanes, most = list(_LANE_COST), sizes.amax()[None]
     costs = torch.stack([(-(-sizes // n)).sum() * n for n in lanes])
