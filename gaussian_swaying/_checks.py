@@ -47,7 +47,7 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
 
 
 def requires_grad(value: Any) -> bool:
-    """Whether a value is a tensor that requires a gradient."""
+    """True if a value is a tensor that requires a gradient."""
     return isinstance(value, Tensor) and value.requires_grad
 
 

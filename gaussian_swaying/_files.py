@@ -37,7 +37,7 @@ def remove_temporaries(folder: Path) -> None:
 
 
 def kind_of(path: Path) -> str | None:
-    """What a path is, links followed: ``file``, ``folder``, ``named pipe``, ``socket`` ...; None if there is nothing.
+    """Return the kind of a path, links followed: ``file``, ``folder``, ``named pipe``, ...; None if nothing is there.
 
     Nothing is opened, so this never waits for a pipe that nobody writes to.
     """

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 RECORDED = 200_000
-"""Most particles or Gaussians whose fields are recorded in CUDA graphs, which keep their memory."""
+"""Most particles or Gaussians for which the kernels of their fields are recorded: CUDA graphs keep their memory."""
 
 _RECORDING = threading.Lock()
 """Held while a graph is recorded: PyTorch cannot give memory back to the driver during that time."""
@@ -59,7 +59,7 @@ def tensors_in(modules: Iterable[nn.Module]) -> list[torch.Tensor]:
 
 
 def _parts(module: nn.Module) -> Iterator[nn.Module]:
-    """A module and all its parts; one that is used several times comes several times."""
+    """Yield a module and all its submodules; one that is used several times comes several times."""
     yield module
     for child in vars(module)["_modules"].values():
         if child is not None:
@@ -136,7 +136,7 @@ class Replayed:
 
     @property
     def recorded(self) -> bool:
-        """Whether there is a recording."""
+        """True if a graph has been recorded."""
         return self._graph is not None
 
     def __call__(

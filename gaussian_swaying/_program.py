@@ -1,4 +1,4 @@
-"""How the program was started (installed, or from a checkout), so that printed commands can be pasted."""
+"""Commands as the user would type them: for the installed program, or for a checkout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One thread at a time: objects that keep buffers between calls are used by threads in turn."""
+"""A lock for objects that keep buffers between calls, so that only one thread at a time uses them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ S = TypeVar("S", bound=_HasTurn)
 
 
 def in_turn(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
-    """Let other threads wait until a method is done; its object has the lock as ``turn``."""
+    """Decorate a method so that other threads wait until it is done; its object has the lock as ``turn``."""
 
     @functools.wraps(method)
     def one_at_a_time(self: S, *args: Any, **kwargs: Any) -> R:

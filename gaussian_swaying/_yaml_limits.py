@@ -139,7 +139,7 @@ def read_fields(path: str | os.PathLike[str], what: str, fields: Sequence[str]) 
         fields: Names that it may have.
 
     Returns:
-        What is given, by name.
+        The given values, by name.
 
     Raises:
         FileNotFoundError: If there is no such file.

@@ -21,9 +21,9 @@ from gaussian_swaying.geometry.frame import SimFrame
 def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
     r"""Axes of a box that a flow carries along its x axis, as rows; y is horizontal.
 
-    A box that repeats would come back the same after one length of it. With ``tilted``, it is turned so that the air
-    comes back at another place of it, 0.382 of its width and 0.236 of its height further, and only after many
-    lengths close to where it was. The turn does not change isotropic turbulence.
+    A periodic box repeats after one length. With ``tilted``, it is turned against the flow, so that each length later a
+    point meets the box 0.382 of its width and 0.236 of its height further on, and only after many lengths close to the
+    first place. The turn does not change isotropic turbulence.
 
     Args:
         flow: The flow [m/s], shape (3,); x if it is zero.
@@ -116,7 +116,7 @@ class CarriedField(WindEffect):
     def offset(self, carried: Tensor) -> Tensor:
         """Place of the object's centre in the field, in cells, when the flow has ``carried`` it [m], shape (..., 3).
 
-        Within the first period along the axes that repeat, so that the small numbers of float32 are enough for it.
+        It is reduced to the first period along the axes that repeat, so that float32 is precise enough.
         """
         place = self.anchor - (self.place + carried) @ self.axes.T
         return torch.where(self.repeats, place.remainder(self.sides), place) / self.step
@@ -138,7 +138,7 @@ class Turbulence(CarriedField):
     """Turbulence in space and time: a box without divergence that the mean wind carries along.
 
     It depends on its seed alone: not on the device, the substep or the number of Gaussians. See
-    :func:`~gaussian_swaying.aero.turbulence_box.turbulence_box`. A cell of a sixteenth of the length holds 92 % of
+    :func:`~gaussian_swaying.aero.turbulence_box.turbulence_box`. A cell of a sixteenth of the length resolves 92 % of
     the variance of the along-wind component, and interpolation between its corners takes some more of the smallest
     waves (docs/wind.md).
 
@@ -148,7 +148,7 @@ class Turbulence(CarriedField):
             height above it.
         spectrum: ``von_karman``, or ``kaimal`` for a boundary layer.
         gamma: Mann's shear, which makes gusts along the wind stronger than those up and down; 3.9 near the ground, and
-            0 for isotropic turbulence. It makes gusts longer than the box would hold: raise ``spacing`` to a quarter
+            0 for isotropic turbulence. It makes gusts longer than the box can contain: raise ``spacing`` to a quarter
             of ``length``.
         cells: Cells of the box along the wind, across and up.
         spacing: Side of a cell [m]; a sixteenth of ``length`` if null.
@@ -186,7 +186,7 @@ class Turbulence(CarriedField):
 
     @property
     def resolved(self) -> float:
-        """Share of the variance along the wind that the cells can hold; without the shear."""
+        """Share of the variance along the wind that the cells resolve; without the shear."""
         return resolved_share(self.length, self.spacing, self.spectrum)  # type: ignore[arg-type]
 
     def strength(self, flow: Tensor) -> Tensor:
@@ -196,5 +196,5 @@ class Turbulence(CarriedField):
 
 @lru_cache(maxsize=2)
 def _box(cells: tuple[int, ...], side: float, length: float, spectrum: str, gamma: float, seed: int) -> Tensor:
-    """Kept, so that the same turbulence in another wind need not be made again."""
+    """Return :func:`turbulence_box`, cached, so that the same turbulence in another wind need not be made again."""
     return turbulence_box(cells, [side] * 3, length, spectrum, gamma, seed)

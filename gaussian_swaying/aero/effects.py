@@ -1,4 +1,4 @@
-"""How the wind differs from place to place: effects that a ``WindField`` applies in order, after its modulations."""
+"""Effects make the wind differ from place to place; a ``WindField`` applies them in order, after its modulations."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from gaussian_swaying.geometry.frame import SimFrame
 
 @dataclass(frozen=True)
 class Moment:
-    """What an effect knows of the wind at one time.
+    """The wind at one time, as the effects get it.
 
     Attributes:
         time: The time [s], scalar float64 tensor.
         flow: Flow without modulations and effects [m/s], shape (3,), float64.
-        carried: How far that flow has carried the air since time zero [m], shape (3,), float64.
+        carried: Displacement of the air by that flow since time zero [m], shape (3,), float64.
     """
 
     time: Tensor
@@ -32,7 +32,7 @@ class Moment:
 
 
 class WindEffect(Recordable, nn.Module, ABC):
-    """Base of what changes the wind from place to place.
+    """Base of effects, which change the wind from place to place.
 
     A subclass has a ``forward``, and sets ``recordable = True`` if that can be recorded in a CUDA graph (see
     ``Force``). Places are in metres, z up, from the centre of the object at rest; in a configuration they are in scene

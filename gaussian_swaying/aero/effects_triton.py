@@ -94,7 +94,8 @@ def shaped_wind(position, vector, space, OPTIONS: tl.constexpr):
     """Velocity of the air at some places: twin of ``WindField.shaped``.
 
     ``vector``: velocity without effects (3), place of the object's centre in a carried field [cells] (3), its strength,
-    the mean flow (3), and how far the streets of vortices are (one each).
+    the mean flow (3), and the phases of the vortex streets (one each).
+
     ``OPTIONS`` after four others: number of effects, and five for each: its kind, where its table starts in ``space``,
     and whether that repeats along each axis; of an obstacle, whether it has a wake, and where in ``vector`` its street
     is, or 0.

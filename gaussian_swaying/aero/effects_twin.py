@@ -1,4 +1,4 @@
-"""What the kernels read of a wind with effects: numbers that change with the substep, and a table of all others."""
+"""Data of a wind with effects for the kernels: numbers that change with the substep, and a table of all others."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KINDS: dict[type[WindEffect], int] = {
 }
 HEADER = 32
 STREETS = 10
-"""Where the first street of vortices is in the numbers of a substep; the mean flow is before it."""
+"""Index of the first vortex street in the numbers of a substep; those before it include the mean flow."""
 
 
 class Packed(NamedTuple):
@@ -42,7 +42,7 @@ class Packed(NamedTuple):
         kinds: The number of effects, and five for each: its kind, where its table starts, and whether that repeats
             along each axis; of an obstacle, whether it has a wake, and where its street is.
         space: A header for each effect, and then their tables, float32, shape (n,).
-        keys: What the numbers of each effect depended on.
+        keys: Key of each effect; its numbers are valid as long as the key does not change.
     """
 
     kinds: tuple[int, ...]
@@ -51,9 +51,10 @@ class Packed(NamedTuple):
 
 
 def has_twin(wind: WindField) -> bool:
-    """Whether the kernels know all effects of a wind, of which at most one is carried; few poles may shed vortices.
+    """True if the kernels can compute a wind: they know its effects, and at most one is a carried field.
 
-    A subclass of an effect may compute something else, so the kernels do not know it.
+    The kernels know no subclass of an effect, as it may compute something else. The obstacles that shed vortices must
+    fit into the numbers of a substep (``TWIN_VECTOR``).
     """
     kinds = [KINDS.get(type(effect)) for effect in wind.effects]  # type: ignore[arg-type]
     fits = STREETS + len(_streets(wind)) <= TWIN_VECTOR
@@ -67,13 +68,13 @@ def _streets(wind: WindField) -> list[CylinderObstacle]:
 
 
 def packed(wind: WindField, device: torch.device, before: Packed | None = None) -> Packed:
-    """What the kernels are compiled for, and the numbers that they read.
+    """Return the constants that the kernels are compiled for, and the numbers that they read.
 
     Args:
         wind: The wind.
         device: Where the numbers are.
-        before: What was packed before: numbers of effects that have changed since are written again, in place if they
-            fit.
+        before: The earlier result, if any: only numbers of effects that have changed since are written, in place if
+            they fit.
     """
     effects = list(wind.effects)
     keys = [_key(effect) for effect in effects]
@@ -101,7 +102,7 @@ def packed(wind: WindField, device: torch.device, before: Packed | None = None) 
 
 
 def _key(effect: nn.Module) -> object:
-    """What its numbers depend on; None if that cannot be told."""
+    """Return a key that changes when the numbers of an effect change; None if changes cannot be detected."""
     tensors = tensors_in([effect])
     if any(tensor.is_inference() for tensor in tensors):
         return None
@@ -138,7 +139,7 @@ def _write(effect: WindEffect, head: Tensor, table: Tensor) -> None:
 
 
 def vectors(wind: WindField, velocity: Tensor, times: Tensor) -> Tensor:
-    """What the kernels read of a wind at some times.
+    """Return the numbers of a wind that change with time, as the kernels read them.
 
     Args:
         wind: The wind.
@@ -147,7 +148,7 @@ def vectors(wind: WindField, velocity: Tensor, times: Tensor) -> Tensor:
 
     Returns:
         Velocity, place of the object's centre in a carried field [cells], its strength [m/s], and if the flow matters
-        the mean flow [m/s] and how far each street of vortices is; shape (n, 7), or (n, 10 + streets).
+        the mean flow [m/s] and the phase of each vortex street; shape (n, 7), or (n, 10 + streets).
     """
     place, strength = torch.zeros_like(velocity), torch.zeros_like(velocity[:, :1])
     if not any(isinstance(effect, CarriedField | Obstacle) for effect in wind.effects):

@@ -124,13 +124,13 @@ def capped_area(area: Tensor, rest_area: Tensor, max_ratio: float) -> Tensor:
         max_ratio: Largest allowed ratio of the two; infinite for no cap.
 
     Returns:
-        Shape (..., P). The gradient with respect to ``area`` is zero where the cap holds.
+        Shape (..., P). The gradient with respect to ``area`` is zero where the cap applies.
     """
     return area if max_ratio == math.inf else torch.minimum(area, max_ratio * rest_area)
 
 
 class AeroForce(nn.Module):
-    """Wind on surface patches: holds the coefficients and calls :func:`aero_force`.
+    """Wind on surface patches: stores the coefficients and calls :func:`aero_force`.
 
     The paper's coefficients are visual parameters. For comparison, a flat plate across the flow has a C_D of about 1.2,
     and skin friction is about 0.005. In Python the three coefficients may be tensors, which keep their gradient.
@@ -193,14 +193,14 @@ class AeroForce(nn.Module):
 
     @property
     def idle(self) -> bool:
-        """Whether the force is zero in any wind, so that it need not be computed."""
+        """True if the force is zero in any wind, so that it need not be computed."""
         coefficients = (self.C_D, self.C_F, self.C_L)
         needed = any(float(c.detach()) or c.requires_grad for c in coefficients)
         return self.air_density == 0 or not needed
 
     @property
     def mostly_linear(self) -> bool:
-        """Whether less than 5 % of the force depends on the side of the patch that the flow meets."""
+        """True if less than 5 % of the force depends on the side of the patch that the flow meets."""
         drag, friction, lift = (float(c.detach()) for c in (self.C_D, self.C_F, self.C_L.abs()))
         sided = lift / max(drag + friction + lift, 1e-30)
         return self.law != "paper" and not self.unit_tangent and sided < 0.05

@@ -22,7 +22,9 @@ PLANE_GROWTH = 0.29 / math.sqrt(2 * math.log(2))
 """Standard deviation of a plane wake per root of thickness times distance (Wygnanski and others 1986)."""
 
 ROUND_GROWTH = 0.05
-"""How fast a round wake widens: 0.03 in smooth wind, 0.05 in gusty wind (Bastankhah & Porté-Agel 2014)."""
+"""Growth of the width of a round wake per distance: 0.03 in smooth wind, 0.05 in gusty wind (Bastankhah & Porté-Agel
+2014).
+"""
 
 
 def sphere_flow(velocity: Tensor, place: Tensor, radius: float) -> Tensor:
@@ -146,7 +148,7 @@ def ellipsoid_flow(velocity: Tensor, place: Tensor, radii: Sequence[float]) -> T
 
 
 def round_wake(behind: Tensor, aside: Tensor, width: float, drag: float, growth: float = ROUND_GROWTH) -> Tensor:
-    r"""Share of the speed that is missing in the wake of a body: a Gaussian that conserves the momentum.
+    r"""Velocity deficit in the wake of a body, as a share of the speed: a Gaussian that conserves the momentum.
 
     .. math::
         \Bigl(1 - \sqrt{1 - \tfrac{C_D}{8 (\sigma / d)^2}}\Bigr) e^{-r^2 / 2 \sigma^2}, \qquad
@@ -207,8 +209,8 @@ def vortex_street(behind: Tensor, aside: Tensor, width: float, turns: Tensor, st
     :math:`\psi = -\tfrac{\Gamma}{4 \pi} \ln\bigl(\cosh \tfrac{2 \pi y}{l} - \cos \tfrac{2 \pi x}{l} + \delta\bigr)`,
     where delta = 0.3 gives each vortex a core. They drift at 0.86 of the flow (Roshko 1954) and are shed at the
     frequency St U / d, so that l = 0.86 d / St, and a street that drifts so slowly has the circulation
-    :math:`\Gamma = 0.14 \sqrt8\, U l`. The street forms within two widths and fades over thirty (both ours). What its
-    mean takes from the flow is left to the wake.
+    :math:`\Gamma = 0.14 \sqrt8\, U l`. The street forms within two widths and fades over thirty (both ours). The mean
+    velocity deficit is part of the wake, not of the street.
 
     Args:
         behind: Distance downwind of the centre [m], any shape.

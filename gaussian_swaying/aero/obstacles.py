@@ -47,7 +47,7 @@ class Obstacle(WindEffect):
 
     @abstractmethod
     def wake(self, place: Tensor, moment: Moment) -> tuple[Tensor, Tensor | None]:
-        """Share of the speed that is missing at places from the centre, (..., P), and what swirls, (..., P, 3)."""
+        """Velocity deficit as a share of the speed (..., P), and velocity of the vortices [m/s] (..., P, 3) or None."""
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         """See :class:`~gaussian_swaying.aero.effects.WindEffect`."""
@@ -171,11 +171,11 @@ class CylinderObstacle(Obstacle):
         return across / speed.clamp(min=1e-12), speed
 
     def turns(self, flow: Tensor, carried: Tensor) -> Tensor:
-        """How far the street is on its way to the next vortex, from 0 to 1.
+        """Return the phase of the vortex street: the share of the way to the next vortex, from 0 to 1.
 
         Args:
             flow: The mean flow [m/s], shape (..., 3), float64.
-            carried: How far it has carried the air since time zero [m], shape (..., 3), float64.
+            carried: Displacement of the air by it since time zero [m], shape (..., 3), float64.
 
         Returns:
             Shape (...).

@@ -35,7 +35,7 @@ def _scaled(v, factor):
 
 @triton.jit
 def _only(where, v):
-    """A vector, zero elsewhere."""
+    """Return a vector where a mask is true, and zero elsewhere."""
     return tl.where(where, v[0], 0.0), tl.where(where, v[1], 0.0), tl.where(where, v[2], 0.0)
 
 
@@ -110,7 +110,7 @@ def past_sphere(v, x, head, vector, WAKE: tl.constexpr):
 def past_cylinder(v, x, head, vector, WAKE: tl.constexpr, STREET: tl.constexpr):
     """As ``CylinderObstacle``; ``head``: middle (3), radius, drag, axis (3), Strouhal number.
 
-    ``STREET`` is which of the numbers in ``vector`` holds its turns, 0 without a street.
+    ``STREET`` is the index in ``vector`` of the phase of its vortex street, 0 without a street.
     """
     middle = read3(head)
     radius = tl.load(head + 3)
@@ -179,7 +179,7 @@ def carlson_rd(x, y, z):
 
 @triton.jit
 def _over(x, a, root):
-    """The place per the squared half axes of the ellipsoid through it."""
+    """Return coordinates divided by the squared half axes of the confocal ellipsoid through the place."""
     return x[0] / (a[0] + root), x[1] / (a[1] + root), x[2] / (a[2] + root)
 
 
@@ -188,7 +188,7 @@ def past_ellipsoid(v, x, head, vector, WAKE: tl.constexpr):
     """As ``EllipsoidObstacle``.
 
     ``head``: middle (3), size (its longest half axis), drag, start of the wake, axes (9), the half axes per ``size``
-    (3), and what its flow is strengthened by along each axis (3).
+    (3), and ``ellipsoid_strength`` along each axis (3).
     """
     middle = read3(head)
     size = tl.load(head + 3)

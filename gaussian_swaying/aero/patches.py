@@ -28,12 +28,12 @@ from gaussian_swaying.geometry.groups import equal_rows, sums
 from gaussian_swaying.geometry.linalg import cofactor
 
 MOST = 243
-"""Directions that are kept of the patches of one point; like ones are joined until there are no more."""
+"""Most directions that are kept for the patches of one point; similar ones are joined until there are no more."""
 
 _ANGLES = (0.003, 0.01, 0.03, 0.1, 0.25)  # [rad] of the cells of directions; the coarsest make 3 x 9 x 9 of them
 
 _COARSE = (0.5,)
-"""The same where the sum of signs is a small part of the force; 3 x 5 x 5 cells."""
+"""The same angles where the sum of signs is a small part of the force; 3 x 5 x 5 cells."""
 
 
 class Patches(nn.Module):
@@ -74,7 +74,7 @@ class PatchSums(nn.Module):
 
     Attributes:
         tensor: Sum of A N N^T [m²], shape (P, 3, 3).
-        vector: Area vectors A N at rest [m²], joined with those of like direction, sorted by point, shape (V, 3).
+        vector: Area vectors A N at rest [m²], joined with those of similar direction, sorted by point, shape (V, 3).
         point: The material point of each, shape (V,).
         single: Whether no point has patches of more than one direction.
     """

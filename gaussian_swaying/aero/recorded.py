@@ -24,8 +24,8 @@ class FrozenWind(CarriedField):
     The x axis of the file points along the flow, y to its left, z up. Along the wind it starts again at its end; across
     and up its outermost values go on outside.
 
-    A .bts holds the mean wind as well: it is taken off, since ``wind.flow`` has it, and must have its speed. What is
-    left is the turbulence and how the mean differs from that at the hub. Other files hold deviations from the mean.
+    A .bts contains the mean wind as well. The mean at the hub is subtracted, since ``wind.flow`` has it and must have
+    the same speed; the turbulence and the profile of the mean are left. Other files contain deviations from the mean.
 
     Args:
         path: The file; for .nc and .npz see :func:`~gaussian_swaying.aero.wind_files.read_grid`.

@@ -1,4 +1,4 @@
-"""How a body slows the wind on its way through it, so that the inner leaves of a crown feel less."""
+"""Shelter: a body slows the wind on its way through, so that the inner leaves of a crown feel less of it."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ class Shelter(WindEffect):
     """The body's own patches slow the wind on its way, by the exponential law of :func:`extinction`.
 
     Meant for crowns, hedges and stands of plants: many small leaves to a cell. A single sheet across the wind would
-    shelter itself, since the cells do not know that its patches lie side by side. It is refreshed at the start of every
-    frame, from how the body stands then, in the direction of the mean flow. Place it last in the list.
+    shelter itself, since the cells do not know that its patches lie side by side. It is computed again at the start of
+    every frame, from the shape of the body then, in the direction of the mean flow. Place it last in the list.
 
     Args:
         cells: Corners of the grid along each axis; its side is the longest of the body's box. A cell should hold
@@ -112,7 +112,7 @@ class Shelter(WindEffect):
         return other
 
     def refresh(self, position: Tensor, drag_area: Tensor, axes: Tensor) -> None:
-        """Compute the share of the wind that is left, from how the body stands.
+        """Compute the share of the wind that is left, from the present shape of the body.
 
         Args:
             position: Of the particles [m], shape (P, 3).

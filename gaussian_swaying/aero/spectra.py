@@ -1,4 +1,4 @@
-"""Spectra of turbulence: how its energy is spread over wave numbers.
+"""Spectra of turbulence: its energy as a function of the wave number.
 
 All are for a neutral wind of one point or of isotropic turbulence, with wave numbers in radians per metre. A frozen
 field that is carried at a speed U is seen at one place with the frequency f = U k1 / (2 pi).
@@ -85,7 +85,7 @@ def across_spectrum(k1: Tensor, length: float, spectrum: str = "von_karman") -> 
 
 
 def resolved_share(length: float, spacing: tuple[float, float, float], spectrum: str = "von_karman") -> float:
-    """Share of the variance of the component along the wind that cells of this size can hold.
+    """Share of the variance of the component along the wind that cells of this size resolve.
 
     That of the waves with less than half a turn per cell along each axis, by a sum over 128 x 64 directions and 512
     wave numbers in each.
@@ -114,7 +114,7 @@ def resolved_share(length: float, spacing: tuple[float, float, float], spectrum:
 
 
 def shear_time(k: Tensor, length: float, gamma: float) -> Tensor:
-    r"""How far the mean shear turns eddies of a wave number before they break up: Mann's beta.
+    r"""Return the dimensionless life time of eddies in the mean shear, by wave number: Mann's beta.
 
     .. math::
         \beta(k) = \Gamma\, (k a)^{-2/3} \bigl[ {}_2F_1(\tfrac13, \tfrac{17}6; \tfrac43; -(k a)^{-2}) \bigr]^{-1/2}

@@ -142,7 +142,7 @@ def _wave_numbers(cells: Sequence[int], spacing: Sequence[float], device: torch.
 def _sheared(
     k1: Tensor, k2: Tensor, turned: Tensor, beta: Tensor, flat: Tensor, square: Tensor, at_first: Tensor
 ) -> tuple[Tensor, Tensor]:
-    r"""What a vertical wave adds to the two horizontal ones: :math:`\zeta_1, \zeta_2` of Mann 1994, 3.14 to 3.17."""
+    r"""Return the factors :math:`\zeta_1, \zeta_2` on the vertical wave in the others (Mann 1994, 3.14 to 3.17)."""
     safe = flat.clamp(min=1e-30)
     c1 = beta * k1.square() * (at_first - 2 * turned.square() + beta * k1 * turned) / (square * safe)
     angle = torch.atan2(beta * k1 * safe.sqrt(), at_first - turned * k1 * beta)

@@ -46,12 +46,12 @@ def _mix(x: Tensor) -> Tensor:
 
 
 def stream_start(seed: int, stream: int) -> int:
-    """Where the counter of a generator starts, as a signed 64-bit number."""
+    """Return the first value of a generator's counter, as a signed 64-bit number."""
     return _signed(seed * 0x9E3779B97F4A7C15 + stream + 1)
 
 
 def _stream_key(seed: int | Tensor, stream: int, device: torch.device) -> Tensor:
-    """Where the counters start, on the device: nothing is copied from the host, so a CUDA graph can record it."""
+    """Return the first values of the counters, made on the device, so that a CUDA graph can record it."""
     if isinstance(seed, Tensor):
         return (seed * _signed(0x9E3779B97F4A7C15) + (stream + 1))[..., None]
     return torch.full((), stream_start(seed, stream), dtype=torch.int64, device=device)
@@ -131,7 +131,7 @@ class UniformGust(Modulation):
 
     Args:
         delta: Half width of the distribution; not given in the paper.
-        interval: Time between samples [s]; each holds until the next.
+        interval: Time between samples [s]; each applies until the next.
     """
 
     recordable = True
@@ -153,7 +153,7 @@ class GaussianGust(Modulation):
 
     Args:
         std: Standard deviation [m/s]; the paper uses 0.3.
-        interval: Time between samples [s]; each holds until the next. Not given in the paper. White noise drawn once
+        interval: Time between samples [s]; each applies until the next. Not given in the paper. White noise drawn once
             per substep would fade as substeps get shorter, so samples are drawn at fixed times instead.
     """
 
@@ -175,7 +175,7 @@ class FlowKey:
     """One entry of a schedule.
 
     Args:
-        time: Time from which the flow holds [s].
+        time: Time from which the flow applies [s].
         flow: Air velocity [m/s], z up; in Python also a tensor, as in a :class:`WindField`.
     """
 
@@ -232,10 +232,10 @@ class WindField(nn.Module):
 
     Args:
         flow: Steady air velocity [m/s], z up. In Python also a tensor of shape (3,), which keeps its gradient.
-        schedule: Flow that changes over time, used instead of ``flow``; the first entry also holds before its time. Or
-            the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
+        schedule: Flow that changes over time, used instead of ``flow``; the first entry also applies before its time.
+            Or the CSV of an anemometer (:func:`~gaussian_swaying.aero.wind_files.read_anemometer`), with linear
             interpolation.
-        interpolation: Between entries of the schedule: ``step`` (hold) or ``linear``.
+        interpolation: Between entries of the schedule: ``step`` (constant until the next) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.
         effects: What differs from place to place, applied in order after the modulations: a profile, turbulence,
@@ -280,12 +280,12 @@ class WindField(nn.Module):
 
     @property
     def uniform(self) -> bool:
-        """Whether it is the same everywhere."""
+        """True if the wind is the same everywhere."""
         return len(self.effects) == 0
 
     @property
     def recordable(self) -> bool:
-        """Whether all of its parts can be recorded in a CUDA graph."""
+        """True if all modulations and effects can be recorded in a CUDA graph."""
         return all(getattr(part, "recordable", False) for part in (*self.modulations, *self.effects))
 
     def in_frame(self, frame: SimFrame) -> WindField:
@@ -320,7 +320,7 @@ class WindField(nn.Module):
         return torch.lerp(before, picked(self.flows, after), share)
 
     def carried(self, time: Tensor) -> Tensor:
-        """How far the flow without modulations has carried the air since time zero [m].
+        """Return the displacement of the air by the flow without modulations since time zero [m].
 
         Args:
             time: Times [s], shape (...), float64.
@@ -357,7 +357,7 @@ class WindField(nn.Module):
         return self.shaped(self(time), position, Moment(time, self.mean_flow(time), self.carried(time)))
 
     def shaped(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """What the effects make of a velocity that is the same everywhere.
+        """Return the velocity at some places: the effects applied to one that is the same everywhere.
 
         Args:
             velocity: Velocity with modulations [m/s], shape (3,).

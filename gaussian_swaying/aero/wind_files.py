@@ -159,7 +159,7 @@ def _checked(path: Path, axes: dict[str, np.ndarray], velocity: np.ndarray) -> G
 
 
 def _is_step(length: float) -> bool:
-    """Whether a side of a cell [m] is one that a wind can have."""
+    """True if a length [m] is allowed for the side of a cell of a wind."""
     return bool(1 / LONGEST_STEP <= length <= LONGEST_STEP)
 
 

@@ -106,12 +106,12 @@ class WindForce(Force):
 
     @property
     def uniform(self) -> bool:
-        """Whether the wind is the same everywhere in a scene."""
+        """True if the wind is the same everywhere in a scene."""
         return all(isinstance(w, WindBatch) or (isinstance(w, WindField) and w.uniform) for w in self._fields)
 
     @property
     def recordable(self) -> bool:  # type: ignore[override]
-        """Whether all winds can be recorded: spatial winds and modulations that are themselves ``recordable``."""
+        """True if a CUDA graph can record all winds, that is, spatial winds and modulations are ``recordable``."""
         return all(
             wind.recordable and (isinstance(wind, (SpatialWind, WindBatch)) or type(wind) is WindField)
             for wind in self._fields
@@ -254,7 +254,7 @@ class WindForce(Force):
         return tensors_in(self._shelters())
 
     def refresh(self, state: MPMState) -> None:
-        """Take in how the body stands now, for :class:`~gaussian_swaying.aero.shelter.Shelter`; once in a frame.
+        """Update each :class:`~gaussian_swaying.aero.shelter.Shelter` from the body's present shape; once in a frame.
 
         Args:
             state: The state at the start of the frame.
@@ -274,7 +274,7 @@ class WindForce(Force):
                 shelter.refresh(state.position, area, axes)
 
     def during(self, time: Tensor, dt: float, steps: int) -> Callable[[MPMState, int], Given]:
-        """See ``Force.during``: what does not depend on the place is computed for all substeps at once."""
+        """See ``Force.during``: a uniform wind is computed for all substeps at once."""
         if self.uniform:
             winds = self.winds(time, dt, steps)
             return lambda state, k: self.force(state, winds[k])
@@ -288,7 +288,7 @@ class WindForce(Force):
 
     @property
     def has_twin(self) -> bool:
-        """Whether the kernels can compute the force: they must know all effects, and the lists must not be too long."""
+        """True if the kernels can compute the force: they know all effects, and the lists are not too long."""
         wind = self._fields[0]
         known = self.uniform or (self._shared and isinstance(wind, WindField) and has_twin(wind))
         return known and (self.sums is None or self.sums.rows < 2**24)  # rows are counted in float32
@@ -340,7 +340,7 @@ class WindForce(Force):
         )
 
     def _packed(self) -> Packed:
-        """What the kernels read of the effects; what has changed is written again, in place where possible."""
+        """Return the data of the effects for the kernels; what changed is written again, in place where possible."""
         wind = self._fields[0]
         assert isinstance(wind, WindField)
         with torch.inference_mode(False), torch.no_grad():

@@ -18,7 +18,7 @@ SWAY, UNIFORM, GAUSSIAN = 0, 1, 2
 BLOCK = 64
 
 _numbers: WeakKeyDictionary[nn.Module, tuple[tuple[object, ...], Tensor, Tensor]] = WeakKeyDictionary()
-"""What the kernel reads of each wind, on the device, and what it was made from."""
+"""For each wind: the key that its numbers were made from, and the numbers that the kernel reads, on the device."""
 
 
 @triton.jit

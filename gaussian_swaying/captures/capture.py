@@ -199,7 +199,7 @@ def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
 
 
 def view_reach(cameras: Sequence[Camera], focus: Tensor) -> float:
-    """How far the median camera sees to the side of a point (3,) [scene units]."""
+    """Return how far to the side of a point (3,) the median camera sees [scene units]."""
     reach = []
     for camera in cameras:
         distance = math.dist(camera.position.tolist(), focus.tolist())

@@ -43,7 +43,7 @@ class TrueSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueView:
-    """What a camera sees, averaged over each pixel where it is a colour, at the pixel's centre else.
+    """The exact picture of a camera: colour and alpha averaged over each pixel, depth and normals at its centre.
 
     Attributes:
         colors: Colours in 0 to 1, multiplied with alpha, shape (H, W, 3).
@@ -241,7 +241,7 @@ class GeneratedCapture:
         return rearrange(functional.avg_pool2d(rearrange(packed, "h w c -> 1 c h w"), n), "1 c h w -> h w c")
 
     def _cast(self, camera: Camera, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Whether each ray hits, the depth of the hit, and its x and z, each of shape (rows, columns)."""
+        """Cast rays at the sheet; return hit or not, and depth, x and z of the hit, each of shape (rows, columns)."""
         intrinsics, view = camera.intrinsics.double(), camera.world_to_camera.double()
         v, u = torch.meshgrid(
             (row - intrinsics[1, 2]) / intrinsics[1, 1], (column - intrinsics[0, 2]) / intrinsics[0, 0], indexing="ij"
@@ -266,7 +266,7 @@ class GeneratedCapture:
         return hit.reshape(shape), depth.reshape(shape), x.reshape(shape), z.reshape(shape)
 
     def _first_crossing(self, eye: Tensor, rays: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor]:
-        """Which rays cross the sheet between two depths, and the first depth of these crossings."""
+        """Return a mask of the rays that cross the sheet between two depths, and the first depth of these crossings."""
 
         def above(t: Tensor, rays: Tensor) -> Tensor:
             x, y, z = (eye[axis] + t * rays[:, axis] for axis in range(3))

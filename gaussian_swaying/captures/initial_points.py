@@ -103,7 +103,7 @@ def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: in
 
 
 def _clear(capture: Capture, center: Tensor, points: Tensor) -> Tensor:
-    """Which points (N, 3) are at least half as far from every camera as the centre, shape (N,)."""
+    """Return a mask of the points (N, 3) at least half as far from every camera as the centre is, shape (N,)."""
     eyes = torch.stack([view.camera.position for view in capture.split("train")]).float()
     limit = 0.5 * (eyes - center.float()).norm(dim=-1)
     return torch.cat([(torch.cdist(part, eyes) >= limit).all(-1) for part in points.split(1 << 16)])

@@ -120,7 +120,7 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """Whether any coefficient differs from zero."""
+        """True if any distortion coefficient differs from zero."""
         return any(self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:

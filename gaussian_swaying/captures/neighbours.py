@@ -1,4 +1,4 @@
-"""Which views of a capture see a surface from nearby, but not from the same place."""
+"""Neighbouring views of a capture: those that see the same surface from nearby, but not from the same place."""
 
 from __future__ import annotations
 

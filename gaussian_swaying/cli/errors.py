@@ -68,7 +68,7 @@ def run_command(
 
 
 def _was_written(output: SafeStream) -> bool:
-    """Whether all standard output was written; if not, print an error. A pipe closed by its reader is no error."""
+    """True if all standard output was written; if not, print an error. A pipe closed by its reader is no error."""
     output.flush()
     number = getattr(output.error, "errno", None) or errno.EBADF
     if output.error is None or number == errno.EPIPE:
@@ -192,7 +192,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _asked_for(text: str) -> str:
-    """How much memory was requested, if the message says so."""
+    """Return the requested amount of memory in words, from an error message; empty if it does not say."""
     found = re.search(r"allocate (\d+) bytes", text)
     if found:
         return f"{int(found[1]) / 2**30:,.3g} GiB were requested"

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     begun: list[Path] = []
 
     def advice(error: BaseException) -> str | None:
-        """How to continue, if the fit was stopped."""
+        """Return the command that continues the fit, if the user stopped it."""
         stopped = isinstance(error, KeyboardInterrupt) and begun and (begun[0] / "fit.json").exists()
         return f"To continue it:\n  {command(arguments, '--resume')}" if stopped else None
 

@@ -104,13 +104,13 @@ def settings_of(
     further: Sequence[str],
     tell: Callable[[float, str], None] = lambda share, what: None,
 ) -> Namespace:
-    """The settings of what is to be shown.
+    """The settings of the scene to show.
 
     Args:
         parser: From :meth:`Simulation.parser`.
         scene: A splat, a configuration, or None for the flag or the ``--config`` among the further options.
         further: Options of ``gaussian-swaying sim``.
-        tell: Told how much is done, from 0 to 1, and what is done next.
+        tell: Called with the share that is done, from 0 to 1, and the name of the next task.
 
     Raises:
         ValueError: If a file or an option is bad.

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started: list[Simulation] = []
 
     def advice(error: BaseException) -> str | None:
-        """How to continue from the last checkpoint of the run, if there is one."""
+        """Return the command that continues from the last checkpoint of the run, if there is one."""
         if not started or started[0].resumable is None:
             return None
         return how_to_resume(*started[0].resumable, arguments, isinstance(error, SimulationDiverged))

@@ -71,7 +71,7 @@ def without_splat() -> list[str]:
 
 
 def caches() -> dict[str, Path]:
-    """Where compiled kernels are kept: of Triton and of gsplat."""
+    """Return the cache folders of compiled kernels, of Triton and of gsplat."""
     from torch.utils.cpp_extension import _get_build_directory
 
     triton = os.environ.get("TRITON_CACHE_DIR") or Path.home() / ".triton" / "cache"

@@ -1,4 +1,4 @@
-"""What ``gaussian-swaying sim --help`` shows: the twenty options that people use; ``--help-all`` shows the rest too."""
+"""The short help of ``gaussian-swaying sim --help``: the options used most; ``--help-all`` shows the rest too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a simulation was made from, as plain data: two that differ are told apart, also where no YAML says so."""
+"""The arguments of a simulation as plain data, so that two that differ can be told apart, also if made in Python."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def describe(value: Any) -> Any:
         value: A number, text, tensor, list, mapping, dataclass, module or any other object with public attributes.
 
     Returns:
-        What YAML can hold; a tensor is its shape and a checksum. The same for equal values, in every process.
+        Plain data for YAML; a tensor becomes its shape and a checksum. Equal values give equal data, in every process.
     """
     if value is None or isinstance(value, bool | int | float | str):
         return value

@@ -1,1 +1,1 @@
-"""Find the wind and the material from video: what is sought, videos, tracks, batches of simulations, least squares."""
+"""Find the wind and the material from video: unknowns, videos, tracks, batches of simulations, least squares."""

@@ -22,7 +22,7 @@ from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 
 SAFETY = 1.15
-"""How much stiffer than at rest the material may become before a rollout is repeated with shorter substeps."""
+"""First factor on the wave speed at rest that substeps allow for; a rollout above it is repeated with shorter ones."""
 CFL_LIMIT = 0.5
 RETRIES = 3
 MARGINS = (0, 16, 64)
@@ -37,7 +37,7 @@ class SubstepTooLongError(RuntimeError):
 
 @dataclass
 class _Group:
-    """Variants that differ in parameters that may differ within a batch only."""
+    """Variants that differ only in parameters that may differ within a batch."""
 
     members: list[int]
     solver: MPMSolver
@@ -48,8 +48,8 @@ class _Group:
 class Ensemble:
     """Variants of a simulation that differ in a few values.
 
-    Variants that differ in nothing but parameters that may differ within a batch are one batch; the others take a batch
-    of their own. All take the same substeps, so that their differences come from the values alone.
+    Variants that differ only in parameters that may differ within a batch are run as one batch; others are run as
+    further batches. All take the same substeps, so that their differences come from the values alone.
 
     Args:
         simulation: The base. Its motion starts from rest at time zero.

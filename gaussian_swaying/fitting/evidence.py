@@ -1,4 +1,4 @@
-"""What a video says about variants of a simulation: differences of tracks, silhouettes and pixels, as residuals."""
+"""Residuals between variants of a simulation and a video: differences of tracks, silhouettes and pixels."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
 
 PATCHES = 4
-"""Tracks and pixels of a square of so many by so many share their errors."""
+"""Squares along each side of the grid that sorts tracks and pixels into clusters of correlated errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Block:
         kind: ``tracks``, ``silhouettes`` or ``pixels``.
         values: Differences between simulation and video for each variant, float64, shape (B, R, D); in pixels for
             tracks, else in grey levels from 0 to 1.
-        cluster: Which group of residuals with like errors each belongs to, shape (R,).
+        cluster: Index of the cluster of correlated residuals that each belongs to, shape (R,).
     """
 
     kind: str
@@ -41,7 +41,7 @@ class Evidence(ABC):
 
     Attributes:
         kind: Its name.
-        floor: Smallest standard deviation that is believed.
+        floor: Lower bound of the standard deviation of the residuals.
     """
 
     kind: str
@@ -64,7 +64,7 @@ class Evidence(ABC):
 
 
 class TrackEvidence(Evidence):
-    """Where the simulation carries the Gaussians that were followed, against where they were seen [pixels]."""
+    """Residuals of tracks: positions of Gaussians in the simulation minus those tracked in the video [pixels]."""
 
     kind, floor = "tracks", 0.05
 
@@ -142,7 +142,7 @@ def compare(
 
     Args:
         ensemble: The simulation.
-        evidence: What is compared.
+        evidence: The comparisons to make.
         values: The values of each variant.
         times: Times of the frames to compare [s], ascending.
         careful: Take the same substeps for all, and repeat with shorter ones if the material stiffens. If not, each

@@ -52,36 +52,37 @@ OURS = (PROGRESS, VALUES, RESULT, SCENE, PICTURES)
 HORIZONS = (0.25, 0.5)
 """Shares of the fitted frames that the first stage takes, one after the other, and all frames if no matches follow.
 
-Chaos grows with time: in a flag that flaps, a hundredth of Young's modulus grows to pixels in two seconds, and over the
-whole of them places far from the lowest one are lowest among their neighbours. So the shortest time that tells the
-unknowns comes first, and what it finds must be exact before time is added."""
+Chaos grows with time: in a flapping flag, changing Young's modulus by a hundredth moves it by pixels after two seconds,
+and
+over the whole video the cost has local minima far from the global one. So the first horizon is the shortest time that
+determines the unknowns, and its solution must be exact before time is added."""
 MATCHED = (0.5, 0.5, 0.75, 1.0, 1.0)
-"""The same for each time that Gaussians are matched again."""
+"""Shares of the fitted frames that are used, one for each time that Gaussians are matched again."""
 SEARCHED = 0.5
 """Share of the fitted frames that the coarse search looks at."""
 NEAR = 0.1
 """Standard deviation of the second part of the search, as a share of the ranges."""
 COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
-"""Residuals that the search takes for large: shares of the picture's width, and grey levels."""
+"""Standard deviations of residuals in the coarse search: shares of the picture's width, and grey levels."""
 TOLERANCE = 3e-4
 """Shortest step of the last stage, as a share of the ranges."""
 ROUGH = 30
-"""How many times less exact the other steps are."""
+"""Factor by which the tolerance of the other steps is larger."""
 
 Say = Callable[[str], None]
 
 
 @dataclass
 class Course:
-    """Where a fit stands, as ``fit.json`` keeps it.
+    """The resume state of a fit, as ``fit.json`` stores it.
 
     Attributes:
         step: Number of the step, which is a stage at a horizon.
-        place: Shares of the ranges.
-        matched: Where the Gaussians of the current step were matched; empty if they were not.
+        place: Values of the unknowns, as shares of their ranges.
+        matched: Values (as shares) at which the Gaussians of the current step were matched; empty if they were not.
         damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
         iteration: Iterations done in this step.
-        ended: Why the iterations of this step ended; empty if they did not.
+        ended: The reason why the iterations of this step ended; empty if they did not.
         stiffening: See :class:`~gaussian_swaying.fitting.ensemble.Ensemble`.
         history: One row for each iteration.
         directions: The principal directions of the sensitivities.
@@ -106,7 +107,7 @@ class Fit:
     Args:
         simulation: The base, with all that is known.
         videos: From :func:`~gaussian_swaying.fitting.videos.read_videos`.
-        plan: What is sought, and how.
+        plan: The unknowns, and how to find them.
         say: Called with a line for each thing that is done.
 
     Raises:
@@ -149,7 +150,7 @@ class Fit:
         return self._tracks
 
     def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
-        """What a stage compares."""
+        """Return the residuals of a stage, one list entry for each video and kind."""
         found: list[Evidence] = []
         if stage == "pixels":
             return [PictureEvidence(video, masks=False) for video in self.videos]
@@ -176,7 +177,7 @@ class Fit:
         return self.ensemble.run([self.values(place) for place in places], times, careful=False)
 
     def values(self, place: Tensor | Sequence[float]) -> dict[str, float]:
-        """The values at a place, shares of the ranges."""
+        """Values of the unknowns at a place, given as shares of the ranges."""
         return {u.name: u.value(float(share)) for u, share in zip(self.plan.unknowns, place, strict=True)}
 
     def residuals(self, evidence: Sequence[Evidence], times: Sequence[float]) -> Callable[[Tensor], list[Block]]:
@@ -237,10 +238,10 @@ class Fit:
         return huber(blocks, scales)
 
     def run(self, course: Course, keep: Callable[[Course], None]) -> Result:
-        """Do what is missing, and report.
+        """Do the steps that are missing, and return the result.
 
         Args:
-            course: Where the fit stands; a new one for a new fit.
+            course: The resume state; a new one for a new fit.
             keep: Called after every iteration, to write the course.
 
         Raises:
@@ -408,8 +409,8 @@ def fit(
     Args:
         base: Configuration of ``sim``, or several: the splat, the solver and all that is known.
         videos: Folders with transforms.json, see :func:`~gaussian_swaying.fitting.videos.read_videos`.
-        unknowns: For each number that is sought its range, such as ``{"wind.speed": [1, 10]}``, or
-            ``{"range": [1, 10], "scale": "log", "start": 3}``.
+        unknowns: For each unknown its range, such as ``{"wind.speed": [1, 10]}``, or ``{"range": [1, 10], "scale":
+            "log", "start": 3}``.
         output: Folder for the results.
         resume: Continue the fit in it.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -433,7 +434,7 @@ def fit(
 
 
 def _described(plan: Plan, simulation: Simulation) -> dict[str, Any]:
-    """What a fit must have in common with the one that it continues."""
+    """Return the resume key: all settings that must be the same in a fit and the one that it continues."""
     own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
     sought = {u.name: [u.low, u.high, u.scale, u.start] for u in plan.unknowns}
     own = {name: list(value) if isinstance(value, tuple) else value for name, value in own.items()}

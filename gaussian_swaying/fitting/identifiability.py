@@ -1,4 +1,4 @@
-"""What a video can tell apart: singular values of the sensitivities, and the combinations that it does not fix."""
+"""Identifiability: singular values of the sensitivities, and combinations of unknowns that a video leaves open."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Direction:
         strength: Singular value: change of the residuals, in standard deviations, when the unknowns move along the
             direction by the whole of their ranges.
         parts: Share of each unknown, of length one.
-        sentence: What the direction is, in words.
+        sentence: The direction in words.
     """
 
     strength: float
@@ -77,7 +77,7 @@ def check_apart(found: Sequence[Direction], unknowns: Sequence[Unknown], limit: 
 
 
 def _sentence(parts: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:
-    """What moving along a direction means, scaled so that its largest part is a change of 10 % or so."""
+    """Describe a step along a direction in words, scaled so that its largest change is about 10 %."""
     turn = 1.0 if parts[max(range(len(parts)), key=lambda k: abs(parts[k]))] > 0 else -1.0
     # how far along the direction until the largest part has changed by a tenth of its value, or of its range
     lead = max(range(len(parts)), key=lambda k: abs(parts[k]))

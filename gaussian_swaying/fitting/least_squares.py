@@ -1,7 +1,7 @@
 """Robust nonlinear least squares by Levenberg and Marquardt's method, with a batch of simulations for each step.
 
 A step takes one batch: the residuals at its end and their sensitivities, by central differences. Residuals are divided
-by their robust standard deviation, and weighed by Huber's function, so that tracks that went astray count little.
+by their robust standard deviation, and weighed by Huber's function, so that wrong tracks count little.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ STEP = 0.004
 HUBER = 1.345
 """Standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)."""
 START = 1e-6
-"""Damping of the first step: nearly none, as damping holds up just what the video hardly tells."""
+"""Damping of the first step: nearly none, as damping mostly slows combinations that the video hardly determines."""
 BETTER, WORSE, LEAST_DAMPING = 0.03, 30.0, 1e-3
-"""Factors of the damping after a step that lowered the cost, and after one that did not, and its least value then."""
+"""Factor on the damping after a step that lowered the cost, after one that did not, and least damping after the latter.
+"""
 MOST_DAMPING = 1e4
-"""Damping at which the search for a better place ends."""
+"""Damping at which the search for a lower cost ends."""
 LEAST_GAIN = 1e-4
 NO_STEP = "no step is better"
 REACH = 0.25
@@ -43,7 +44,7 @@ class Normal:
         cost: Mean of Huber's function over all residuals, each in standard deviations.
         gradient: Weighed sum of sensitivity times residual, shape (U,).
         matrix: Weighed sum of sensitivity times sensitivity, J^T W J, shape (U, U).
-        scores: The gradient of each cluster of like errors, shape (C, U).
+        scores: The gradient of each cluster of correlated residuals, shape (C, U).
         count: Number of residuals.
     """
 
@@ -57,10 +58,10 @@ class Normal:
         r"""Covariance of the unknowns in shares of their ranges, shape (U, U).
 
         :math:`A^{-1} \bigl(\tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are summed
-        over clusters of residuals whose errors are alike (neighbouring tracks at all times): the sandwich of White
-        (1980) and Liang & Zeger (1986). The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far
-        too small alone. It is added, as the sandwich of few clusters, or of residuals below the least standard
-        deviation that is believed, may be near zero.
+        over clusters of correlated residuals (neighbouring tracks at all times): the sandwich of White (1980) and Liang
+        & Zeger (1986). The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far too small alone. It
+        is added, as the sandwich of few clusters, or of residuals below the lower bound of the standard deviation, may
+        be near zero.
         """
         inverse = torch.linalg.pinv(self.matrix, hermitian=True)
         clusters = int((self.scores.abs().sum(-1) > 0).sum())
@@ -71,15 +72,15 @@ class Normal:
 
 @dataclass
 class Progress:
-    """Where an optimisation stands; enough to continue it.
+    """The state of an optimisation; enough to continue it.
 
     Attributes:
-        place: Shares of the ranges, shape (U,).
+        place: Values of the unknowns, as shares of their ranges, shape (U,).
         damping: Damping of the last accepted step.
         iteration: Iterations done.
         normal: The sums at ``place``; None if they are to be computed.
         scales: Standard deviations of each kind of residual there.
-        done: Why it ended; empty if it did not.
+        done: The reason why it ended; empty if it did not.
     """
 
     place: Tensor
@@ -131,10 +132,11 @@ def normal_equations(blocks: Sequence[Block], scales: Mapping[str, float], steps
 
 
 def sensitivities(residuals: Residuals, place: Tensor) -> tuple[list[Block], Tensor]:
-    """Residuals at a point and their changes across it, and how far apart its neighbours are, shape (U,).
+    """Return the residuals at a point with their central differences, and the widths of these, shape (U,).
 
     Steps go to both sides, as far as the range allows: one-sided differences bias the gradient, and in a narrow valley,
-    such as that of wind, stiffness and density raised together, no step of theirs is better far from the lowest place.
+    such as that of wind, stiffness and density raised together, one-sided steps find no lower cost even far from the
+    minimum.
     """
     unknowns = len(place)
     up, down = (place + STEP).clamp(max=1.0), (place - STEP).clamp(min=0.0)
@@ -210,7 +212,7 @@ def step_from(normal: Normal, place: Tensor, damping: float = 0.0) -> Tensor:
 
 
 def expected_gain(normal: Normal, step: Tensor) -> float:
-    """By which share of itself the cost falls along a step, as far as the residuals are linear."""
+    """Expected relative decrease of the cost for a step, with linearised residuals."""
     fall = -(normal.gradient @ step + 0.5 * step @ normal.matrix @ step) / max(normal.count, 1)
     return float(fall) / max(normal.cost, 1e-300)
 

@@ -1,4 +1,4 @@
-"""What a fit does: the file ``fit.yaml``, checked."""
+"""The settings of a fit: the file ``fit.yaml``, checked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 STAGES = ("tracks", "silhouettes", "matches", "pixels")
-"""What is compared, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
+"""Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
 frames of the video, three rounds; colours."""
 
 _FIELDS = (
@@ -39,14 +39,14 @@ _FIELDS = (
 
 @dataclass(frozen=True)
 class Plan:
-    """What a fit does.
+    """The settings of a fit.
 
     Args:
         base: Configuration files of ``sim``: the splat, the solver, and first values.
         videos: Folders with transforms.json.
-        unknowns: What is sought.
+        unknowns: The unknowns.
         known: Options of ``sim`` that replace those of the base.
-        stages: What is compared, see :data:`STAGES`; silhouettes are left out if the video has none.
+        stages: The stages, see :data:`STAGES`; silhouettes are left out if the video has none.
         fit_share: Share of the frames that is fitted; the rest is predicted.
         until: Fit the frames up to this time [s] instead of a share of them.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
@@ -157,7 +157,7 @@ def read_unknown(name: str, given: Any) -> Unknown:
 
 
 def parse_base(plan: Plan, parser: ArgumentParser) -> Namespace:
-    """The settings of the base with what is known.
+    """The settings of the base, with the known options.
 
     Raises:
         ArgumentError: If ``sim`` has no such option or does not accept a value.

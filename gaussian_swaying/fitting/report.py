@@ -1,4 +1,4 @@
-"""What a fit writes: the table of values, pictures of video, simulation and difference, and a scene for ``sim``."""
+"""Outputs of a fit: the table of values, pictures of video, simulation and difference, and a scene for ``sim``."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
 ASTRAY = 6.0
-"""How much less PSNR fitted frames may have than the one at rest [dB]: four times the squared difference."""
+"""Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
 VAGUE = 0.25
 """Standard error, as a share of the range, above which an unknown is called not determined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """How well one camera is reproduced.
+    """Comparison of the fitted simulation with the video of one camera.
 
     Attributes:
         camera: Its name.
@@ -41,7 +41,7 @@ class Shown:
         predicted: PSNR of the predicted frames [dB]; NaN if there are none.
         rest: PSNR of the first frame, at rest [dB]: what noise, light and the splat itself leave, before any motion.
         picture: Rows of video, simulation and difference, dtype uint8, shape (H, W, 3).
-        rows: What each row is, such as ``0.5 s, fitted``.
+        rows: A label for each row, such as ``0.5 s, fitted``.
     """
 
     camera: str
@@ -54,17 +54,17 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a fit found.
+    """The result of a fit.
 
     Attributes:
-        unknowns: What was sought.
-        place: Where in their ranges the values are.
+        unknowns: The unknowns.
+        place: Values found, as shares of the ranges.
         covariance: Covariance of the places, shape (U, U).
         directions: Principal directions of the sensitivities, the best known first.
-        shown: How well each camera is reproduced.
+        shown: Comparison with the video of each camera.
         history: One row for each iteration.
         seconds: Time it took.
-        unsettled: Why the values are not those of a lowest place, and what to do; empty if they are.
+        unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
     """
 
     unknowns: Sequence[Unknown]
@@ -78,7 +78,7 @@ class Result:
 
     @property
     def values(self) -> dict[str, float]:
-        """The values."""
+        """Values of the unknowns that were found."""
         return {u.name: u.value(share) for u, share in zip(self.unknowns, self.place, strict=True)}
 
     @property
@@ -119,7 +119,7 @@ class Result:
         ]
 
     def text(self) -> str:
-        """The table and what is to be said about it, for printing."""
+        """The table with warnings and remarks, for printing."""
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())

@@ -1,4 +1,4 @@
-"""Whether a fit has settled: what a further step would still change."""
+"""Check that a fit ended at a local minimum: what a further Gauss-Newton step would still change."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from gaussian_swaying.fitting.unknowns import Unknown
 FAR = 0.005
 """Step, as a share of a range, above which the values have not settled."""
 GAIN = 0.003
-"""Share of the cost that such a step must be expected to gain: it changes nothing that is seen otherwise."""
+"""Least expected relative decrease of the cost by such a step; below it, the step would change nothing visible."""
 
 _BEGIN = "put `pixels` last in `stages`, raise `search`, or give a `start` that is nearer"
 
 
 def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended: str) -> str:
-    """Why the values at the end of a fit are not those of a lowest place, in a sentence; empty if they are.
+    """Return a sentence that says why the end of a fit is not a local minimum; empty if it is one.
 
-    The sentence names what the next step of Gauss and Newton would change, and the remedy. It cannot know of another,
-    lower place elsewhere.
+    The sentence names what the next Gauss-Newton step would change, and the remedy. A lower minimum elsewhere is not
+    detected.
 
     Args:
         normal: The sums at the end.
         place: The end, shares of the ranges, shape (U,).
-        unknowns: What was sought.
-        ended: Why the last iterations ended, see :class:`~gaussian_swaying.fitting.least_squares.Progress`; empty if
-            their number ran out.
+        unknowns: The unknowns.
+        ended: The reason why the last iterations ended, see :class:`~gaussian_swaying.fitting.least_squares.Progress`;
+            empty if their number ran out.
     """
     step = step_from(normal, place) - place
     gain = expected_gain(normal, step)

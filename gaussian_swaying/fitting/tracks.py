@@ -35,10 +35,10 @@ EDGE = 4.0
 OPAQUE = 0.3
 """Least opacity of a Gaussian that is followed."""
 BEHIND = 0.03
-"""How far behind the picture's depth a visible Gaussian may lie, as a share of the object's size."""
+"""Largest depth of a visible Gaussian behind the rendered depth, as a share of the object's size."""
 THIN = 0.25
-"""Share of the Gaussians in sight that must lie inside the object, a window away from its border, to leave the others
-out. Of a thing as thin as a window all are kept."""
+"""Gaussians near the border of the object are left out if at least this share of the visible ones lies a window away
+from it. In an object as thin as a window, all are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Tracks:
     Attributes:
         index: Their places among the moving Gaussians of the scene, shape (T,).
         position: Where each was seen [pixels], float64, shape (F, T, 2).
-        seen: Whether the track still holds, bool, shape (F, T).
+        seen: Whether the track is still valid, bool, shape (F, T).
     """
 
     index: Tensor
@@ -73,18 +73,19 @@ def track(simulation: Simulation, video: Footage, most: int = 400) -> Tracks:
 
 
 def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], most: int = 400) -> Tracks:
-    """Where the Gaussians of a simulation are seen in the video: from each rendered frame to the frame of the camera.
+    """Find the Gaussians of a simulation in the video: match each rendered frame with the frame of the camera.
 
     Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
     simulation must already be near, within a few tens of pixels.
 
-    Of Gaussians that overlap, the nearest are drawn, so the print of a splat is seen beside their centres, by a part
-    of a pixel that depends on how the surface is turned (:func:`drawn_beside`). A video of the thing does not have
-    that, and one that was made with the splat has it, too. The first frame tells: it is at rest, and simulation and
-    video are alike. What is left there comes from a camera that is not quite right: its median is taken off everywhere.
+    Where Gaussians overlap, the picture shows mostly the nearest ones. So it shows a Gaussian beside its projected
+    centre, by a part of a pixel that depends on the angle of view (:func:`drawn_beside`). A video of the real object
+    does not have this offset; one that was rendered from the splat has it, too. The first frame, at rest, shows which
+    is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
+    all frames.
 
-    Near the border of the object a window holds more border than print, and the border of a splat is not quite that
-    of the thing. Such Gaussians are left out.
+    Near the border of the object a window shows more border than texture, and the border of a splat is not quite that
+    of the real object. Such Gaussians are left out.
 
     Args:
         simulation: The scene.
@@ -121,19 +122,19 @@ def match(simulation: Simulation, video: Footage, states: Sequence[MPMState], mo
 
 
 def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
-    """How far from the centres of Gaussians a picture shows them, averaged over a window around each place.
+    """Return the offset between the rendered and the projected centres of Gaussians, averaged over windows.
 
-    Where a Gaussian is seen is the mean of all pixels by its weights in them: what alpha compositing leaves of it
-    behind those in front. The weights are derivatives of the picture by the colours.
+    The rendered centre of a Gaussian is the mean of all pixels, weighted by its share of each after alpha compositing.
+    These weights are the derivatives of the picture by the colours.
 
     Args:
         painter: Draws the picture.
         gaussians: All Gaussians of it, N.
         camera: Its camera, on their device.
-        places: Where it is asked [pixels], shape (T, 2).
+        places: Centres of the windows [pixels], shape (T, 2).
 
     Returns:
-        Towards where the picture shows them [pixels], float64, shape (T, 2).
+        Rendered minus projected centre [pixels], float64, shape (T, 2).
     """
     opacity, width, height = painter.scene.model.opacity().detach(), camera.width, camera.height
 
@@ -156,10 +157,10 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
-    """How much of the shift of a splat's print a video at rest lacks, from 0 to 1, and the median of what is left (2,).
+    """Return the share of the splat's offsets that a video at rest lacks, 0 to 1, and the median of the rest (2,).
 
     Args:
-        off: How far from the centres of Gaussians the video was found to show them [pixels], shape (T, 2).
+        off: Offset of the matched positions in the video from the projected centres [pixels], shape (T, 2).
         beside: From :func:`drawn_beside`, shape (T, 2).
     """
     share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
@@ -174,7 +175,7 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
         start: Points in the first frame [pixels; the first pixel's centre is at 0.5], shape (T, 2).
 
     Returns:
-        NumPy arrays: positions, float64, shape (F, T, 2), and whether each still holds, shape (F, T).
+        NumPy arrays: positions, float64, shape (F, T, 2), and whether each is still valid, shape (F, T).
     """
     import numpy as np
 
@@ -230,7 +231,7 @@ def _chosen(simulation: Simulation, video: Footage, grey: Any, most: int) -> tup
 
 
 def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float) -> Tensor:
-    """Which points (T, 2) at some depths (T,) lie in a picture, away from its edges, and not behind what it shows."""
+    """Mask of points (T, 2) at depths (T,) that lie in a picture, away from its edges, and not behind its surface."""
     expected = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].cpu()
     height, width = expected.shape
     inside = (pixel > EDGE).all(-1) & (pixel[:, 0] < width - EDGE) & (pixel[:, 1] < height - EDGE) & (depth > 0)
@@ -239,7 +240,7 @@ def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float
 
 
 def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
-    """Which points of those that are ``there`` have a window without a border of the object; all if hardly any has."""
+    """Mask of the points ``there`` whose window contains no border of the object; all of them if hardly any is left."""
     alpha = picture.alpha[..., 0].cpu()
     column, row = _windows(pixel, alpha.shape[1], alpha.shape[0])
     inside = there & (alpha[row, column] >= 0.5).all(-1)
@@ -260,7 +261,7 @@ def _grey(images: Tensor) -> Any:
 
 
 def opencv() -> Any:
-    """The module ``cv2``, which follows points.
+    """Import and return ``cv2`` (OpenCV), which tracks points.
 
     Raises:
         ImportError: If OpenCV is not installed.

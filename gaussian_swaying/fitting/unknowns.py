@@ -1,4 +1,4 @@
-"""What is sought: an option of the simulation with a range, and how its value gets into a variant of a simulation."""
+"""An unknown of a fit: a number of the simulation with a range, and how variants of a simulation get its value."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCALES = ("log", "linear")
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that is sought.
+    """An unknown of a fit.
 
     Args:
         name: The option of ``sim``, such as ``material.E``; or ``wind.speed`` [m/s], ``wind.azimuth`` [degrees, from +x
@@ -24,7 +24,7 @@ class Unknown:
         low: Smallest value.
         high: Largest value.
         scale: ``log`` or ``linear``.
-        start: Where to start; None for a coarse search over the range.
+        start: First value; None for a coarse search over the range.
 
     Raises:
         ValueError: If the name is unknown or the range makes no sense; the message names the unknown.
@@ -64,7 +64,7 @@ class Unknown:
         return self.low + share * (self.high - self.low)
 
     def share(self, value: float) -> float:
-        """Where in the range a value lies."""
+        """Return the share of the range at which a value lies, 0 to 1; logarithmic if ``scale`` is."""
         if self.scale == "log":
             return math.log(value / self.low) / math.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
@@ -86,7 +86,7 @@ def default_scale(name: str, low: float) -> str:
 
 
 def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
-    """Raise ValueError if a simulation has no place for an unknown; the message names it and the remedy."""
+    """Raise ValueError if a simulation has no such parameter as an unknown; the message names it and the remedy."""
     names = [unknown.name for unknown in unknowns]
     if not names:
         raise ValueError("Expected `unknowns` to have at least one entry, such as wind.speed: add it.")

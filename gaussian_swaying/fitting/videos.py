@@ -65,13 +65,13 @@ class _Shot:
 
 
 class _Room:
-    """What the videos of a fit may still decode."""
+    """The number of frames and bytes that the videos of a fit may still decode."""
 
     def __init__(self) -> None:
         self.frames, self.bytes = MOST_FRAMES, MOST_BYTES
 
     def holds(self, width: int, height: int) -> int:
-        """How many more frames of this size fit."""
+        """Return how many more frames of this size fit."""
         return min(self.frames, self.bytes // (3 * width * height))
 
     def check(self, path: Path, width: int, height: int, frames: int = 1) -> None:
@@ -84,7 +84,7 @@ class _Room:
             )
 
     def take(self, path: Path, width: int, height: int) -> None:
-        """Make room for one frame of a file.
+        """Count one more frame of a file.
 
         Raises:
             ValueError: If it does not fit any more.
@@ -257,7 +257,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
 
 
 def _next(film: Any, path: Path) -> Any:
-    """What ffmpeg tells or decodes next; None at the end."""
+    """Return the next item of ffmpeg's generator (the metadata, then frames); None at the end."""
     try:
         return next(film, None)
     except Exception as error:  # ffmpeg's errors are of many kinds

@@ -33,7 +33,7 @@ _PRIM = "/World/Gaussians"
 
 
 def cleaned(cloud: GaussianCloud) -> GaussianCloud:
-    """A splat that every format can hold.
+    """Return a splat that every format can store.
 
     Gaussians with a NaN, an infinite centre or colour, or a zero quaternion are left out. Opacities and sizes beyond
     the useful range of float32 are clamped: logits to ±16, logarithms of the size to ±20.

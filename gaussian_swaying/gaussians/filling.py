@@ -116,7 +116,7 @@ def ray_directions(count: int) -> list[tuple[int, int, int]]:
 
 
 def odd_crossings(dense: Tensor, direction: tuple[int, int, int]) -> Tensor:
-    """Whether a ray from each cell enters dense matter an odd number of times before it leaves the grid.
+    """True for cells whose ray enters dense matter an odd number of times before it leaves the grid.
 
     Args:
         dense: Cells whose density is above the threshold, bool, shape (nx, ny, nz).
@@ -230,7 +230,7 @@ def sample(field: Tensor, cells: Tensor, chunk: int = _CHUNK) -> Tensor:
 
 
 def sheet_depth(density: Tensor, cells: Tensor, covariances: Tensor, threshold: float) -> float:
-    """How far dense cells extend beyond the centres of their Gaussians [cells], for the median Gaussian.
+    """Return the distance by which dense cells extend beyond the centre of the median Gaussian [cells].
 
     A sheet with density d at its centres and a standard deviation s across it falls to the threshold at
     s sqrt(2 log(d / threshold)).
@@ -451,7 +451,7 @@ def solid_elements(field: Tensor, side: int, chunk: int = _CHUNK) -> Tensor:
 
 
 def assign(means: Tensor, element: Tensor, low: Tensor, spacing: float, resolution: Tensor) -> tuple[Tensor, Tensor]:
-    """Which element of the solid each Gaussian belongs to, and which elements need an extra point.
+    """Return the element of the solid that each Gaussian belongs to, and a mask of those that need an extra point.
 
     A Gaussian belongs to the element that it is in, or else to the nearest one within 1.5 spacings. An element that
     contains the centre of a Gaussian needs no extra point.

@@ -1,4 +1,4 @@
-"""Fewer points for a coarse grid: groups of points that share a small part of a cell, and specks that hang on nothing.
+"""Fewer points for a coarse grid: groups of points that share a small part of a cell, and specks without connection.
 
 A grid carries no more information than its nodes, and captures have many more Gaussians than a cell can tell apart.
 """
@@ -79,7 +79,7 @@ def grid_groups(
 
 @torch.no_grad()
 def loose_points(points: Tensor, side: float) -> Tensor:
-    """Which points hang on nothing, or by a thread, so that the wind would blow them off a grid.
+    """Return a mask of points connected to nothing, or by a thread only: on a grid, the wind would blow them away.
 
     One point of each cube counts, the one nearest to the centre of its cube's points, and two of them are connected if
     they are at most two sides apart, as are points in cubes side by side. Loose are
@@ -90,8 +90,8 @@ def loose_points(points: Tensor, side: float) -> Tensor:
 
     Args:
         points: Points, shape (N, 3).
-        side: Side of the cubes, in the unit of the points, less than half the spacing of the grid. What is farther
-            apart than one spacing shares only the rims of its kernels, and moves apart without strain.
+        side: Side of the cubes, in the unit of the points, less than half the spacing of the grid. Points farther apart
+            than one spacing share only nodes with small weights, and can move apart without strain.
 
     Returns:
         Booleans, shape (N,); none if otherwise all would be loose.

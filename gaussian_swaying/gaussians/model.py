@@ -123,7 +123,7 @@ class GaussianSurfaceModel(nn.Module):
 
     @property
     def view_dependent(self) -> bool:
-        """Whether the colours depend on the view direction."""
+        """True if the colours depend on the view direction."""
         return self.shN.shape[1] > 0
 
     def covariance(self) -> Tensor:

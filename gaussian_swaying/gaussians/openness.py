@@ -1,4 +1,4 @@
-"""How open patches are to the outside: the share of each that the wind can reach, measured as light would."""
+"""Openness of patches: the share of each that the wind from outside can reach, measured with rays, like light."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which Gaussians are simulated: a region of space, and a threshold on opacity."""
+"""The choice of the simulated Gaussians: a region of space, and a threshold on opacity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines spread evenly over all directions, two axes across each, and the area of a hull from its shadows."""
+"""Lines spread evenly over all directions, two axes across each, and the area of a convex hull from its projections."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def axes_across(lines: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def hull_area(points: Tensor) -> float:
-    r"""Area of the convex hull of points, by Cauchy's formula: four times its mean shadow over all directions.
+    r"""Area of the convex hull of points, by Cauchy's formula: four times its mean projected area.
 
     The outermost points in 1,000 directions stand for all; a sphere comes out less than 1 % too small. A flat sheet has
     two sides, so its hull has twice its area.

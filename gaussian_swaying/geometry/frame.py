@@ -42,7 +42,7 @@ class SimFrame:
 
     @property
     def turns(self) -> bool:
-        """Whether the axes differ from those of the scene; they do unless z is up in the scene."""
+        """True if the axes differ from those of the scene, which is so unless z is up in the scene."""
         if not self._turns:
             self._turns.append(not torch.equal(self.rotation, torch.eye(3).to(self.rotation)))
         return self._turns[0]

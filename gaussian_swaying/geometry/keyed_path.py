@@ -16,7 +16,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 
 @dataclass
 class KeyedPath:
-    """A rigid motion given at some times, and straight in between.
+    """A rigid motion given at some times, and linear in between.
 
     Args:
         times: Times of the keys [s], rising.
@@ -74,7 +74,7 @@ def _vectors(keys: Sequence[Sequence[float]], count: int) -> Tensor:
 
 
 def fastest(times: Tensor, values: Tensor, start: float = -math.inf, end: float = math.inf) -> float:
-    """Largest rate of values (K, 3) between keys, of those intervals that reach into the time from start to end [s]."""
+    """Largest rate of values (K, 3) between keys, over the intervals that overlap the time from start to end [s]."""
     if len(times) < 2:
         return 0.0
     meets = (times[1:] > start) & (times[:-1] < end)

@@ -380,7 +380,7 @@ def _combine(v, c0, c1, c2):
 
 @triton.jit
 def _reject(a, unit):
-    """What is left of a vector across a unit vector."""
+    """Return the part of a vector perpendicular to a unit vector."""
     along = dot3(a, unit)
     return (a[0] - along * unit[0], a[1] - along * unit[1], a[2] - along * unit[2])
 

@@ -21,7 +21,7 @@ LARGEST_MESH = 1 << 28
 """Largest file of a mesh [bytes]; some three million vertices as .obj."""
 
 MOST_SQUARES = 10_000_000
-"""Most squares of a cell of the distance grid under all triangles of a mesh, each as a square of its longest side."""
+"""Bound on the size of a mesh: the sum of (longest side / cell of the distance grid)² over its triangles."""
 
 _DISAGREE = 0.02
 """Share of the nodes next to which the rays along the three axes may disagree; more of them mean a hole."""
@@ -68,7 +68,7 @@ def read_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
 
 
 def _on_a_line(places: Tensor) -> bool:
-    """Whether places (V, 3) are on one line but for rounding to float32, as files have it.
+    """True if all places (V, 3) are on one line, within the rounding of files to float32.
 
     Rounding moves a coordinate c by at most c / 2^24, so a place by sqrt(3) times that of the largest coordinate. The
     second singular value is the root of the sum of the squared distances from the line that fits best.
@@ -205,7 +205,7 @@ def triangle_distance(place: Tensor, corners: Tensor) -> Tensor:
 
 
 def _inside(corners: Tensor, origin: Tensor, spacing: float, shape: tuple[int, ...], axis: int) -> Tensor:
-    """Whether a ray along an axis up to each node crosses the triangles an odd number of times, long, of ``shape``."""
+    """Return 1 where the ray along an axis up to a node crosses the triangles an odd number of times, else 0; long."""
     u, v = (k for k in range(3) if k != axis)
     nu, nv, nw = shape[u], shape[v], shape[axis]
     scaled = (corners - origin) / spacing

@@ -104,7 +104,7 @@ def _nearest_among(
 
 
 def particle_spacing(points: Tensor) -> float:
-    """Distance to the nearest other point that 90 % of the points stay below, from an even sample of some 4,000.
+    """90th percentile of the distance to the nearest other point, from an even sample of some 4,000 points.
 
     Args:
         points: Shape (N, 3).

@@ -140,7 +140,7 @@ def deform_all(
 
 
 def compiles() -> bool:
-    """Whether kernels can be compiled on this machine's GPU."""
+    """True if kernels can be compiled on this machine's GPU."""
     return _kernels() is not None
 
 

@@ -1,4 +1,4 @@
-"""What a picture needs of each patch after a deformation, in one kernel; the definitions are in ``patches``."""
+"""One kernel for the fields of deformed patches that a picture needs; the definitions are in ``patches``."""
 
 from __future__ import annotations
 

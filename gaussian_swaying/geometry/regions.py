@@ -48,7 +48,7 @@ class Region(ABC):
 
     @abstractmethod
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
 
     def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
         """Smallest and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
@@ -66,7 +66,7 @@ class Everything(Region):
         return "Everything()"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
         return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
 
@@ -96,7 +96,7 @@ class Box(Region):
         return f"Box(min={list(self.min)}, max={list(self.max)})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
         return ((points >= self.on(points, self.min)) & (points <= self.on(points, self.max))).all(-1)
 
@@ -124,7 +124,7 @@ class Sphere(Region):
         return f"Sphere(center={list(self.center)}, radius={self.radius})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
         return (points - self.on(points, self.center)).square().sum(-1) <= self.radius**2
 
@@ -162,7 +162,7 @@ class Cylinder(Region):
         )
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
         axis = self.on(points, self.axis)
         offset = points - self.on(points, self.center)
@@ -196,7 +196,7 @@ class Union(Region):
         return f"Union(regions={self.regions})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         inside = self.regions[0].contains(points)
         for region in self.regions[1:]:
             inside = inside | region.contains(points)
@@ -221,7 +221,7 @@ class Not(Region):
         return f"Not(region={self.region})"
 
     def contains(self, points: Tensor) -> Tensor:
-        """Which of the points [scene units] (..., 3) are inside, as booleans (...)."""
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         return ~self.region.contains(points)
 
 
@@ -241,7 +241,7 @@ def _check_region(name: str, region: Region) -> None:
 
 
 def whereabouts(region: Region, points: Tensor, rotation: Tensor) -> tuple[str, str]:
-    """Where points lie, and a remedy if only the axes of a region are wrong; for an error about one without points.
+    """Describe where points lie, for an error about a region without points, and name a remedy if its axes are wrong.
 
     Winds and other velocities have z up, but regions are in the axes of the scene, in which up may be another axis.
 
@@ -278,7 +278,7 @@ class RegionInFrame(Region):
         self.recordable = region.recordable
 
     def contains(self, points: Tensor) -> Tensor:
-        """Whether each point (..., 3) [m, z up] lies inside; bool, shape (...)."""
+        """Return a mask (...) of the points (..., 3) [m, z up] that are inside."""
         return self.region.contains(self.frame.point_to_scene(points))
 
     def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:

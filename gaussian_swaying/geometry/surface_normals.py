@@ -1,4 +1,4 @@
-"""Normals of the surface that points lie on, from where their neighbours are."""
+"""Normals of the surface that points lie on, from the positions of their neighbours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def neighbour_normals(points: Tensor, normals: Tensor, weights: Tensor | None = 
     "Surface reconstruction from unorganized points"). A neighbour counts with :math:`w_j (n_i \cdot n_j)^2`, so that
     another sheet, or the other face of an edge, counts little.
 
-    Photos determine where trained Gaussians lie better than how each of them is turned: the smallest axes of small
+    Photos determine the positions of trained Gaussians better than their orientations: the smallest axes of small
     Gaussians may lean by some tenths of a degree over large parts of a surface, while their centres do not.
 
     Args:

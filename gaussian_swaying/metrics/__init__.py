@@ -1,1 +1,1 @@
-"""How far a run is from a reference: structural similarity, Chamfer and Fréchet video distance."""
+"""Distances between a run and a reference: structural similarity, Chamfer and Fréchet video distance."""

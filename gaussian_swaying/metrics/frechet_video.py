@@ -227,7 +227,7 @@ class FrechetVideoDistance(Metric):
         return frechet_distance(*moments)
 
     def protocol(self) -> dict[str, Any]:
-        """What the number depends on: network and hash, cutting and resizing, and how many clips there were."""
+        """Return the settings that the number depends on: network, hash, cutting, resizing, and number of clips."""
         counts = {"real_clips": _joined(self.real_features), "generated_clips": _joined(self.fake_features)}
         features = max((value.shape[-1] for value in counts.values()), default=0)
         return {

@@ -1,4 +1,4 @@
-"""How far the normals of a surface are tilted over patches of a given size."""
+"""Tilt of the normals of a surface over patches of a given size."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Body:
     Args:
         points: The material at rest.
         boundaries: Boundary conditions in metres, in order.
-        surface: The places that touch; None for the material points, which then touch obstacles only.
+        surface: Contact samples of its surface; None for the material points, which then touch obstacles only.
 
     Attributes:
         laws: The laws of the material, bound to its particles.

@@ -49,9 +49,9 @@ class ForceTwin:
         vectors: ``vectors(time, dt, steps)`` returns what depends only on time: a vector for the start of each of
             ``steps`` (at most 256) substeps of ``dt`` from ``time`` on, both scalar float64 tensors; shape (steps, 3),
             or (steps, B, 1, 3) for a batch of scenes. Up to sixteen numbers may take the place of the three.
-        space: What the force reads depending on the place: numbers in float32, shape (n,), which stay at the same
-            address and may change between rollouts. The function then has two more arguments: ``(F, velocity, position,
-            values, vector, numbers, space, OPTIONS)``. None for a force that does not depend on the place.
+        space: Numbers that the force reads depending on the place, float32, shape (n,), which stay at the same address
+            and may change between rollouts. The function then has two more arguments: ``(F, velocity, position, values,
+            vector, numbers, space, OPTIONS)``. None for a force that does not depend on the place.
         adjoint: A ``@triton.jit`` function ``(F, velocity, values, vector, numbers, a, OPTIONS)`` that returns the
             gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three of
             the vector and by the first three of the numbers. No other input of the force may require a gradient then.
@@ -128,7 +128,7 @@ class Force(Recordable, nn.Module, ABC):
 
     @property
     def has_twin(self) -> bool:
-        """Whether there is a :meth:`twin`."""
+        """True if there is a :meth:`twin`."""
         return False
 
     def twin(self) -> ForceTwin:

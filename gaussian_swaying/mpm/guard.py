@@ -1,4 +1,4 @@
-"""What a rollout is checked for: what it is given before it begins, and its state at the end.
+"""Checks of a rollout: its arguments before it begins, and its state at the end.
 
 Nothing that is checked before the substeps makes the host wait, and the end is one wait for all checks together.
 """
@@ -27,7 +27,7 @@ def check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, limi
         state: The state to start from.
         dt: Substep [s].
         steps: Number of substeps.
-        limit: Whether to refuse a substep that nothing is stable with.
+        limit: Whether to refuse a substep with which nothing is stable.
 
     Returns:
         The number of substeps as an integer of Python.
@@ -109,7 +109,7 @@ def check_end(
     force: Tensor | None = None,
     drag: Tensor | None = None,
 ) -> None:
-    """Raise an error if the state after a rollout means nothing (one GPU synchronisation).
+    """Raise an error if the state after a rollout is not valid (one GPU synchronisation).
 
     Args:
         bound: The formulation, bound to its material.

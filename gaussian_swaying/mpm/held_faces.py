@@ -1,4 +1,4 @@
-r"""Where held material ends: the face between what a clamp holds and what is free, and whether a body is a sheet there.
+r"""Faces between clamped and free material, and the test whether a body is a sheet there.
 
 A clamped solid does not move at that face; its strain across the face is free. So a clamp holds rows on the face
 (:mod:`~gaussian_swaying.mpm.point_holds`): the mean displacement of patches of half a cell, and its slopes along the
@@ -27,9 +27,10 @@ HELD_ALONE = 0.999
 SOFTENED = 0.03
 """Factor of the stiffness of material that a clamp holds all the time.
 
-What is rigid needs none. In the cells that the face cuts, held material would share the curvature of the free side and
-stiffen it, as if the face lay up to a quarter of a cell farther out: an error of first order. Without any stiffness,
-nodes of which a sliver is free would hang on almost nothing. Measured on cantilevers of 0.3 to 6 cells.
+Rigid material needs no stiffness. In the cells that the face cuts, held material would share the curvature of the free
+side and stiffen it, as if the face lay up to a quarter of a cell farther out: an error of first order. Without any
+stiffness of the held material, nodes with only a sliver of free material would be almost unconnected. Measured on
+cantilevers of 0.3 to 6 cells.
 """
 
 SHEET = 1.25

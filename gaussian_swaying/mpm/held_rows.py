@@ -1,4 +1,4 @@
-"""Rows: the weights on the nodes by which points of the material are held, and which of them are independent."""
+"""Constraint rows: weights on the nodes by which points of the material are held; choice of independent rows."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ LEAST_OWN = 0.2
 """Least share of a row, in the norm of the inverse mass, that the rows chosen before it must leave over.
 
 The condition of the chosen rows grows with its inverse. Rows at the centres of full cells of uniform mass keep 0.79 of
-themselves in a line, 0.63 in a plane and 0.5 in a solid (one over the mean of the inverse of the spectrum
-(3/4 + cos(k)/4)² of a line, to the power of one, two and three). Less than a fifth has a second row at nearly the same
-place, or a slope along a held line. The condition is then below 50 for hinges and below 200 for clamps, for lines at
-any angle and for patches (tested).
+themselves in a line, 0.63 in a plane and 0.5 in a solid (one over the mean of the inverse of the spectrum (3/4 +
+cos(k)/4)² of a line, to the power of one, two and three). A second row at nearly the same place, or a slope along a
+held line, keeps less than a fifth. The condition is then below 50 for hinges and below 200 for clamps, for lines at any
+angle and for patches (tested).
 """
 
 LEAST_OWN_ON_A_FACE = 0.05
@@ -41,7 +41,7 @@ _NO_WEIGHT = 1e-6  # of a node that a particle on the border of its cell does no
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Rows of one scene, K in all, on the CPU in float64.
+    """Constraint rows of one scene, K in all, on the CPU in float64.
 
     Attributes:
         node: Nodes of each row, shape (K, 27).
@@ -69,7 +69,7 @@ class Rows:
 
     @staticmethod
     def join(parts: Sequence[Rows]) -> Rows:
-        """Rows one after the other."""
+        """Join several sets of rows, one after the other."""
         return Rows(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Rows)))
 
 

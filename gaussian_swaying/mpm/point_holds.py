@@ -1,15 +1,16 @@
 r"""Points of the material that boundaries hold exactly: hinges and clamps of the ``total`` formulation.
 
-A held point is a row of constant weights :math:`C` on the nodes: the quadratic B-splines at its rest place, or their
-slopes for a clamp (:mod:`~gaussian_swaying.mpm.held_rows`). A clamped region is held on its face
+A held point is a constraint row of constant weights :math:`C` on the nodes: the quadratic B-splines at its rest place,
+or their slopes for a clamp (:mod:`~gaussian_swaying.mpm.held_rows`). A clamped region is held on its face
 (:mod:`~gaussian_swaying.mpm.held_faces`), and the nodes behind it by the boundary itself: no row moves them. The
 velocity :math:`v` of the nodes, of mass :math:`M`, is changed as little as possible (Gauss's principle of least
 constraint) so that the rows move with their target velocity :math:`g'`:
 
 .. math:: v \leftarrow v - M^{-1} C^T \lambda, \qquad (C M^{-1} C^T)\, \lambda = C v - g'.
 
-:math:`\lambda` is the momentum that each row takes from the body. The projection removes motions and adds no stiffness,
-so the stable substep does not shrink. All rows of a body form one system, so pins that share nodes agree.
+:math:`\lambda` is the reaction impulse: the momentum that each row takes from the body. The projection removes motions
+and adds no stiffness, so the stable substep does not shrink. All rows of a body form one system, so pins that share
+nodes agree.
 
 Rows that nearly depend on others are left out (``independent_rows``). They are sorted by decreasing release time.
 With :math:`C M^{-1} C^T = L L^T` and :math:`W = L^{-1}`, both lower triangular, the inverse for the first k rows is

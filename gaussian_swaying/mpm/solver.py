@@ -133,17 +133,17 @@ class MPMSolver(nn.Module):
 
     @property
     def mls(self) -> bool:
-        """Whether the stress term and the update of F are those of MLS-MPM."""
+        """True if the stress term and the update of F are those of MLS-MPM."""
         return self.settings.mls
 
     @property
     def deterministic(self) -> bool:
-        """Whether sums on a GPU have a fixed order."""
+        """True if sums on a GPU have a fixed order."""
         return self.settings.deterministic
 
     @property
     def neighbours_fixed(self) -> bool:
-        """Whether particles keep their neighbours from the rest state: they cannot tear, flow or leave the grid."""
+        """True if particles keep their neighbours from the rest state: they cannot tear, flow or leave the grid."""
         return FORMULATIONS[self.formulation].neighbours_fixed
 
     # ---- the object at rest
@@ -184,7 +184,7 @@ class MPMSolver(nn.Module):
         self._bound = bound
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:
-        """Why the Triton kernels are not used; ValueError if they cannot be, but ``transfer`` is triton."""
+        """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is triton."""
         if self.transfer == "torch":
             return "`transfer` is torch"
         try:
@@ -199,7 +199,7 @@ class MPMSolver(nn.Module):
 
     @property
     def has_kernels(self) -> bool:
-        """Whether the Triton substep is used where no gradient is needed."""
+        """True if the Triton substep is used where no gradient is needed."""
         return self._bound is not None and self._fused_obstacle is None
 
     def fused(self, *tensors: Tensor | None) -> Fused | None:
@@ -220,7 +220,7 @@ class MPMSolver(nn.Module):
         return self._kernels()
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
-        """Whether a gradient is wanted by the body or by one of some tensors."""
+        """True if the body or one of some tensors requires a gradient, and gradients are enabled."""
         asking = (*self.bound.body.tensors(), *tensors)
         return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
 
@@ -266,7 +266,7 @@ class MPMSolver(nn.Module):
             velocity: Initial velocity [m/s], shape (..., P, 3); zero if None.
             margin: Cells around the object in the first grid of the ``updated`` formulation.
             frame: Transform from scene units to metres, for boundaries in scene units; None if they are in metres.
-            surface: The places that touch; None for the material points, which then touch obstacles only.
+            surface: Contact samples of the surface; None for the material points, which then touch obstacles only.
 
         Returns:
             The state, with the device and dtype of ``points``.
@@ -294,14 +294,14 @@ class MPMSolver(nn.Module):
         return self.bound.stable_substep(state)
 
     def substeps(self, state: MPMState, frame_dt: float, cells: float | None = None) -> int:
-        """How many equal substeps the next frame of ``frame_dt`` seconds takes (one GPU synchronisation).
+        """Return the number of equal substeps of the next frame of ``frame_dt`` seconds (one GPU synchronisation).
 
         In ``updated``, obstacles count as moving material does, so that they meet every node on their way.
 
         Args:
             state: The state now.
             frame_dt: Length of the frame [s].
-            cells: What :meth:`cells_per_second` says, if it is known; then the host need not wait.
+            cells: The result of :meth:`cells_per_second`, if it is known; then the host need not wait.
 
         Raises:
             ValueError: If the fixed substep is longer than the stable one, or takes an obstacle over nodes.
@@ -321,7 +321,7 @@ class MPMSolver(nn.Module):
         return math.sqrt(dt * dt + 2 * self.bound.viscous_time(state) * dt) * self.cells_per_second(state)
 
     def cells_per_second(self, state: MPMState) -> Tensor:
-        """How many cells the fastest wave crosses per second, a scalar tensor; in a kernel if there is one."""
+        """Return the cells that the fastest wave crosses per second, a scalar tensor; in a kernel if there is one."""
         if self._fused_obstacle is None:
             from gaussian_swaying.mpm.triton.measures import largest_speed
 

@@ -38,7 +38,7 @@ class GridSpec:
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
     def holds(self, other: GridSpec) -> bool:
-        """Whether all nodes of another grid are among those of this one."""
+        """True if all nodes of another grid are among those of this one."""
         inside = (
             a <= b and b + m <= a + n
             for a, n, b, m in zip(self.offset, self.resolution, other.offset, other.resolution, strict=True)
@@ -71,7 +71,7 @@ class GridSpec:
 
 
 def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec:
-    """The smallest box of the lattice that holds the stencils of all points between two corners.
+    """The smallest box of the lattice that contains the stencils of all points between two corners.
 
     It rounds as :func:`~gaussian_swaying.mpm.transfer.bspline_stencil` does, in the precision of the points: where a
     corner lies on a border between two stencils, another rounding would leave the points there outside of the grid.
@@ -248,7 +248,7 @@ class MPMState:
             law has one.
         substep: Length of the last substep [s]; 0 at the start.
         work: Work of the external forces since the start [J], shape (...) over the batch, float64.
-        impulse: Momentum that each boundary took from the body since the start [N s], in the order of the boundaries,
+        impulse: Reaction impulse: momentum that each boundary took from the body since the start [N s], in their order,
             shape (..., B, 3), float64; see :func:`support_force`.
     """
 

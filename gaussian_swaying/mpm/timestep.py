@@ -1,4 +1,4 @@
-r"""The substep: how long it may be, and how many fit in a frame.
+r"""The length of substeps: stable limits, and the number of substeps in a frame.
 
 For quadratic B-splines the sum :math:`\sum_i \nabla w_i \nabla w_i^T / w_i` of one particle is diagonal with entries
 between 4 and 6 over :math:`\Delta x^2`. With lumped masses this bounds the highest frequency of any arrangement of
@@ -170,7 +170,7 @@ def rounding_speed(speed: float, dt: float, steps: float, dx: float, dtype: torc
 
 
 def kick_time(state: MPMState, dt: float) -> float:
-    """How long forces act in a substep of ``dt`` [s] that starts at a state; see ``MPMSolver.step``."""
+    """Return the time for which forces act in a substep of ``dt`` [s] from a state; see ``MPMSolver.step``."""
     return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
 
@@ -194,11 +194,11 @@ def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | 
 
 
 def look_marks(steps: int, looks: int) -> list[int]:
-    """Numbers of the substeps after which to look: multiples of what a CUDA graph repeats, and the last one.
+    """Numbers of the substeps after which to check: multiples of the substeps in a CUDA graph, and the last one.
 
     Args:
         steps: Number of substeps.
-        looks: How often to look, at most.
+        looks: Largest number of checks.
     """
     unit = max(size for size in Repeater.SIZES if size == 1 or looks * size <= 2 * steps)
     return sorted({min(unit * math.ceil((k + 1) * steps / (looks * unit)), steps) for k in range(looks)})

@@ -165,12 +165,12 @@ def bspline_weights(f: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _borders(ranked: Tensor, count: int) -> Tensor:
-    """Where each of ``count`` nodes begins in a sorted list, and the end of the list; shape (count + 1,)."""
+    """Return the start of each of ``count`` nodes in a sorted list, and the end of the list; shape (count + 1,)."""
     return torch.searchsorted(ranked, torch.arange(count + 1, device=ranked.device))
 
 
 def _sparse_products(factors: Tensor) -> bool:
-    """Whether MKL's sparse products can be used: fast with 32-bit indices, and without a gradient of the matrix."""
+    """True if MKL's sparse products can be used: fast with 32-bit indices, and without a gradient of the matrix."""
     few = 9 * factors.numel() < 2**31  # upper bound on the number of entries
     return factors.device.type == "cpu" and few and not factors.requires_grad and torch.backends.mkl.is_available()
 

@@ -33,7 +33,7 @@ STRETCHED = 0.001  # share of the particles that may be stretched or compressed 
 
 @dataclass(frozen=True)
 class Motion:
-    """How far a scene moved in a run.
+    """The motion of a scene in a run: displacement and stretch.
 
     Attributes:
         share: Largest displacement (the :data:`MOVED` quantile over the particles) as a share of the longest side.

@@ -226,7 +226,7 @@ def finest_within(
 
 
 def _apart(dx: float, from_dx: float) -> float:
-    """How far two grid spacings are apart, as a logarithm; those that are nearly the same are the farthest."""
+    """Return the distance of two grid spacings, as a logarithm; infinite if they are nearly the same."""
     distance = abs(math.log(dx / from_dx))
     return distance if distance > 0.1 else math.inf
 

@@ -1,4 +1,4 @@
-"""What a camera should show: the whole object, including parts that do not move."""
+"""The Gaussians that a camera should show: the whole object, including parts that do not move."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SOLID = 0.1  # opacity
 
 
 def nearby(points: Tensor, simulated: Tensor) -> Tensor:
-    """Which points (N, 3) are at most one longest side outside the box of those that move, shape (N,)."""
+    """Return a mask of the points (N, 3) at most one longest side outside the box of those that move, shape (N,)."""
     low, high = points[simulated].amin(0), points[simulated].amax(0)
     side = (high - low).amax()
     return ((points >= low - side) & (points <= high + side)).all(-1)

@@ -1,4 +1,4 @@
-"""Where an object is held: whether it stands or hangs, and the end that is pinned."""
+"""Guess whether an object stands or hangs, and which of its ends is to be pinned."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ENDS = {"bottom": "lower", "top": "upper"}
 
 @dataclass(frozen=True)
 class HoldGuess:
-    """Where the object is held.
+    """A guess of the end at which the object is held.
 
     Attributes:
         end: ``top``, ``bottom``, ``side`` or ``none``.
@@ -148,7 +148,7 @@ def balanced_base(points: Tensor, weight: Tensor, up: Tensor) -> tuple[float, fl
 
 
 def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
-    """What an object would stand on, in words: a wide base (:func:`balanced_base`), or a stalk.
+    """Describe what an object would stand on: a wide base (:func:`balanced_base`) or a stalk; None if neither.
 
     A stalk is a lower end that is at most two thirds as wide as the upper one.
 
@@ -170,7 +170,7 @@ def standing_base(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
 
 
 def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
-    """What an object would hang from, in words: something as thin as a cord, right above its centre.
+    """Describe the cord that an object would hang from, right above its centre; None if there is none.
 
     A cord is an upright stretch of at least 15 % of the length, at most 15 % from the top, that is thinner than 0.04 of
     the length and than a quarter of the widest part.
@@ -209,7 +209,7 @@ def hanging_cord(points: Tensor, weight: Tensor, up: Tensor) -> str | None:
 
 
 def _above(points: Tensor, weight: Tensor, end: Tensor, up: Tensor, margin: float) -> bool:
-    """Whether the centre of the visible area is above or below the hull of one end, within a margin."""
+    """True if the centre of the visible area is above or below the hull of one end, within a margin."""
     centre = (points * weight[:, None]).sum(0) / weight.sum().clamp(min=1e-300)
     one, other = plane_axes(up)
     for k in range(8):
@@ -240,7 +240,7 @@ def _option(end: str, sideways: Sequence[float]) -> str:
 
 
 def _touched(points: Tensor, left_out: Tensor | None, up: Tensor, cell: float) -> tuple[bool, bool]:
-    """Whether excluded Gaussians are right below the lower end, and right above the upper one.
+    """Return two booleans: excluded Gaussians are right below the lower end, and right above the upper one.
 
     That is so if at least 30 % of the columns of cells at that end have something in or beside them within two cells.
     """

@@ -1,4 +1,4 @@
-"""What the cameras of photos show about a splat: the up direction, the object, and its background."""
+"""Guesses from the cameras of the photos of a splat: the up direction, the object, and its background."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ def backdrops(points: Tensor, weight: Tensor, eyes: Tensor, reach: float, cell: 
 
 
 def _below(columns: Tensor, high: Tensor) -> Tensor:
-    """Which points are in or beside a column with at least 3 of the high ones; columns (N, 2), shape (N,)."""
+    """Return a mask (N,) of points in or beside a column with at least 3 of the high ones; columns (N, 2)."""
     index = columns.floor().long()
     key = index[:, 0] * 2**31 + index[:, 1]
     full, count = key[high].unique(return_counts=True)

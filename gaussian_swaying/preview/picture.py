@@ -52,7 +52,7 @@ class Parts:
 
 
 def classify(simulation: Simulation) -> Parts:
-    """Which Gaussians are simulated, carried, held and pushed.
+    """Sort the Gaussians into simulated, carried, held and pushed ones.
 
     Raises:
         ValueError: If a condition holds nothing.

@@ -72,7 +72,7 @@ def area_line(run: dict[str, Any]) -> str:
 
 
 def run_lines(run: dict[str, Any]) -> list[str]:
-    """What a given configuration simulates."""
+    """Return lines of text about the scene that a given configuration simulates."""
     return [
         "",
         "this configuration",
@@ -110,7 +110,7 @@ def cost_lines(cost: Cost) -> list[str]:
 def quality_lines(
     found: Suggestion, cost: Cost, minutes: float | None, grids: dict[str, float], others: dict[str, float]
 ) -> list[str]:
-    """Why the starter has its grid, and what the other qualities would cost.
+    """Return lines of text: the reason for the grid of the starter, and the cost of the other qualities.
 
     Args:
         found: The guesses, with the chosen grid.

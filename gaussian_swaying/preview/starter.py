@@ -175,7 +175,7 @@ recorder:
 
 
 def _kind(s: Suggestion) -> str:
-    """What a pin holds, with the reason: the edge of a sheet is thin enough to turn about its points."""
+    """Return the kind of a pin, with the reason as a comment: hinge for a sheet, whose edge can turn, nodes else."""
     if s.sheet:
         return "hinge             # points: cloth turns where it is held; `updated` needs nodes"
     return (

@@ -48,7 +48,7 @@ MAX_BOXES = 8  # largest number of boxes that cut specks out of the region
 
 @dataclass(frozen=True)
 class RegionGuess:
-    """Which Gaussians to simulate.
+    """A guess of the Gaussians to simulate.
 
     Attributes:
         simulated: The simulated ones, shape (N,).

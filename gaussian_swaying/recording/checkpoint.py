@@ -27,7 +27,7 @@ def write_checkpoint(path: Path, checkpoint: dict[str, Any]) -> None:
 
 
 def log_lines(log: Sequence[Mapping[str, float]], known: list[str]) -> list[str]:
-    """A log of frames as a checkpoint holds it: a line of JSON per frame.
+    """A log of frames as a checkpoint stores it: a line of JSON per frame.
 
     Args:
         log: Diagnostics of all frames so far.

@@ -1,7 +1,7 @@
 """The displacement of nodes in a file: two bytes a number, and four for the few nodes that swing far.
 
 A node at the border of a body has almost no mass. It may swing far, even by thousands of times the size of the body,
-while all that is read from it nearly cancels. So such nodes need more than float16.
+while its effect on the particles nearly cancels. So such nodes need more than float16.
 """
 
 from __future__ import annotations

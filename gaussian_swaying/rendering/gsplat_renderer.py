@@ -21,7 +21,7 @@ from gaussian_swaying.rendering.protocol import (
 
 
 def gsplat_works() -> bool:
-    """Whether gsplat's CUDA kernels exist or can be compiled, which takes about a minute the first time."""
+    """True if gsplat's CUDA kernels exist or can be compiled, which takes about a minute the first time."""
     if not torch.cuda.is_available():
         return False
     try:

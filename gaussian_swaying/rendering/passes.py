@@ -68,7 +68,7 @@ def facing(normals: Tensor, view: Tensor) -> Tensor:
 
 
 def _shown(alpha: Tensor, smooth: bool) -> Tensor:
-    """How far a pixel of this opacity is shown: where it is covered; or, with smooth edges, fading about that."""
+    """Return the visibility of pixels of some opacity: 1 if covered, else 0; with smooth edges, a ramp between them."""
     return ((2 * alpha - COVERED).clamp(0, 1) if smooth else alpha >= COVERED).to(alpha)
 
 

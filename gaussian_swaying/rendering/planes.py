@@ -41,7 +41,7 @@ class SurfaceMaps:
 
 
 def plane_channels(means: Tensor, quats: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
-    """What :func:`surface_maps` needs blended: the normal towards the camera, and the distance of the plane.
+    """Return the channels that are blended for :func:`surface_maps`: normal towards the camera, distance of the plane.
 
     Args:
         means: Centres [scene units], shape (N, 3).

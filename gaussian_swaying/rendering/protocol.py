@@ -77,7 +77,7 @@ class ScreenGaussians:
     height: int
 
     def seen(self, count: int) -> Tensor:
-        """Which of ``count`` Gaussians are drawn, bool, shape (N,)."""
+        """Return a mask of the drawn ones among ``count`` Gaussians, bool, shape (N,)."""
         drawn = (self.radii > 0).all(-1)
         if self.index is None:
             return drawn[0]

@@ -142,7 +142,7 @@ class TearingGauge:
         self.elastic = solver.laws.elastic_particles()
 
     def __call__(self, position: Tensor) -> Tensor:
-        """Which particles are torn from a neighbour, from positions (..., P, 3) [m]; bool, shape (scenes, P)."""
+        """Return a mask (scenes, P) of the particles torn from a neighbour, from positions (..., P, 3) [m]."""
         flat = position.reshape(-1, *position.shape[-2:])
         near = flat.reshape(-1, 3).index_select(0, self.neighbour).reshape(*flat.shape[:2], -1, 3)
         apart = torch.linalg.vector_norm(near - flat[:, :, None], dim=-1)
@@ -239,7 +239,7 @@ class Measurement:
 
     @property
     def outran(self) -> bool:
-        """Whether a particle with a finite position left the grid in the frame."""
+        """True if a particle with a finite position left the grid in the frame."""
         return bool(self._wait()["outran"][0])
 
     @property
@@ -438,7 +438,7 @@ class Gauge:
 
 
 def _fields(state: MPMState) -> list[Tensor]:
-    """What :func:`measure` reads of a state whose two deformation gradients are the same tensor."""
+    """Return the fields that :func:`measure` reads of a state whose two deformation gradients are the same tensor."""
     found = [state.position, state.velocity, state.F_total, state.lost, state.time, state.impulse]
     return [*found, *(t for t in (state.node_displacement, state.node_velocity, state.internal) if t is not None)]
 
@@ -458,7 +458,7 @@ def _supports(before: MPMState, after: MPMState) -> Tensor:
 
 
 def _outran(before: MPMState, after: MPMState) -> Tensor:
-    """Whether a particle with a finite position left the grid in between, float64, shape (1,)."""
+    """Return 1 if a particle with a finite position left the grid between two states, else 0; float64, shape (1,)."""
     new = after.lost & ~before.lost & torch.isfinite(after.position).all(-1)
     return new.any().double().reshape(1)
 

@@ -65,7 +65,7 @@ class Edit:
 
     @property
     def of_material(self) -> bool:
-        """Whether more than the colour changes."""
+        """True if more than the colour changes."""
         return any(value is not None for value in (self.E, self.nu, self.density, self.law))
 
 
@@ -169,7 +169,7 @@ class SceneEditor:
         return sorted({edit.time for edit in self.edits})
 
     def reach(self, edit: Edit) -> tuple[Tensor, Tensor]:
-        """Which particles (P,) and which Gaussians (N,) an edit changes.
+        """Return masks of the particles (P,) and of the Gaussians (N,) that an edit changes.
 
         Raises:
             ValueError: If there are none.

@@ -1,4 +1,4 @@
-"""How Gaussians follow the material: each reads displacement and deformation where it is at rest."""
+"""Motion of the Gaussians with the material: each takes displacement and deformation at its own rest position."""
 
 from __future__ import annotations
 

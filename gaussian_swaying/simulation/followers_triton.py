@@ -1,4 +1,4 @@
-"""What a picture needs of Gaussians that follow the nodes, in one kernel; the definitions are in ``followers``."""
+"""One kernel for the fields of Gaussians that follow the nodes, for a picture; the definitions are in ``followers``."""
 
 from __future__ import annotations
 

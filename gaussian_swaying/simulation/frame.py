@@ -18,7 +18,7 @@ from gaussian_swaying.simulation.painter import Painter
 
 
 class Moving(Protocol):
-    """What a frame needs of the simulation that made it."""
+    """The attributes of a simulation that its frames use."""
 
     frame_dt: float
     painter: Painter

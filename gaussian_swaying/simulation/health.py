@@ -14,7 +14,7 @@ USUAL = 0.2  # largest displacement, as a fraction of the size, that still looks
 
 
 def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elastic: Tensor | None) -> dict[str, Any]:
-    """What moved most, and what was compressed and stretched most, over the frames of a run.
+    """Return the largest displacement, compression and stretch over the frames of a run.
 
     Args:
         log: Diagnostics of the frames, as from ``FrameDiagnostics.as_dict``.

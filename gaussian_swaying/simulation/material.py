@@ -1,4 +1,4 @@
-"""What an object is made of."""
+"""Material of an object: elastic constants, density, thickness, law, and regions that differ."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MaterialRegion:
 
 @dataclass
 class Material:
-    """What the object is made of.
+    """The material of the object.
 
     Args:
         E: Young's modulus [Pa].
@@ -95,7 +95,7 @@ class Material:
 
 
 DIFFERENTIABLE = ("E", "nu", "density")
-"""What of a :class:`Material` may require a gradient."""
+"""Numbers of a :class:`Material` that may require a gradient."""
 
 
 def with_gradients(points: MaterialPoints, material: Material) -> MaterialPoints:

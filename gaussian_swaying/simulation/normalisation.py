@@ -138,7 +138,7 @@ def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
 
 
 class Placed(NamedTuple):
-    """What :meth:`Normalisation.place` returns, as arguments of a simulation."""
+    """The result of :meth:`Normalisation.place`: arguments of a simulation."""
 
     scene: Scene
     material: Material

@@ -40,7 +40,7 @@ POLAR = ("wind.speed", "wind.azimuth", "wind.elevation")
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What drives a scene and what it is made of. Nothing in it is changed in place: another value makes another setup.
+    """Scene, material and drivers of a simulation. Never changed in place: another value makes another setup.
 
     Attributes:
         scene: The scene at rest.
@@ -478,7 +478,7 @@ def _write_solver(setup: Setup, values: Mapping[str, Any]) -> Setup:
 
 
 def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
-    """How a number of a force of a class is read and written."""
+    """Return the functions that read and write an attribute of the force of a class."""
 
     def read(setup: Setup) -> float:
         for force in setup.forces:

@@ -254,7 +254,7 @@ class Run:
 
     @property
     def recording(self) -> bool:
-        """Whether anything is written in a frame."""
+        """True if anything is written in a frame."""
         recorder = self.recorder
         return recorder.images or recorder.ply_every > 0 or recorder.trajectory or recorder.nodes
 

@@ -1,4 +1,4 @@
-"""Which points carry the material: samples of the surface and the inside of an object, one by one or in groups."""
+"""Material points: samples of the surface and the inside of an object, one for each Gaussian or for groups."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ __all__ = ["Material", "MaterialRegion", "Scene", "SimulatedScene"]
 
 
 class Scene:
-    """Where the Gaussians come from and which of them are simulated.
+    """The source of the Gaussians, and the choice of those that are simulated.
 
     Args:
         ply: A 3DGS .ply, a compressed .ply or a .splat; takes precedence over ``generator``.
@@ -65,8 +65,8 @@ class Scene:
             comparison with a wind that does not use patches). Null for ``open`` with ``ply`` and ``coverage`` with
             ``generator`` or ``wind_on: all``.
         filling: Fills the inside of a solid with points that carry mass and feel no wind; null for a shell.
-        wind_on: Which simulated Gaussians feel the wind: ``surface`` (those in contact with open air) or ``all`` (also
-            those inside the solid that ``filling`` finds). Without ``filling``, all are on the surface.
+        wind_on: The simulated Gaussians that feel the wind: ``surface`` (those in contact with open air) or ``all``
+            (also those inside the solid that ``filling`` finds). Without ``filling``, all are on the surface.
         max_stretch: Largest size at which a Gaussian is drawn, as a multiple of its size at rest (see
             :func:`~gaussian_swaying.geometry.covariances.limit_deformed`), in pictures and exports; null for no limit.
             Nothing changes below the limit. Above it a Gaussian would look like a streak: two parts of the object that
@@ -79,7 +79,7 @@ class Scene:
             limit on sizes needs this: use 0.45 ``solver.dx`` or less. Null for none with ``points: gaussian``; with
             ``grid``, null fills holes: extra points, ``solver.dx / points_per_cell`` apart, where no Gaussian is
             within 0.6 cells.
-        points: Which points carry the material: ``gaussian`` (one for each simulated Gaussian, as in the paper and
+        points: The points that carry the material: ``gaussian`` (one for each simulated Gaussian, as in the paper and
             PhysGaussian), or ``grid`` (groups of Gaussians, as many as the grid can use, and extra points where
             Gaussians are sparse; the Gaussians follow the nodes). ``grid`` is many times faster where the splat is
             much finer than the grid, and needs ``solver.formulation: total``. Null for ``grid`` in ``total`` and
@@ -439,7 +439,7 @@ class SimulatedScene(nn.Module):
         return rest + move, F
 
     def solid(self) -> Tensor:
-        """Which moving Gaussians keep their shape because their law has no return map; bool, shape (M,)."""
+        """Return a mask (M,) of the moving Gaussians that keep their shape, as their law has no return map."""
         if self._kept is None or self._kept[0] is not self.points:  # an edit replaces the points
             laws, index = self.points.laws, self.points.law_index
             with torch.inference_mode(False):  # it outlives the call

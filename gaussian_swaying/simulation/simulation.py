@@ -191,7 +191,7 @@ class Simulation(Stepping):
 
     @property
     def setup(self) -> Setup:
-        """What drives the scene now, and what it is made of; see :mod:`gaussian_swaying.simulation.parameters`."""
+        """Return the present scene, material and drivers; see :mod:`gaussian_swaying.simulation.parameters`."""
         forces = tuple(force for force in self.custom_forces if isinstance(force, Force))
         points = self.scene.points
         return Setup(self.scene, self.material, points, self.wind, self.aero, forces, self.solver.settings)
@@ -257,7 +257,7 @@ class Simulation(Stepping):
 
     @property
     def config(self) -> str:
-        """What a run is compared with before it is resumed, as YAML: the file, and the arguments given in Python."""
+        """Return the resume key of a run as YAML: the configuration file, and the arguments given in Python."""
         heading = "changed_in_python" if self._text else "made_in_python"
         return self._text + python_text(heading, {name: self._given[name] for name in self._changed})
 

@@ -1,4 +1,4 @@
-"""How a simulation gets from one state to the next: the state at rest, edits, substeps, and what a frame needs."""
+"""Stepping of a simulation from one state to the next: the state at rest, edits, substeps, and their number."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Stepping(nn.Module):
 
     @property
     def idle(self) -> bool:
-        """Whether the wind has no effect; computed again only if a coefficient changed, as it makes the host wait."""
+        """True if the wind has no effect; computed again only if a coefficient changed, as it makes the host wait."""
         aero = self.aero
         key = (aero, aero.air_density, *(0 if c.is_inference() else c._version for c in (aero.C_D, aero.C_F, aero.C_L)))
         if self._idle is None or self._idle[0] != key:
@@ -384,13 +384,13 @@ class Stepping(nn.Module):
 
     @property
     def foresees(self) -> bool:
-        """Whether the needs of the next frame are measured at the end of a frame, so that the host waits once."""
+        """True if the needs of the next frame are measured at the end of a frame, so that the host waits once."""
         simple = self.solver.substep is None and self.solver.stiffness_damping == 0
         return simple and self.solver.has_kernels and self.wind_force.recordable
 
     @in_turn
     def substeps(self, state: MPMState, parts: tuple[object, ...] | None = None) -> int:
-        """How many substeps the next frame takes, for waves in the material and explicit drag on light patches.
+        """Return the number of substeps of the next frame, from waves in the material and drag on light patches.
 
         Args:
             state: The state at its start.
@@ -496,12 +496,12 @@ class Launched:
 
 
 class Outlook:
-    """What decides how many substeps the next frame takes, read with the measurements of this one.
+    """The numbers that decide how many substeps the next frame takes, read with the measurements of this one.
 
     Args:
         state: The state at the end of the frame.
         needs: The numbers of :func:`needs_of`.
-        parts: What :func:`parts_of` said when they were measured.
+        parts: The result of :func:`parts_of` when they were measured.
     """
 
     def __init__(self, state: MPMState, needs: list[float], parts: tuple[object, ...] | None) -> None:
@@ -509,19 +509,19 @@ class Outlook:
         self._read = [weakref.ref(tensor) for tensor in _read(state)]
 
     def holds(self, state: MPMState, parts: tuple[object, ...] | None) -> bool:
-        """Whether the frame starts from this state, with nothing changed since; ``parts`` is what they are now."""
+        """True if the frame starts from this state and nothing changed since; ``parts`` is the result of now."""
         same = all(known() is tensor for known, tensor in zip(self._read, _read(state), strict=False))
         return same and self._parts is not None and self._parts == parts
 
 
 def _read(state: MPMState) -> list[Tensor]:
-    """What the needs depend on in a state."""
+    """Return the fields of a state that the needs depend on."""
     found = (state.F_elastic, state.internal, state.velocity, state.time)
     return [tensor for tensor in found if tensor is not None]
 
 
 def parts_of(simulation: Stepping) -> tuple[object, ...] | None:
-    """What the needs depend on besides the state; None if that cannot be told, or if it is on another device."""
+    """Return a key of all else that the needs depend on; None if changes cannot be detected, or on another device."""
     wind = simulation.wind_force
     tensors = tensors_in([wind])
     if any(tensor.is_inference() or tensor.device != simulation.device for tensor in tensors):
@@ -550,7 +550,7 @@ def needs_of(simulation: Stepping, state: MPMState, winds: Tensor | None) -> Ten
 
 
 def _raised_here(error: BaseException) -> bool:
-    """Whether an error was raised by this package, and not by code that it called."""
+    """True if an error was raised by this package, and not by code that it called."""
     place = error.__traceback__
     while place is not None and place.tb_next is not None:
         place = place.tb_next

@@ -67,7 +67,7 @@ def _shallow(module: M) -> M:
 
 
 def why_apart(simulation: Simulation) -> str | None:
-    """Why a simulation cannot be done together with others; None if it can."""
+    """Return the reason why a simulation cannot share a rollout with others; None if it can."""
     wind = simulation.wind
     if not isinstance(wind, WindField) or not wind.uniform:
         return "the wind differs from place to place"

@@ -1,4 +1,4 @@
-"""What touches in a scene: places on the surface of the object, and the Gaussians that stand still as an obstacle."""
+"""Contact in a scene: samples on the surface of the object, and the Gaussians that stand still as an obstacle."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
 
 @torch.no_grad()
 def close_at_rest(surface: Surface) -> int:
-    """How many pairs of places lie above each other at rest by less than the thickness: they will be pushed apart."""
+    """Count pairs of contact samples closer at rest than the thickness, one above the other: they are pushed apart."""
     thickest = float(surface.thickness.amax())
     first, second = close_pairs(surface.place, thickest, surface.place, 0.0)
     arm = surface.place[first] - surface.place[second]

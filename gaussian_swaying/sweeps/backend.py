@@ -1,4 +1,4 @@
-"""What does the jobs of a sweep: a pool of processes or Ray behind one protocol, and the loop that keeps it busy."""
+"""Backends that do the jobs of a sweep: a pool of processes or Ray, one protocol, and the loop that keeps it busy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PACKED = 0.9  # share of a GPU's memory that is given away, as runs differ
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a job ended.
+    """The outcome of a job.
 
     Attributes:
         results: The result of each of its runs, by name.
@@ -31,7 +31,7 @@ class Outcome:
 
     @property
     def complete(self) -> bool:
-        """Whether all runs are."""
+        """True if all runs are complete."""
         return all(result["status"] == "complete" for result in self.results.values())
 
 
@@ -39,7 +39,7 @@ class Backend(Protocol):
     """Does jobs, several at a time. It knows nothing of plans, retries and tables."""
 
     def free(self) -> bool:
-        """Whether another job can be given."""
+        """True if another job can be given."""
 
     def submit(self, job: Job) -> None:
         """Begin a job."""

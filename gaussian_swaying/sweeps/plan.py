@@ -1,4 +1,4 @@
-"""What a sweep does: the configuration that all runs share, and what differs between them."""
+"""The plan of a sweep: the configuration that all runs share, and the axes along which they differ."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ def _environment(**values: str) -> Iterator[None]:
 
 
 def _receive(worker: _Worker, job: Job) -> tuple[Outcome, bool]:
-    """How a job ended, and whether the worker can do another one."""
+    """Return the outcome of a job, and True if the worker can do another one."""
     try:
         done = worker.connection.recv()
         return Outcome(done.results, share=done.share), done.ready

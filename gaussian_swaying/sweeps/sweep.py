@@ -176,7 +176,7 @@ def _backend(
 
 
 def _finish(folder: Path, plan: Plan, results: dict[str, dict[str, Any]], picture: str, parquet: bool) -> None:
-    """What is written at the end."""
+    """Write the tables and contact sheets at the end of a sweep."""
     if parquet:
         write_parquet(folder, plan.names, plan.runs, results)
     write_contact_sheets(folder, picture)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def shares_rollout(name: str) -> bool:
-    """Whether runs that differ in an axis keep their shape."""
+    """True if runs that differ only in this axis can share a rollout, as they have the same material points."""
     known = find(name)
     return known is not None and known.batched and known.same_points and known.name in parameters.names()
 

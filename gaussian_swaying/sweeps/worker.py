@@ -41,7 +41,7 @@ Explain = Callable[[BaseException], str]
 
 @dataclass(frozen=True)
 class Done:
-    """What a worker has done.
+    """The results of a job, as a worker sends them.
 
     Attributes:
         results: The result of each run, by name.

@@ -19,7 +19,7 @@ _INNER_HOOKS = ("on_before_backward", "on_after_backward", "on_before_optimizer_
 
 
 def images_until_hooks(trainer: Trainer, every: int) -> int:
-    """How many images to train on before Lightning's hooks are called.
+    """Return the number of images to train on before Lightning's hooks are called.
 
     Hooks come at multiples of ``every``, and wherever Lightning has something to do: the last image, a checkpoint, a
     validation, the end of an epoch. On several devices each trains on so many images, and all call the hooks together.
@@ -66,7 +66,7 @@ def number_batch(trainer: Trainer, dataloader_iter: Any) -> None:
 
 
 def inner_hooks_used(trainer: Trainer, module: Any) -> bool:
-    """Whether a callback or the module wants to be called within a step, at each backward pass and optimiser."""
+    """True if a callback or the module has a hook within a step, such as one at each backward pass."""
     if any(getattr(type(module), name) is not getattr(LightningModule, name) for name in _INNER_HOOKS):
         return True
     return any(

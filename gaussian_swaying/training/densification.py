@@ -39,7 +39,7 @@ class Densification(ABC):
     """
 
     absgrad: bool = False
-    """Whether the renderer must compute absolute gradients."""
+    """True if the renderer must compute absolute gradients."""
 
     def __init__(self) -> None:
         self._model: GaussianSurfaceModel | None = None

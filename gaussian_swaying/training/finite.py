@@ -1,4 +1,4 @@
-"""What is finite: the loss, checked without waiting for the GPU, and the Gaussians of a splat."""
+"""Checks for NaN and infinity: of the loss, without waiting for the GPU, and of the Gaussians of a splat."""
 
 from __future__ import annotations
 

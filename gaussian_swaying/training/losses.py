@@ -165,7 +165,7 @@ class LossInputs:
 
 
 NEEDS = ("surface", "other_view")
-"""What a term may need beside the picture; it is made only while such a term is active."""
+"""Inputs that a term may need besides the picture; each is computed only while a term that needs it is active."""
 
 
 class LossTerm(nn.Module, ABC):
@@ -186,7 +186,7 @@ class LossTerm(nn.Module, ABC):
     needs: frozenset[str] = frozenset()
 
     def share(self, step: int) -> float:
-        """What its weight is multiplied by at a step; 0 where it is not computed."""
+        """Return the factor on its weight at a step; 0 where it is not computed."""
         if step < self.start or (step - self.start) % self.every:
             return 0.0
         if self.stop is None:
@@ -353,7 +353,7 @@ class TotalLoss(nn.Module):
         return {name: term for name, term in self._by_name.items() if term.share(step)}
 
     def needs(self, step: int) -> frozenset[str]:
-        """What these terms need, see :data:`NEEDS`."""
+        """Return the inputs that the active terms need, see :data:`NEEDS`."""
         wanted: frozenset[str] = frozenset()
         return wanted.union(*(term.needs for term in self.active(step).values()))
 

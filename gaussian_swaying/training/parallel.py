@@ -44,7 +44,7 @@ def sum_over_devices(tensors: Sequence[Tensor]) -> None:
 
 
 def seen_by_any(seen: Tensor) -> Tensor:
-    """Which Gaussians are in the picture of at least one device.
+    """Return a mask of the Gaussians in the picture of at least one device.
 
     Args:
         seen: Those in the picture of this device, bool (N,).
@@ -57,7 +57,7 @@ def seen_by_any(seen: Tensor) -> Tensor:
 
 
 def several_devices() -> bool:
-    """Whether this process is one of several that train together."""
+    """True if this process is one of several that train together."""
     return distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
 
 

@@ -28,7 +28,7 @@ def grey(image: Tensor) -> Tensor:
 
 
 def edge_weight(image: Tensor) -> Tensor:
-    r"""How little a picture changes at each pixel, :math:`(1 - |\nabla I|)^2` with the gradient over its largest value.
+    r"""Return a weight that falls with the image gradient, :math:`(1 - |\nabla I|)^2`, relative to its largest value.
 
     Chen et al. 2024 (PGSR), equation 9: depths may jump where colours do.
 
@@ -95,7 +95,7 @@ def sample(image: Tensor, pixel: Tensor) -> Tensor:
 
 
 def round_trip(pixel: Tensor, depth: Tensor, camera: Camera, other: OtherView) -> tuple[Tensor, Tensor]:
-    """How far a pixel is from itself after it went to another view and back, each time along the rendered surface.
+    """Return the reprojection error of pixels: to another view and back, each time by the rendered surface.
 
     Args:
         pixel: Pixel coordinates, shape (S, 2).
@@ -180,7 +180,7 @@ def cross_correlation(one: Tensor, two: Tensor, contrast: float = 0.01) -> tuple
 
 
 def textured(image: Tensor, radius: int, contrast: float) -> Tensor:
-    """Where the patch around a pixel of a grey picture (H, W) has a standard deviation above ``contrast``, bool (H, W).
+    """Return a mask (H, W) of pixels of a grey picture whose patch has a standard deviation above ``contrast``.
 
     False within ``radius`` pixels of the border.
     """

@@ -282,7 +282,7 @@ class Controls(Panel):
         )
 
     def _anchor(self) -> np.ndarray:
-        """Where the arrow of the wind ends: just above the object."""
+        """Return the tip of the arrow of the wind, just above the object."""
         scene = self.session.simulation.scene
         low, high = (corner.double() for corner in scene.bounds)
         up = scene.frame.rotation[2].to(low)
@@ -315,7 +315,7 @@ class Controls(Panel):
 
 
 def log_place(stiffness: float) -> float:
-    """Where a stiffness [Pa] is on the slider."""
+    """Return the slider's value for a stiffness [Pa]: its logarithm to base 10, within the range."""
     return round(min(max(math.log10(stiffness), float(LEAST_LOG)), float(MOST_LOG)), 2)
 
 

@@ -49,10 +49,10 @@ class Door:
         self.token = None if host in LOCAL else secrets.token_urlsafe(16)
 
     def refusal(self, path: str, headers: Mapping[str, str], address: str = "", port: int = 0) -> str | None:
-        """Why a request is refused, or None.
+        """Return the reason why a request is refused, or None.
 
         Args:
-            path: What is asked for, with the query.
+            path: The requested path, with the query.
             headers: Of the request.
             address: Address of this computer at which the request arrived.
             port: Port of the server.
@@ -74,7 +74,7 @@ class Door:
         return None
 
     def answer(self, process_request: Any, connection: Any, request: Any) -> Any:
-        """What viser answers to a request that may come in, never in a frame; it connects to nothing but itself."""
+        """Return viser's answer to an allowed request, with headers that forbid frames and connections elsewhere."""
         address, port = connection.local_address[:2]
         refused = self.refusal(request.path, request.headers, address, port)
         if refused is not None:

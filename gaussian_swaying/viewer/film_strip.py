@@ -35,7 +35,7 @@ class FilmStrip:
 
     @property
     def full(self) -> bool:
-        """Whether the video has its greatest length, and takes no more pictures."""
+        """True if the video has its greatest length, and takes no more pictures."""
         return self.seconds >= LONGEST
 
     def add(self, time: float, picture: np.ndarray) -> None:

@@ -103,6 +103,6 @@ def _plain(modulation: Any) -> dict[str, Any]:
 
 
 def _name(modulation: dict[str, Any]) -> str:
-    """What a modulation is called on the page."""
+    """Return the name of a modulation on the page."""
     kind = modulation["class_path"].rsplit(".", 1)[-1]
     return next((name for name, known in KINDS.items() if known == kind), kind)

@@ -1,4 +1,4 @@
-"""What browsers may send to the live page."""
+"""Checks of the messages that browsers send to the live page."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Incoming:
         }
 
     def takes(self, raw: bytes | str) -> bool:
-        """Whether a message passes, as it arrived."""
+        """True if a raw message is valid and may be processed."""
         from viser._messages import Message
 
         if self.server is None:
@@ -147,7 +147,7 @@ TOO_LARGE = (
 
 
 def what_is_wrong(handle: Any, value: Any) -> str | None:
-    """Why a value is none that a control can have, or None."""
+    """Return the reason why a control cannot have a value, or None if it can."""
     import viser
 
     name = handle.label
@@ -167,7 +167,7 @@ def what_is_wrong(handle: Any, value: Any) -> str | None:
 
 
 def _numbers(values: Any, count: int) -> bool:
-    """Whether a list has so many finite numbers."""
+    """True for a list of ``count`` finite numbers."""
     return (
         isinstance(values, (list, tuple))
         and len(values) == count

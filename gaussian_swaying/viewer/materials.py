@@ -1,4 +1,4 @@
-"""What a stiffness feels like: Young's moduli of everyday materials."""
+"""Young's moduli of everyday materials, to give an idea of a stiffness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the groups of controls on the live page share: the page, its session, and how a control is heard."""
+"""Base of the groups of controls on the live page: the page, its session, and callbacks of controls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the live page shows: the settings of a splat that has no configuration."""
+"""Settings for the live page of a splat that has no configuration."""
 
 from __future__ import annotations
 

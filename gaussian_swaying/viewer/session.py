@@ -32,7 +32,7 @@ MOST_UNDONE = 50  # changes
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """What there is to see at a moment.
+    """The simulation, its state and its measurements at one time.
 
     Attributes:
         simulation: The simulation.
@@ -49,7 +49,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Rates:
-    """How fast a session runs.
+    """The speed of a session.
 
     Attributes:
         steps: Steps per second.
@@ -66,7 +66,7 @@ class Rates:
 
 @dataclass
 class Past:
-    """What a change took the place of.
+    """The settings before a change, to undo it.
 
     Attributes:
         settings: The settings before it.
@@ -188,7 +188,7 @@ class Session:
 
     @property
     def changes(self) -> int:
-        """How many changes can be undone."""
+        """Number of changes that can be undone."""
         return len(self._past)
 
     def pause(self, paused: bool = True) -> None:
@@ -221,12 +221,12 @@ class Session:
 
     @property
     def pulls(self) -> bool:
-        """Whether something is held."""
+        """True while the user pulls at something."""
         return self._pull is not None
 
     @property
     def broken(self) -> bool:
-        """Whether the simulation diverged, and waits for a reset."""
+        """True if the simulation diverged, and waits for a reset."""
         return self._broken
 
     def wait(self, number: int, seconds: float) -> Snapshot:
@@ -240,7 +240,7 @@ class Session:
         return config_text(self.parser, self.settings)
 
     def rates(self) -> Rates:
-        """How fast it runs."""
+        """Return the present speed."""
         steps, now = list(self._steps), time.perf_counter()
         steps = [step for step in steps if now - step[0] < WINDOW]
         health, simulation = self.snapshot.health, self.simulation

@@ -30,7 +30,7 @@ class Fields:
         self._fields, self._where, self._asked = fields, where, set[str]()
 
     def given(self, name: str) -> bool:
-        """Whether the key is there."""
+        """True if the key is there."""
         return name in self._fields
 
     def get(self, name: str, *default: Any) -> Any:

@@ -24,7 +24,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import RegionInFrame
 
 BY_BODY = "by body"
-"""The kind of a pin that holds a sheet by a hinge, and anything else by a clamp."""
+"""The kind of a pin that becomes a hinge for a sheet, and a clamp for anything else."""
 
 CLOCK = 1e-9  # round-off of a time after many additions of a substep [s]
 _Kind = TypeVar("_Kind", bound="Boundary")
@@ -98,7 +98,7 @@ class Boundary(Recordable, nn.Module, ABC):
         return moved
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
-        """What it acts on: ``nodes``, in :meth:`forward`; points, as a ``hinge`` or a ``clamp``; or the ``surface``.
+        """Return what it acts on: ``nodes`` (:meth:`forward`), points as a ``hinge`` or ``clamp``, or the ``surface``.
 
         It may also be :data:`BY_BODY`, which leaves the choice of hinge or clamp to the formulation.
 
@@ -117,7 +117,7 @@ class Boundary(Recordable, nn.Module, ABC):
 
     @property
     def moves(self) -> bool:
-        """Whether what it holds moves: whether it has a :meth:`target` of its own."""
+        """True if the held part moves, that is, if it has a :meth:`target` of its own."""
         return type(self).target is not Boundary.target
 
     def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
@@ -125,7 +125,7 @@ class Boundary(Recordable, nn.Module, ABC):
         return torch.zeros_like(place)
 
     def turning(self, arm: Tensor, dt: float | Tensor) -> Tensor:
-        """How the target velocity differs between two places that are ``arm`` (..., 3) apart; zero if at rest."""
+        """Return the difference of the target velocity [m/s] over a distance ``arm`` (..., 3) [m]; zero if at rest."""
         return torch.zeros_like(arm)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor | None:
@@ -137,7 +137,7 @@ class Boundary(Recordable, nn.Module, ABC):
         return None
 
     def active(self, time: Tensor) -> Tensor:
-        """Whether the condition acts at a time [s]; scalar bool tensor, so that no GPU synchronisation is needed."""
+        """True if the condition acts at a time [s]; scalar bool tensor, so that no GPU synchronisation is needed."""
         now = time + CLOCK
         return (now >= self.start) & (now < self.end)
 

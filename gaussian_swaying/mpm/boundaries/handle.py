@@ -18,8 +18,8 @@ class Handle(PinnedRegion):
     """Moves the particles of a region as a rigid body: a pin that travels and turns.
 
     Each substep moves what is held exactly to its place in the rigid motion, so a handle that turns for minutes neither
-    grows nor drifts. It lets go when its time window ends. As a ``hinge`` it turns its points, but not the slope of a
-    sheet; as a ``clamp`` it turns both.
+    grows nor drifts. It releases the material when its time window ends. As a ``hinge`` it turns its points, but not
+    the slope of a sheet; as a ``clamp`` it turns both.
 
     Args:
         region: Region of the held particles at rest, in scene units.
@@ -64,7 +64,7 @@ class Handle(PinnedRegion):
         return self.copy_in(frame, pivot=frame.point_to_sim(self.pivot))
 
     def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
-        """The velocity of the rigid motion: its explicit step ends at the right place.
+        """Velocity of the rigid motion, such that an explicit step ends exactly on it.
 
         Shape (..., 3) [m/s].
         """

@@ -18,8 +18,9 @@ from gaussian_swaying.mpm.boundaries.plane import plane_velocity
 class Obstacle(Boundary):
     """A rigid body, fixed or moving, that the material cannot enter, with Coulomb friction.
 
-    In ``total`` it stops places of the surface, at the obstacle's own surface (:mod:`~gaussian_swaying.mpm.contact`).
-    In ``updated`` it stops grid nodes, as a ``Plane`` does, so the gap is up to a cell wide.
+    In ``total`` it stops contact samples of the body's surface, at the obstacle's own surface
+    (:mod:`~gaussian_swaying.mpm.contact`). In ``updated`` it stops grid nodes, as a ``Plane`` does, so the gap is up to
+    a cell wide.
 
     Args:
         center: Where its own axes have their origin at rest, in scene units.
@@ -79,11 +80,11 @@ class Obstacle(Boundary):
 
     @property
     def still(self) -> bool:
-        """Whether it never moves."""
+        """True if it never moves."""
         return self.path is None
 
     def fastest(self, farthest: float, start: float = -math.inf, end: float = math.inf) -> float:
-        """Bound of its speed [m/s] at places up to ``farthest`` [m] from its centre, while it acts in a time [s]."""
+        """Bound of its speed [m/s] at places up to ``farthest`` [m] from its centre, between two times [s]."""
         start, end = max(start, self.start), min(end, self.end)
         if not start < end:
             return 0.0

@@ -52,7 +52,7 @@ class StillGaussians(Obstacle):
         self.corner: Tensor
 
     def take(self, found: DistanceGrid) -> None:
-        """Take the distance from the Gaussians, in metres, z up."""
+        """Set the grid of distances from the Gaussians, in metres, z up."""
         self.values, self.corner, self.spacing = found.values, found.origin, found.spacing
 
     def in_frame(self, frame: SimFrame) -> Obstacle:
@@ -60,7 +60,7 @@ class StillGaussians(Obstacle):
         return copy.copy(self)
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
-        """Interpolated from the grid; far away if nothing was taken."""
+        """Interpolate the grid; RuntimeError if none was set."""
         if self.spacing == 0:
             raise RuntimeError(
                 "The StillGaussians have no Gaussians: give them to a Simulation, which knows the scene."

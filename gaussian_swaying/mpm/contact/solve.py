@@ -45,7 +45,7 @@ PUSH_CELLS = 0.004
 """Most of an overlap that a substep removes [cells]."""
 
 CREEP = 0.01
-"""How much friction yields where it sticks: the share of the free slip of a substep that a lone place keeps."""
+"""Creep of sticking friction: the share of the free slip of a substep that a single contact sample keeps."""
 
 SLACK = 0.02
 """Gap up to which a constraint counts as acting [cells]."""
@@ -137,7 +137,7 @@ class Constraints:
 
 
 def acting(moving: Tensor, held: Constraints, dt: float | Tensor, dx: float) -> Tensor:
-    """Which constraints the motion of this substep comes close to, bool, shape (M,).
+    """Return a mask of the constraints whose gap comes close to zero in this substep, bool, shape (M,).
 
     Args:
         moving: Velocity of the places, and of the one that stands for obstacles [m/s], shape (A + 1, 3).

@@ -1,4 +1,4 @@
-"""The contact of a body in ``total``: which places may touch, and what a substep does about it."""
+"""Contact of a body in ``total``: lists of samples that may touch, and the impulses of a substep."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ LEAST_MARGIN = 0.5
 """Least distance beyond contact within which pairs are listed [cells]."""
 
 ARM = 1.2
-"""How much farther a place may move than any material point."""
+"""Bound on the motion of a contact sample, relative to the largest motion of the material points."""
 
 TOLERANCE = 5e-5
 """Violation of a constraint within a substep at which the impulses are good enough [cells]."""
 
 AHEAD = 3.0
-"""For how many substeps ahead points are followed before the lists are made again."""
+"""Substeps by which the motion of points is extrapolated, to make the lists again before they are incomplete."""
 
 APART = 2.0
 """Places closer than this at rest [cells] are neighbours: they share nodes, and a fold cannot be sharper."""
@@ -36,7 +36,7 @@ APART = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Lists:
-    """What may touch until the nodes have moved half the margin.
+    """Candidates for contact: all pairs that may touch before the nodes have moved half the margin.
 
     Attributes:
         place: The places that occur, shape (A,).
@@ -81,7 +81,7 @@ def in_fixed_order(wanted: bool) -> Iterator[None]:
 class ContactStage:
     """Contact of a body with obstacles and with itself, bound to its grid.
 
-    The lists of what may touch are a cache: a state decides alone what happens, whatever was stepped before.
+    The lists of what may touch are only a cache: the result of a substep depends on its state, not on earlier substeps.
 
     Args:
         surface: The places that touch.
@@ -131,7 +131,7 @@ class ContactStage:
             self.apart = max(APART * self.dx, 3 * thickest)
         self.lists: Lists | None = None
         self.made = 0
-        """How often the lists were made."""
+        """Number of times that the lists were made."""
 
     # ---- lists
 
@@ -292,7 +292,7 @@ class ContactStage:
         return Constraints(*fields), owner
 
     def positions(self, displacement: Tensor) -> Tensor:
-        """Where the places are now [m], shape (C, 3), from the node displacement (..., G, 3)."""
+        """Return the positions of the contact samples [m], shape (C, 3), from the node displacement (..., G, 3)."""
         return self.surface.place + weighted(displacement.reshape(-1, 3), self.node, self.weight)
 
     def normals(self, place: Tensor, displacement: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What touches: places of the surface of a body, and how they do."""
+"""Contact samples on the surface of a body, and the settings of its contact."""
 
 from __future__ import annotations
 

@@ -84,11 +84,11 @@ class Formulation(ABC):
             self.gravity = torch.tensor(settings.gravity, dtype=torch.float64, device=device)
 
     def hold_kind(self, k: int) -> str:
-        """What the ``k``-th boundary acts on."""
+        """Return what the ``k``-th boundary acts on, see ``Boundary.hold_kind``."""
         return self.body.boundaries[k].hold_kind(self.neighbours_fixed)
 
     def acts_on_nodes(self, k: int) -> bool:
-        """Whether the ``k``-th boundary acts on nodes."""
+        """True if the ``k``-th boundary acts on nodes."""
         return self.kinds[k] == "nodes"
 
     @classmethod
@@ -126,7 +126,7 @@ class Formulation(ABC):
         )
 
     def no_impulse(self) -> Tensor:
-        """A momentum of zero for each boundary, shape (..., B, 3), float64."""
+        """A reaction impulse of zero for each boundary, shape (..., B, 3), float64."""
         position = self.body.points.position
         shape = (*position.shape[:-2], len(self.kinds), 3)
         return torch.zeros(shape, dtype=torch.float64, device=position.device)
@@ -136,7 +136,7 @@ class Formulation(ABC):
         """The state with a grid for the next ``horizon`` seconds; see ``MPMSolver.fit_grid``."""
 
     def bounding_grid(self, position: Tensor, margin: int, speed: float = 0.0) -> GridSpec:
-        """The smallest grid that holds the stencils of all particles.
+        """The smallest grid that contains the stencils of all particles.
 
         Args:
             position: Particle position [m], shape (..., P, 3).
@@ -259,13 +259,13 @@ class Formulation(ABC):
         return damped_substep(limit, self.settings.stiffness_damping)
 
     def cells_per_second(self, state: MPMState) -> Tensor:
-        """How many cells the fastest wave crosses per second, a scalar tensor."""
+        """Return the number of cells that the fastest wave crosses per second, a scalar tensor."""
         body, spatial, F = self.body, not self.neighbours_fixed, state.F_elastic.detach()
         speed = wave_speed(body.points, F, state.internal, spatial=spatial, laws=body.laws)
         return cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach()
 
     def obstacle_cells(self, state: MPMState, seconds: float) -> float:
-        """How many cells the fastest obstacle that acts on nodes crosses per second, in some seconds from a state on.
+        """Return the cells per second of the fastest obstacle that acts on nodes, in some seconds from a state on.
 
         Such an obstacle stops the nodes that it meets, and would jump over those between two substeps. The host waits
         if there is one that moves.

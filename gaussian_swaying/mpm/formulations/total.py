@@ -77,7 +77,7 @@ class Total(Formulation):
         self.contact = self._contact()
 
     def hold_kind(self, k: int) -> str:
-        """What a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
+        """Return what a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
 
         Warns if a hinge or a clamped place is to hold a part of several cells in thickness, which it cannot.
         """
@@ -118,16 +118,16 @@ class Total(Formulation):
         return max(thick for thick, _ in found), all(sheet for _, sheet in found)
 
     def acts_on_nodes(self, k: int) -> bool:
-        """Whether a boundary acts on nodes: also a clamp, on those that carry held material alone."""
+        """True if a boundary acts on nodes; so does a clamp, on nodes that carry only held material."""
         return super().acts_on_nodes(k) or self.has_face(k)
 
     def has_face(self, k: int) -> bool:
-        """Whether a boundary clamps a region whose particles are all released together."""
+        """True if a boundary clamps a region and never releases its particles one by one."""
         held = self.body.held[k]
         return self.kinds[k] == "clamp" and held is not None and held.release is None
 
     def _soften(self) -> None:
-        """Take most of the stiffness from what clamps hold all the time, see ``held_faces.SOFTENED``."""
+        """Reduce the stiffness of material that clamps hold all the time, see ``held_faces.SOFTENED``."""
         masks = [
             held.mass > 0
             for k, (held, boundary) in enumerate(zip(self.body.held, self.body.boundaries, strict=True))
@@ -180,7 +180,7 @@ class Total(Formulation):
             )
 
     def _on_nodes(self, k: int, held: Held) -> Held:
-        """What the ``k``-th boundary holds, with its constant share of each node."""
+        """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
         boundary, face = self.body.boundaries[k], self.has_face(k)
         share = scatter(self.stencil, held.mass[..., None, None])[..., 0] * self.node_inverse_mass
         threshold = HELD_ALONE if face else boundary.held_share
@@ -245,7 +245,7 @@ class Total(Formulation):
         return self.read_particles(state, displacement + dt * velocity, velocity)
 
     def touch(self, velocity: Tensor, displacement: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the impulses of contact; also the momentum that each boundary took, as :meth:`hold`."""
+        """Apply the impulses of contact; return velocity and reaction impulse on each boundary, as :meth:`hold`."""
         assert self.contact is not None
         velocity, taken = self.contact.apply(velocity, displacement, time, dt)
         return velocity, taken.reshape(*velocity.shape[:-2], -1, 3)

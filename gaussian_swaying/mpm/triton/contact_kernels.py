@@ -95,7 +95,7 @@ def _constrain_pairs(
     row, moving, candidates, near, room, data, other, slots, places, p, mask, dt, limit, slack, push, most,
     BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """The pairs of places that this substep comes close to, as ``pair_gaps`` and ``acting``.
+    """Write the constraints of pairs of samples that come close in this substep, as ``pair_gaps`` and ``acting``.
 
     Returns how many there are for each place, and how many slots it needed.
     """
@@ -156,7 +156,7 @@ def _constrain_walls(
     moving, wall_gap, wall_normal, wall_drive, wall_valid, pressed, data, other, slots, places, p, mask, many, dt,
     slack, push, most, WALLS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The obstacles that this substep brings places close to; -1 less their number is in place of the other place."""
+    """Write the constraints of samples close to an obstacle k in this substep; -1 - k stands for the other sample."""
     for wall in range(WALLS):
         at = wall * places + p
         n0 = tl.load(wall_normal + at * 3, mask, 0.0)
@@ -215,10 +215,11 @@ def _impulses(
 ):  # fmt: skip
     """One iteration of ``resolve``: the impulses of the constraints of each place, and their change summed there.
 
-    Also summed is the change that ends the iterations here: back from the momentum to what was found before.
+    It also sums the change that applies if the iterations end here: from the point extrapolated by the momentum back to
+    the last iterate.
 
-    Returns the velocity that each place lacks, and its part of the sum that says whether the momentum led the wrong
-    way.
+    Returns the largest violation of each sample's constraints as a velocity, and its part of the sum whose sign tells
+    whether to restart the momentum.
     """
     plane = slots * places
     v0 = tl.load(moving + p * 4, mask, 0.0)
@@ -310,7 +311,7 @@ def _count_nodes(
     entry_start, entry_place, entry_weight, reached, marked, total, touched, nodes, many, WALLS: tl.constexpr,
     programs, TALL: tl.constexpr,
 ):  # fmt: skip
-    """How much unit impulses at all constraints move each node, at most; zero where there are none.
+    """Sum the weights of all constraints at each node: the most that unit impulses at them move it; zero without any.
 
     Nodes far from all constraints are not summed: they are not marked, or without obstacles have no pairs around them.
     """
@@ -375,7 +376,7 @@ def contact_solve(
     """The impulses of a substep, added to the velocities of the nodes; see ``resolve``.
 
     Nothing is done if no pairs are listed and no obstacle is within reach. With obstacles, ``contact_positions`` has
-    read the velocities. What obstacles press is added to ``pressed_sum``, float64.
+    read the velocities. The reaction impulse on obstacles is added to ``pressed_sum``, float64.
     """
     pid = tl.program_id(0)
     programs = tl.num_programs(0)

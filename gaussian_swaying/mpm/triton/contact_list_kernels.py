@@ -95,7 +95,7 @@ def three(x):
 def place_now(
     fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Where places are now, and the derivatives of the displacement there, along each axis."""
+    """Return the present positions of contact samples, and the derivatives of the displacement along each axis."""
     u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, True, BLOCK)
     if ARMS:
         a = load3(arm, places, p, mask)
@@ -123,7 +123,7 @@ def contact_positions(
     fields, base, fraction, arm, rest, places, position, moving, status, sx, sy, inverse_dx, ARMS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Where all places are now, shape (C, 3), and their velocity; nothing is within reach yet."""
+    """Write positions (C, 3) and velocities of all contact samples; reset the flag that something is in reach."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < places
     u, d0, d1, d2 = interpolate(fields, base, fraction, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
@@ -147,7 +147,7 @@ def _cell(x, inverse_size):
 
 @triton.jit
 def _bucket(x, y, z, last):
-    """Where a cell of the grid is in a table of ``last + 1`` entries, a power of two."""
+    """Return the hash of a grid cell: its index in a table of ``last + 1`` entries, a power of two."""
     return ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & last
 
 

@@ -56,7 +56,7 @@ class Part:
         looks: Numbers of the substeps after which the wave speed is measured.
         loaded: Whether the work of a load is counted.
         begin: ``begin(n)`` fills what n substeps read besides the state and the schedule.
-        key: What ``begin`` depends on; None if it cannot be recorded.
+        key: Key of the data that ``begin`` reads; None if it cannot be recorded.
     """
 
     steps: int
@@ -115,10 +115,10 @@ class Fused(ABC):
         self.force_in = torch.zeros(0, 4, device=self.device)
         self.wave = shared(points.laws, "wave")
         self.watches = self.wave is not None
-        """Whether rollouts can measure the wave speed."""
+        """True if rollouts can measure the wave speed."""
         self.speed = torch.zeros(1, device=self.device)
         self.impulse = bound.no_impulse()
-        """Momentum that each boundary took in the current part of the rollout, shape (..., B, 3)."""
+        """Reaction impulse: momentum that each boundary took in the current part of the rollout, shape (..., B, 3)."""
         self.time = torch.zeros((), dtype=torch.float64, device=self.device)
         self.dt = torch.zeros((), dtype=torch.float64, device=self.device)
         self.gravity = [float(g) for g in bound.settings.gravity]
@@ -131,7 +131,7 @@ class Fused(ABC):
 
     @classmethod
     def unsupported(cls, bound: Formulation, interpret: bool) -> str | None:
-        """Why these kernels cannot run a body, or None if they can.
+        """Return the reason why these kernels cannot run a body, or None if they can.
 
         Args:
             bound: The formulation, bound to the body.
@@ -150,16 +150,16 @@ class Fused(ABC):
         return None
 
     def adjoint(self, state: MPMState, forces: Sequence[Force]) -> tuple[Adjoint | None, str]:
-        """The rollouts with gradients in kernels; or None, and why they need torch."""
+        """Return the rollouts with gradients in kernels; or None, and the reason why they need torch."""
         return None, "only the total formulation has backward kernels"
 
     @property
     def recordable(self) -> bool:
-        """Whether substeps can be recorded in a CUDA graph."""
+        """True if substeps can be recorded in a CUDA graph."""
         return all(boundary.recordable for boundary in self.body.boundaries)
 
     def holds(self) -> bool:
-        """Whether buffers and graphs are still valid: nothing that they were made from was replaced."""
+        """True if buffers and graphs are still valid: nothing that they were made from was replaced."""
         return self._made_from == _made_from(self.body)
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
@@ -249,7 +249,7 @@ class Fused(ABC):
         loaded = twin is not None or options["FORCE"]
 
         def begin(count: int) -> None:
-            """What the substeps read besides the state and the schedule."""
+            """Write the buffers that the substeps read besides the state and the schedule."""
             self.first_step.zero_()
             if twin is not None:
                 numbers = twin.numbers()
@@ -276,7 +276,7 @@ class Fused(ABC):
         return table
 
     def _key_of(self, force: Force | None) -> tuple[object, ...] | None:
-        """What the recorded vectors and numbers of a force depend on; None if they cannot be recorded."""
+        """Return the key of the recorded vectors and numbers of a force; None if they cannot be recorded."""
         if force is None:
             return ()
         here = all(tensor.device == self.device for tensor in tensors_of([force]))
@@ -312,11 +312,11 @@ class Fused(ABC):
         return added([split(force(state), force, state) for force in self.asked])
 
     def _asked_key(self) -> tuple[object, ...]:
-        """What recorded forces depend on; it holds the forces themselves, so that no other object takes their place."""
+        """Return the key of the recorded forces; it refers to them, so that no new object gets the id of an old one."""
         return (self.asked, fingerprint(self.asked)) if self.asked else ()
 
     def _resists(self, state: MPMState) -> bool:
-        """Whether a force in torch returns a resistance; calls each force once."""
+        """True if a force in torch returns a resistance; calls each force once."""
         key = self._asked_key()
         if key != self._resist[0]:
             self._resist = key, self._ask(state)[1] is not None
@@ -344,7 +344,8 @@ class Fused(ABC):
     def _run(self, state: MPMState, part: Part) -> dict[str, Any]:
         """Copy the state to the buffers, run the substeps, and return the fields of the new state.
 
-        ``impulse`` is what the boundaries took in this part, and ``work``, if it is loaded, the work of the load in it.
+        ``impulse`` is the reaction impulse on the boundaries in this part, and ``work``, if it is loaded, the work of
+        the load in it.
         """
 
     def _work(self) -> Tensor:
@@ -389,5 +390,5 @@ def _nothing() -> None:
 
 
 def _made_from(body: Body) -> tuple[object, ...]:
-    """What the buffers and graphs of a body depend on besides its points; if it changes, they are invalid."""
+    """Return the key of the buffers and graphs of a body, without its points; they are invalid once it changes."""
     return fingerprint([*body.boundaries, *body.points.laws])

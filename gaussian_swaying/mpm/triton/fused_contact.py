@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gaussian_swaying.mpm.formulations.total import Total
 
 ROOM, SLOTS = 64, 16
-"""First room for the candidates of a place, and for its constraints."""
+"""Initial number of entries for the candidates of a contact sample, and for its constraints."""
 
 MOST_ENTRIES = MAX_INDEX // 2
 """Most entries of a buffer of candidates or constraints."""
@@ -29,13 +29,14 @@ LEAST_MARGIN = 0.1
 """Least distance beyond contact within which pairs are listed [cells]."""
 
 AHEAD = 8.0
-"""For how many substeps of the fastest node lists are made, unless that is more than the reach of contact."""
+"""Substeps of the fastest node for which lists stay complete, unless that is more than the reach of contact."""
 
 BLOCK, TALL = 128, 32
 """Places, and nodes, of a program at a time."""
 
 WIDE, WIDE_SEARCH = 8, 4
-"""How many candidates of each place are looked at together, in a substep and when lists are made; 8 would spill."""
+"""Candidates of a contact sample that are tested together, in a substep and when lists are made (8 there would spill).
+"""
 
 PER_PROCESSOR = 4
 """Programs on each multiprocessor; all of them must run at once."""
@@ -111,7 +112,7 @@ class FusedContact:
         touched = [obstacle for _, obstacle in stage.obstacles if is_known(obstacle)]
         self.solids = Solids([(obstacle, 0) for obstacle in touched], self.device, steps=1)
         self.numbers = [touched.index(o) if is_known(o) else None for _, o in stage.obstacles]
-        """Which of the solids each obstacle is; None for one that runs in torch."""
+        """For each obstacle, its index among the solids; None for one that runs in torch."""
         self.programs = self._programs()
         self._take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
 
@@ -144,7 +145,7 @@ class FusedContact:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What recorded substeps depend on."""
+        """Return the key that recorded substeps depend on."""
         return (self.room, self.slots, self.data.data_ptr(), self.candidates.data_ptr())
 
     @property
@@ -154,7 +155,7 @@ class FusedContact:
 
     @property
     def made(self) -> int:
-        """How often the lists were made; the host waits."""
+        """Number of times that the lists were made; the host waits."""
         return int(self.status[int(list_kernels.MADE.value)])
 
     @property
@@ -163,7 +164,7 @@ class FusedContact:
         return int(self.status[int(list_kernels.ROUNDS.value)])
 
     def fits(self) -> bool:
-        """Whether the room was large enough for all lists so far; the host waits. If it was not, there is more now.
+        """True if the buffers were large enough for all lists so far; if not, enlarge them. The host waits.
 
         Raises:
             ValueError: If the lists are too long for any buffer.
@@ -250,10 +251,10 @@ class FusedContact:
 
 
 def _carries(node: Tensor, weight: Tensor, nodes: int) -> Tensor:
-    r"""How far places move with a node: no place moves farther than the largest of these numbers times the motion.
+    r"""Return a factor for each node; no contact sample moves farther than the largest factor times the node's motion.
 
-    A node that reaches the material by a hair's breadth has next to no mass, and stress moves it by metres, which
-    moves no place. With :math:`s_i` the largest weight of a node at any place, and :math:`r_i = \min(1, s_i /` LIGHT
+    A node whose support barely reaches the material has almost no mass, and stress may move it by metres, which moves
+    no sample. With :math:`s_i` the largest weight of a node at any place, and :math:`r_i = \min(1, s_i /` LIGHT
     :math:`)`, a place moves by at most :math:`\sum_i |w_i| |u_i| \le \max_i (C r_i |u_i|)`, where C is the largest sum
     of :math:`|w_i| / r_i` of a place: at most 1.27 if no weight is negative.
 

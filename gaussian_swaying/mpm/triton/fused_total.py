@@ -89,7 +89,7 @@ class FusedTotal(Fused):
             kind == "surface" or (type(b) in pins and b.start <= 0 and b.end == math.inf)
             for b, kind in zip(body.boundaries, bound.kinds, strict=True)
         )
-        """Whether the kernels apply all boundaries but obstacles, which are contact."""
+        """True if the kernels apply all boundaries but obstacles, which are contact."""
         self.position = bound.needs_position
         self.lattice = grid.node_positions(self.rest) if bound.needs_lattice else None
         self._take_pins()
@@ -100,7 +100,7 @@ class FusedTotal(Fused):
         check_indices(max(8 * len(inverse), 27 * (self.pieces + 1) * width, 27 * len(active)))
 
     def _take_pins(self) -> None:
-        """What pins without a window hold: nodes, and points."""
+        """Collect the nodes and points that pins without a time window hold."""
         bound, active = self.bound, self.active.long()
         owner = torch.full((self.bound.node_mass.numel(),), -1, device=self.device)
         for k in reversed(range(len(bound.held)) if self.plain else ()):  # the first pin takes the momentum
@@ -256,7 +256,7 @@ class FusedTotal(Fused):
         )  # fmt: skip
 
     def _impulse(self) -> Tensor:
-        """Momentum that each boundary took in this part of the rollout, shape of ``impulse``; in a fixed order."""
+        """Reaction impulse on each boundary in this part of the rollout, shape of ``impulse``; summed in a fixed order."""
         total = self.impulse.reshape(self.scenes, -1, 3).clone()
         if any(self.bound.on_nodes) and self.plain:
             for k, nodes in enumerate(self.own_nodes):
@@ -285,7 +285,7 @@ class FusedTotal(Fused):
         self.displacement.addcmul_(self.velocity, self.dt.float())
 
     def _read(self, found: Tensor, part: Part) -> None:
-        """Write all fields of the state into ``found``, and what boundaries took and the load did beside it."""
+        """Write all fields of the state into ``found``, and beside it the reaction impulses and the work of the load."""
         to = self._views(found)
         kick, implicit = self.schedule[0, 3:], part.options["IMPLICIT"]
         self._read_into(to["position"], to["velocity"], to["affine"], to["F"], kick, part.loaded, implicit)
@@ -305,7 +305,7 @@ class FusedTotal(Fused):
         return views
 
     def _fields(self, found: Tensor, taken_and_done: Tensor, part: Part) -> dict[str, Any]:
-        """What :meth:`_read` wrote, by the names of the state."""
+        """Return the fields that :meth:`_read` wrote, by the names of the state."""
         views, taken = self._views(found), self.impulse.numel()
         F, work = views["F"], {"work": taken_and_done[taken:].view(self.body.points.mass.shape[:-1])}
         return {
@@ -361,10 +361,10 @@ def _sources(cell: Tensor, cells: int) -> Tensor:
 
 
 def _lanes(sizes: Tensor) -> int:
-    """Lanes per cell (one synchronisation).
+    """Return the number of lanes per cell (one synchronisation).
 
-    Those that give the least total work, with empty lanes included. A small body takes as long as its slowest program:
-    there, so many that no program has to go through its cells twice.
+    It gives the least total work, empty lanes included. A small body takes as long as its slowest program, so there it
+    is large enough that no program has to go through its cells twice.
     """
     lanes, most = list(_LANE_COST), sizes.amax()[None]
     costs = torch.stack([(-(-sizes // n)).sum() * n for n in lanes])

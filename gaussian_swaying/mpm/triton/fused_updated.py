@@ -106,7 +106,7 @@ class FusedUpdated(Fused):
         return {**self._read(state), "impulse": self.impulse, **({"work": self._work()} if part.loaded else {})}
 
     def _sorted_for(self) -> int:
-        """How many substeps to go without a sort, from the speed at the end of the last rollout that is done."""
+        """Return the number of substeps between sorts, from the speed at the end of the last finished rollout."""
         if self._copied is None or self._copied.query():
             self.crossing = float(self._measured) or self.crossing
         return sorted_for(self.crowd, self.crossing, self.count)
@@ -121,7 +121,7 @@ class FusedUpdated(Fused):
 
     @property
     def _acting(self) -> bool:
-        """Whether boundary conditions act in torch."""
+        """True if boundary conditions act in torch."""
         return len(self.body.boundaries) > 0 and not self.solids.parts
 
     def _start(self, options: dict[str, Any]) -> None:
@@ -309,7 +309,7 @@ def crowd_of(position: Tensor, dx: float) -> float:
 
 
 def sorted_for(crowd: float, crossing: float, count: int) -> int:
-    r"""After how many substeps to sort again.
+    r"""Return the number of substeps after which to sort again.
 
     As the order gets stale, particles in a row no longer share their cell, and more atomic sums meet: the time of a
     substep grows with their share. Together with the time of the sorts it is least after :math:`\sqrt{S / r}` substeps,

@@ -261,7 +261,7 @@ def obstacle_poses(keys, whole, time, dt, poses, solids):
 
 @triton.jit
 def acts(window, now):
-    """Whether a solid acts at a time, from its first and last time."""
+    """True if a solid acts at a time, from its first and last time."""
     now = now + 1e-9  # boundary.CLOCK
     return (now >= tl.load(window)) & (now < tl.load(window + 1))
 

@@ -1,4 +1,4 @@
-"""What the kernels read of planes and obstacles: :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`."""
+"""Data of planes and obstacles for the kernels: :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TYPES: dict[type[nn.Module], int] = {
 
 
 def known(boundary: nn.Module) -> bool:
-    """Whether the kernels know a boundary."""
+    """True if the kernels can apply a boundary."""
     return type(boundary) is EnclosingBox or (
         type(boundary) in TYPES and not (isinstance(boundary, StillGaussians) and boundary.spacing == 0)
     )
@@ -84,12 +84,12 @@ class Solids:
 
     @property
     def moving(self) -> bool:
-        """Whether any of them moves."""
+        """True if any of them moves."""
         return any(self.moves)
 
     @property
     def options(self) -> tuple[int, ...]:
-        """What the kernels of the nodes are compiled for: twice the kind of each, and one if it moves."""
+        """Return constants for compiling the nodes' kernels: for each solid, twice its kind, plus 1 if it moves."""
         return tuple(2 * kind + int(moves) for kind, moves in zip(self.kinds, self.moves, strict=True))
 
     def take(self) -> None:
@@ -132,7 +132,7 @@ class Solids:
             kernels.obstacle_poses[(steps, count)](self.keys, self.whole, time, dt, self.poses, count, num_warps=1)
 
     def of(self, part: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What the kernels read of one solid in the first substep: numbers, whole numbers, times, pose; and grids."""
+        """Return the data of a solid in the first substep: real and whole numbers, time window, pose; and grids."""
         return self.rows[part], self.whole[part], self.windows[part], self.poses[0, part], self.grids
 
 

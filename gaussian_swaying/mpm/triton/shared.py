@@ -46,7 +46,7 @@ def axis_weights(f, inverse_dx):
 
 @triton.jit
 def vector_of(vectors, scenes, step, scene):
-    """Where the vector of a ``forces.ForceTwin`` is for a substep and a scene."""
+    """Return the pointer to the vector of a ``forces.ForceTwin`` for a substep and a scene."""
     return vectors + (step * scenes + scene) * VECTOR
 
 

@@ -29,7 +29,7 @@ Watch = Callable[[int], None] | None
 
 @dataclass
 class _Run:
-    """What a backward pass needs of one rollout.
+    """Data of one rollout that its backward pass needs.
 
     Attributes:
         state: Where it starts.
@@ -56,7 +56,7 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Pass:
-    """What the kernels of one backward pass compute, and where they sum.
+    """The gradients that the kernels of one backward pass compute, and the buffers in which they sum.
 
     Attributes:
         twin: The force, if any.
@@ -74,7 +74,7 @@ class _Pass:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What a recorded graph of it depends on."""
+        """Return the key that its recorded graph depends on."""
         return (*self.options.values(), *self.flags.values())
 
 
@@ -436,7 +436,7 @@ def segment(steps: int, checkpoint: int, nodes: int) -> int:
 
 
 def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str | None:
-    """Why gradients through a rollout need torch's autograd; None if the kernels have them."""
+    """Return the reason why gradients of a rollout need torch's autograd; None if the kernels compute them."""
     bound = fused.bound
     points = bound.body.points
     if not fused.plain or fused.touching is not None:
@@ -463,7 +463,7 @@ def why_not(fused: FusedTotal, state: MPMState, forces: Sequence[Force]) -> str 
 
 
 def _own(tensor: Tensor, nodal: tuple[Tensor | None, ...]) -> bool:
-    """Whether a field of particles is a leaf that requires a gradient."""
+    """True if a field of particles is a leaf that requires a gradient, and not a nodal field."""
     return tensor.requires_grad and tensor.is_leaf and not any(tensor is t for t in nodal)
 
 

@@ -119,7 +119,7 @@ def motion(fields, node, sx, sy, f, wz, gz, inverse_dx, known, VISCOUS: tl.const
 
 @triton.jit
 def law_row(law, law_table, index, mask, MULTI: tl.constexpr):
-    """Where the numbers of the law of some particles are."""
+    """Return pointers to the constants of the law of some particles."""
     if MULTI:
         row = law_table + ROW * tl.load(law + index, mask, 0)
     else:

@@ -1,4 +1,4 @@
-"""Which class runs the substep of a formulation in Triton kernels."""
+"""The classes that run the substeps of the formulations in Triton kernels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TWINS: dict[str, type[Fused]] = {"total": DifferentiableTotal, "updated": FusedU
 
 
 def why_not_kernels(bound: Formulation, interpret: bool) -> str | None:
-    """Why the kernels cannot be used with a formulation and its material; None if they can.
+    """Return the reason why the kernels cannot be used with a formulation and its material; None if they can.
 
     Args:
         bound: The formulation.

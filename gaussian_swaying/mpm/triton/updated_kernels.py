@@ -299,7 +299,7 @@ def updated_nodes(
 
     SOLIDS has twice the kind of each solid, plus one if it moves. All COUNT of them are applied here, in order; see
     :mod:`~gaussian_swaying.mpm.triton.obstacle_kernels`. With MOVING there are poses for every substep. ``clock`` has
-    the time at step 0 and the substep [s], float64; ``impulse`` (B, 3) collects the momentum that each boundary takes.
+    the time at step 0 and the substep [s], float64; ``impulse`` (B, 3) collects the reaction impulses.
     """
     step = tl.load(first_step) + step_offset
     kick = tl.load(schedule + (step + 1) * 4)

@@ -93,7 +93,7 @@ class OrbitCamera(CameraPath):
 
     @property
     def still(self) -> bool:  # type: ignore[override]
-        """Whether it does not move."""
+        """True if it does not move."""
         return self.degrees_per_second == 0
 
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:

@@ -1,4 +1,4 @@
-"""What a film shows, read from the folder of a run: Gaussians at rest, nodes that move, a camera."""
+"""The contents of a film, read from the folder of a run: Gaussians at rest, nodes that move, a camera."""
 
 from __future__ import annotations
 
