@@ -1,6 +1,7 @@
 """Gradients from the kernels of the backward pass against torch's autograd in float64.
 
-Covers: aero.force_adjoint_triton, mpm.triton.adjoint_kernels, mpm.triton.total_adjoint.
+Covers: aero.force_adjoint_triton, mpm.triton.adjoint_kernels, mpm.triton.total_adjoint,
+mpm.triton.twins.
 """
 
 import dataclasses

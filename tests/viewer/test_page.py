@@ -1,6 +1,6 @@
 """The live page, in a real browser where there is one.
 
-Covers: viewer.holding.
+Covers: viewer.holding, viewer.screen.
 """
 
 import threading
