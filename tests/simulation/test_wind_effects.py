@@ -1,6 +1,6 @@
 """Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML.
 
-Covers: simulation.launch.
+Covers: simulation.stepping.
 """
 
 import warnings
