@@ -23,7 +23,7 @@ from gaussian_swaying.mpm.state import MaterialPoints
 
 DX, DT = 0.1, 1e-3
 TOLERANCE = 2e-5
-"""Relative to the largest value of a field, as in tests/mpm/test_fused.py."""
+"""Relative to the largest value of a field, as in tests/mpm/triton/bodies.py."""
 
 
 def _field(wraps):

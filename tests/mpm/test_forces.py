@@ -1,6 +1,6 @@
 """Lists of forces: valid types, sums, work and gradients; the examples of docs/forces.md.
 
-``test_fused`` tests the same for the fused substep.
+``triton/test_forces.py`` tests the same for the fused substep.
 """
 
 import ast

@@ -1,0 +1,161 @@
+"""Small bodies for the fused substep against the torch substep, which is the reference.
+
+Without a GPU the kernels run in Triton's interpreter, one operation after the other in numpy: slow, so the bodies are
+small there. On a GPU, compiling takes most of the time, so bodies share their options, and some cases run only in the
+interpreter.
+"""
+
+import math
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.wind import WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.fluid import Fluid
+from gaussian_swaying.mpm.laws.foam import Foam
+from gaussian_swaying.mpm.laws.hencky import StVKHencky
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.laws.neo_hookean import NeoHookean
+from gaussian_swaying.mpm.laws.plasticine import Plasticine
+from gaussian_swaying.mpm.laws.sand import Sand
+from gaussian_swaying.mpm.laws.snow import Snow
+from gaussian_swaying.mpm.laws.spring_network import SpringNetwork
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+
+TOLERANCE = 2e-5
+"""Relative to the largest value of a field. A substep rounds some hundred times (half of 1.2e-7 each): in the
+decomposition, and in stresses that are differences of stretches near one; sums also have another order."""
+
+DX, DT = 0.1, 1e-3
+FORMULATIONS = ["total", "updated"]
+FIELDS = ["position", "velocity", "affine", "F_elastic", "F_total", "internal", "node_displacement", "node_velocity"]
+WIND = WindField([5.0, 2.0, -1.0])
+LEFT, TOP = Box([None] * 3, [0.12, None, None]), Box([None, None, 0.17], [None] * 3)
+ELASTIC = {
+    "corotated": FixedCorotated(),
+    "neo-hookean": NeoHookean(),
+    "springs": SpringNetwork(),
+    "hencky": StVKHencky(),
+}
+PLASTIC = {
+    "sand": Sand(),
+    "sand that swells": Sand(volume_correction=True),
+    "metal": Metal(5e2, 1e3),
+    "foam": Foam(2e2, 5.0),
+    "foam without viscosity": Foam(2e2, 0.0),
+    "plasticine": Plasticine(1e3, 2e4, 1e2),
+    "snow": Snow(),
+    "fluid": Fluid(),
+}
+
+
+def on_each(*everywhere, interpreted=()):
+    """Cases for ``kernel_device``; some of them run only if nothing is compiled."""
+    gpu = [pytest.param("cuda", case, marks=pytest.mark.gpu) for case in everywhere]
+    return [pytest.param("interpreted", case) for case in (*everywhere, *interpreted)] + gpu
+
+
+def noise(seed, *shape):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def make_points(device, law=None, count=24, batch=(), **more):
+    """A body of two cells per side."""
+    place = torch.rand(*batch, count, 3, generator=torch.Generator().manual_seed(0))
+    return make_body((0.06 + 0.18 * place).to(device), law, **more)
+
+
+def make_body(position, law=None, youngs_modulus=1e4, **more):
+    mass = 0.5 + torch.rand(position.shape[:-1], generator=torch.Generator().manual_seed(5))
+    return MaterialPoints.create(
+        position,
+        volume=1e-4,
+        density=(100.0 * mass).to(position.device),
+        youngs_modulus=youngs_modulus,
+        poisson_ratio=0.3,
+        law=law,
+        **more,
+    )
+
+
+def set_going(solver, points, strain=0.2):
+    """Deformed and in motion."""
+    device, shape = points.position.device, points.position.shape
+    state = solver.init_state(points, noise(1, *shape).to(points.position))
+    if solver.neighbours_fixed:
+        nodes = [
+            (size * noise(seed, *state.node_velocity.shape)).to(device) for seed, size in ((2, strain * DX), (3, 1.0))
+        ]
+        massive = (solver.bound.node_mass > 0)[..., None]  # others never move
+        return solver.bound.read_particles(state, *(torch.where(massive, value, 0.0) for value in nodes))
+    F = (torch.eye(3) + strain * noise(2, *shape, 3)).to(device)
+    total = F.mT.contiguous() if solver.laws.plastic else F
+    state = state.replace(F_elastic=F, F_total=total, affine=noise(3, *shape, 3).to(device))
+    if state.internal is not None:
+        state = state.replace(internal=state.internal + (0.01 * noise(10, *shape[:-1]).abs()).to(device))
+    return state
+
+
+def make_load(points, wind=WIND, seed=4, **settings):
+    shape, device = points.position.shape, points.position.device
+    normal = torch.nn.functional.normalize(noise(seed, *shape), dim=-1)
+    area = 0.02 * torch.rand(shape[:-1], generator=torch.Generator().manual_seed(seed))
+    area[..., ::5] = 0.0  # within the body
+    aero = AeroForce(**{"C_L": 0.3, **settings}).to(device)
+    wind = wind.to(device) if isinstance(wind, WindField) else [w.to(device) for w in wind]
+    return WindForce(aero, wind, normal.to(device), area.to(device))
+
+
+def make_solver(transfer, formulation="updated", **options):
+    return MPMSolver(**{"dx": DX, "formulation": formulation, "damping": 0.3, "transfer": transfer, **options})
+
+
+def run_both(points, run, formulation="updated", start=set_going, **options):
+    """The results of a function of solver and state with the torch substep and with the fused one."""
+    found = []
+    for transfer in ("torch", "triton"):
+        solver = make_solver(transfer, formulation, **options)
+        with torch.no_grad():
+            found.append(run(solver, start(solver, points)))
+    return found
+
+
+def check_agreement(ends, tolerance=TOLERANCE, names=FIELDS):
+    """Both states are equal, and not the initial one."""
+    pairs = list(zip(*(end if isinstance(end, list) else [end] for end in ends), strict=True))
+    # a running total is as exact as its largest value so far, also where it comes back to nearly zero
+    most = max(1e-9, *(float(expected.work.abs().max()) for expected, _ in pairs))
+    for expected, found in pairs:
+        assert torch.equal(found.lost, expected.lost)
+        assert found.grid == expected.grid
+        assert found.substep == expected.substep
+        torch.testing.assert_close(found.time, expected.time)
+        assert found.work.dtype == torch.float64
+        # a sum over particles with both signs: the sum of its absolute terms is some sqrt(P) larger
+        scale = most * math.sqrt(expected.position.shape[-2])
+        torch.testing.assert_close(found.work, expected.work, rtol=0, atol=tolerance * scale, msg=lambda m: "work " + m)
+        # what is taken is a part of the momentum of the body
+        assert found.impulse.dtype == torch.float64
+        scale = float(expected.velocity.abs().max()) * 0.01 * expected.position.shape[-2]
+        scale = max([scale, *expected.impulse.abs().reshape(-1).tolist()])
+        torch.testing.assert_close(
+            found.impulse, expected.impulse, rtol=0, atol=tolerance * scale, msg=lambda m: "impulse " + m
+        )
+        for name in names:
+            a, b = getattr(expected, name), getattr(found, name)
+            assert (a is None) == (b is None), name
+            if a is None:
+                continue
+            assert bool(torch.isfinite(a).all()), name
+            error = float((b - a).abs().max()) / max(float(a.abs().max()), 1e-30)
+            assert error <= tolerance, f"{name}: {error:.1e} of its largest value"
+
+
+def run_in_wind(points, formulation, steps=1, aero=None, **options):
+    load = make_load(points, **(aero or {}))
+    return run_both(points, lambda solver, state: solver.rollout(state, DT, steps, load), formulation, **options)

@@ -1,0 +1,404 @@
+"""Wind, custom forces and their twins in the fused substep.
+
+Covers: aero.force_triton.
+"""
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.force import AeroForce
+from gaussian_swaying.aero.patches import Patches
+from gaussian_swaying.aero.wind import SpatialWind, WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.forces import Force, ForceTwin
+from gaussian_swaying.mpm.laws.sand import Sand
+
+from .bodies import (
+    DT,
+    ELASTIC,
+    FORMULATIONS,
+    LEFT,
+    PLASTIC,
+    TOLERANCE,
+    WIND,
+    check_agreement,
+    make_load,
+    make_points,
+    make_solver,
+    noise,
+    on_each,
+    run_both,
+    run_in_wind,
+    set_going,
+)
+
+try:
+    import triton
+    import triton.language as tl
+
+    from gaussian_swaying.mpm.triton import fused, fused_updated
+except ImportError:
+    fused = None
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "settings"),
+    on_each(
+        {"drag_step": "semi_implicit"},
+        {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        {"max_area_ratio": 0.9},
+        {"law": "linear", "drag_step": "semi_implicit"},
+        interpreted=[{"law": "projected"}, {"law": "linear"}, {"lift_direction": "lift"}, {"unit_tangent": True}],
+    ),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_every_kind_of_wind(kernel_device, formulation, settings):
+    check_agreement(run_in_wind(make_points(kernel_device), formulation, aero=settings))
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "settings"),
+    on_each(
+        {"drag_step": "semi_implicit", "max_area_ratio": 0.9},
+        {"law": "projected", "lift_direction": "lift", "unit_tangent": True},
+        {"law": "linear", "drag_step": "semi_implicit"},
+        interpreted=[{"law": "projected"}],
+    ),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else ", ".join(map(str, value.values())),
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_wind_on_groups_of_patches(kernel_device, formulation, settings):
+    """Up to a dozen patches for each point, none for some, and a longer list the second time."""
+    points = make_points(kernel_device)
+
+    def load(count):
+        normal = torch.nn.functional.normalize(noise(6, count, 3), dim=-1)
+        area = 0.01 * torch.rand(count, generator=torch.Generator().manual_seed(6))
+        which = torch.randint(0, points.count - 3, (count,), generator=torch.Generator().manual_seed(7))
+        aero = AeroForce(**{"C_L": 0.3, **settings})
+        return WindForce(aero, WIND, Patches(normal, area, which, points.count)).to(kernel_device)
+
+    def run(solver, state):
+        return [solver.rollout(state, DT, 1, load(count)) for count in (90, 130, 90)]
+
+    assert load(90).sums is not None
+    check_agreement(run_both(points, run, formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_the_cap_on_the_area_acts(kernel_device, formulation):
+    """It is also read again in each rollout: a recorded graph stores the address that it reads, not the value."""
+    points = make_points(kernel_device)
+    free, capped = make_load(points), make_load(points, max_area_ratio=0.5)
+    solver = make_solver("triton", formulation)
+    start = set_going(solver, points)
+    ends = [solver.rollout(start, DT, 1, load) for load in (free, capped, free, capped, free)]
+    for k in (2, 3, 4):
+        if formulation == "total":
+            assert torch.equal(ends[k].velocity, ends[k - 2].velocity)
+    gained = [float((end.work - start.work).abs()) for end in ends]
+    assert gained[1] < 0.9 * gained[0]
+    assert gained[2:] == pytest.approx(gained[:3], rel=1e-5)
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+def test_patches_without_flow_and_flat_ones(kernel_device):
+    """Air that moves with the patch, and a patch that is pressed to nothing."""
+
+    def start(solver, points):
+        state = set_going(solver, points)
+        state.velocity[:4] = torch.tensor(WIND.flows[0].tolist(), device=kernel_device)
+        F = state.F_total.clone()
+        F[2] = 0.0
+        F[5] = 0.0
+        return state.replace(F_total=F)
+
+    points = make_points(kernel_device, Sand())
+    check_agreement(run_in_wind(points, "updated", start=start))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_wind_along_the_normal(kernel_device, formulation):
+    """Nothing of it is tangential, and the direction of a zero vector is zero."""
+    points = make_points(kernel_device)
+    up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
+    wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
+    load = WindForce(AeroForce(unit_tangent=True).to(kernel_device), wind, up, 0.01 * torch.ones_like(points.mass))
+
+    def start(solver, points):
+        return solver.init_state(points)
+
+    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 1, load), formulation, start=start)
+    check_agreement(ends, names=["position", "velocity", "affine", "F_elastic"])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("implicit", [False, True])
+def test_forces_and_drag_of_step(kernel_device, formulation, implicit):
+    points = make_points(kernel_device)
+    force = (0.3 * noise(8, *points.position.shape)).to(kernel_device)
+    drag = (0.5 * noise(9, *points.mass.shape).abs()).to(kernel_device) if implicit else None
+
+    def run(solver, state):
+        states = [solver.step(state, DT, force=force, drag=drag)]
+        states.append(solver.step(states[0], DT, force=2 * force, drag=drag))
+        return states
+
+    ends = run_both(points, run, formulation)
+    check_agreement(ends)
+    assert float(ends[1][1].work.abs()) > 0
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_drag_without_a_force(kernel_device, formulation):
+    """Nothing is added to the work."""
+    points = make_points(kernel_device)
+    drag = torch.full_like(points.mass, 0.7)
+    check_agreement(run_both(points, lambda solver, state: solver.step(state, DT, drag=drag), formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_force_function_is_called_each_substep(kernel_device, formulation):
+    points = make_points(kernel_device)
+    times = []
+
+    def force(state):
+        times.append(round(float(state.time), 9))
+        return -20.0 * points.mass[:, None] * state.velocity
+
+    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2, force), formulation)
+    check_agreement(ends)
+    assert times == [0.0, DT] * 2
+
+
+class _Pull(Force):
+    """Pulls particles to a moving place, more strongly if they are sheared; with a resistance if requested."""
+
+    recordable = True
+
+    def __init__(self, device, resistance=None):
+        super().__init__()
+        self.register_buffer("place", torch.tensor([0.3, 0.1, -0.2], device=device))
+        self.register_buffer("way", torch.tensor([80.0, 0.0, 0.0], device=device))
+        self.resistance, self._called = resistance, 0
+
+    def forward(self, state):
+        self._called += 1
+        shear = 1 + state.F_total[..., 0, 1:2].abs() + 1e-3 * state.affine[..., 1, 2:3].abs()
+        pull = 5.0 * shear * (self.place + self.way * state.time - state.position) - 0.1 * state.velocity
+        if state.internal is not None:
+            pull = pull + state.internal[..., None]
+        if self.resistance is None:
+            return pull
+        return pull, self.resistance * (1 + state.velocity.square().sum(-1))
+
+
+FORCES = {
+    "custom": lambda points, pull: [pull],
+    "wind and custom": lambda points, pull: [make_load(points), pull],
+    "custom, wind, wind": lambda points, pull: [
+        pull,
+        make_load(points),
+        make_load(points, WindField([0.0, 9.0, 0.0]), seed=14),
+    ],
+    "semi-implicit wind and custom": lambda points, pull: [make_load(points, drag_step="semi_implicit"), pull],
+}
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    on_each(
+        ("wind and custom", 2.0),
+        ("custom, wind, wind", None),
+        interpreted=[("custom", 2.0), ("semi-implicit wind and custom", None)],
+    ),
+    indirect=["kernel_device"],
+    ids=str,
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, monkeypatch):
+    """Across the end of a part, with particles sorted again, and with a batch; all forces and their work."""
+    name, resistance = case
+    monkeypatch.setattr(fused, "MAX_STEPS", 3)
+    monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
+    points = make_points(kernel_device, count=6, batch=(2,))
+    pull = _Pull(kernel_device, resistance)
+
+    def run(solver, state):
+        monkeypatch.setattr(solver, "_step", None if solver.transfer == "triton" else solver._step)
+        forces = FORCES[name](points, pull)
+        states = [solver.rollout(state, DT, 1, forces)]
+        states.append(solver.rollout(states[-1], 0.7 * DT, 4, forces))
+        return states
+
+    ends = run_both(points, run, formulation)
+    check_agreement(ends)
+    free = make_solver("torch", formulation)
+    with torch.no_grad():
+        calm = free.rollout(set_going(free, points), DT, 1, FORCES[name](points, pull)[:-1])
+    assert not torch.allclose(calm.velocity, ends[0][0].velocity, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    on_each(("total", "corotated"), ("updated", "sand that swells")),
+    indirect=["kernel_device"],
+    ids=str,
+)
+def test_forces_in_torch_with_boundaries_looks_and_flow(kernel_device, case):
+    """The time passed to forces and boundaries advances once per substep; the internal variable is passed too."""
+    formulation, law = case
+    points = make_points(kernel_device, (ELASTIC | PLASTIC)[law], count=12)
+    forces = [_Pull(kernel_device, 1.0), make_load(points)]
+    found = run_both(
+        points,
+        lambda solver, state: solver.watched_rollout(state, DT, 3, forces, 2),
+        formulation,
+        boundaries=[PinnedRegion(LEFT, start=1.5 * DT), Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")],
+    )
+    check_agreement([state for state, _ in found])
+    assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=2 * TOLERANCE)
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, formulation):
+    """The other forces then run in torch as well."""
+    points = make_points(kernel_device, count=12)
+
+    class Waiting(_Pull):
+        def forward(self, state):
+            return super().forward(state) if float(state.time) > 0.5 * DT else 0 * state.position
+
+    def run(solver, state):
+        waiting = Waiting(kernel_device)
+        end = solver.rollout(state, DT, 3, [make_load(points), waiting])
+        assert waiting._called == 2
+        return end
+
+    check_agreement(run_both(points, run, formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_wind_that_depends_on_the_place(kernel_device, formulation):
+    class Shear(SpatialWind):
+        recordable = True
+
+        def forward(self, time, position):
+            speed = (8.0 + 1e3 * time) * (1 + 3 * position[..., 2])
+            return torch.stack([speed, torch.zeros_like(speed), torch.ones_like(speed)], dim=-1)
+
+    points = make_points(kernel_device, count=12)
+    load = make_load(points)
+    shear = WindForce(load.aero, Shear(), load.normal, load.area)
+    check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 2, shear), formulation))
+
+
+if fused is not None:
+
+    @triton.jit
+    def _toward(F, velocity, values, vector, numbers, OPTIONS: tl.constexpr):
+        """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
+        scale = values[0] * tl.load(numbers) * F[0]
+        resistance = values[0] * 0
+        if OPTIONS[0]:
+            resistance = values[1]
+        force = (
+            scale * tl.load(vector) - resistance * velocity[0],
+            scale * tl.load(vector + 1) - resistance * velocity[1],
+            scale * tl.load(vector + 2) - resistance * velocity[2],
+        )
+        return force, resistance
+
+
+class _Toward(Force):
+    """A force outside the package with a twin."""
+
+    has_twin = True
+
+    def __init__(self, points, resists):
+        super().__init__()
+        self.resists = resists
+        self.register_buffer("share", torch.stack([points.mass, 3 * points.mass], dim=-1))
+
+    def along(self, time):
+        return torch.stack([300 * time + 9, -5 + 0 * time, 1 + 2000 * time], dim=-1)
+
+    def forward(self, state):
+        scale = self.share[..., 0] * 2.5 * state.F_total[..., 0, 0]
+        force = scale[..., None] * self.along(state.time).to(scale)
+        if not self.resists:
+            return force
+        return force - self.share[..., 1:] * state.velocity, self.share[..., 1]
+
+    def twin(self):
+        return ForceTwin(
+            function=_toward,
+            options=(self.resists,),
+            implicit=self.resists,
+            sources=(self.share,),
+            values=lambda: self.share,
+            numbers=lambda: torch.tensor([2.5], device=self.share.device),
+            vectors=lambda time, dt, steps: self.along(
+                time + dt * torch.arange(steps, dtype=torch.float64, device=time.device)
+            ),
+        )
+
+
+@pytest.mark.slow(gate=["interpreted-total-False", "interpreted-updated-True"])
+@pytest.mark.parametrize("resists", [False, True])
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_twin_from_outside(kernel_device, formulation, resists):
+    """It comes before a wind, so the wind runs in torch; and the kernels can be given another twin."""
+    points = make_points(kernel_device, count=12)
+    own = _Toward(points, resists)
+
+    def run(solver, state):
+        states = [solver.rollout(state, DT, 2, own)]
+        states.append(solver.rollout(states[-1], DT, 2, [own, make_load(points)]))
+        states.append(solver.rollout(states[-1], DT, 2, make_load(points)))
+        own.share *= 2
+        states.append(solver.rollout(states[-1], DT, 1, own))
+        own.share /= 2
+        return states
+
+    check_agreement(run_both(points, run, formulation))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_forces_in_torch_are_replayed_from_graphs(formulation):
+    """Python is not called after recording; changes in place take effect, and a changed number is recorded again."""
+    pytest.importorskip("triton")
+    points = make_points(torch.device("cuda"), count=60)
+    pulls = [_Pull("cuda", 1.0) for _ in range(2)]
+    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    state = set_going(solvers[0], points, strain=0.02)
+    set_going(solvers[1], points)
+    load = make_load(points)
+    called = []
+    for k in range(7):
+        if k == 4:
+            for pull in pulls:
+                pull.place += 0.2
+        if k == 5:
+            for pull in pulls:
+                pull.resistance = 3.0
+        before = pulls[1]._called
+        dt = [1e-4, 7e-5][k % 2]
+        expected, found = (
+            solver.rollout(state, dt, 22, [load, pull]) for solver, pull in zip(solvers, pulls, strict=True)
+        )
+        check_agreement([expected, found], tolerance=5e-4)
+        called.append(pulls[1]._called - before)
+        state = expected
+    once = 1 if formulation == "updated" else 0  # at the start, where the particles are sorted
+    assert called[0] > 22 - 1
+    assert called[2] == called[3] == called[4] == once
+    assert called[5] > 22 - 1
+    assert any(solvers[1].fused().repeater._graphs.values())

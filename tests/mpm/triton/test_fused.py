@@ -1,0 +1,263 @@
+"""Buffers of the fused substep, what it refuses, and where the kernels are used."""
+
+import dataclasses
+import gc
+import weakref
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.geometry.regions import Box, Everything
+from gaussian_swaying.mpm.boundaries.boundary import Boundary
+from gaussian_swaying.mpm.boundaries.impulse import Impulse
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.laws.fixed_corotated import FixedCorotated
+from gaussian_swaying.mpm.laws.metal import Metal
+from gaussian_swaying.mpm.solver import MPMSolver
+
+from .bodies import (
+    DT,
+    DX,
+    FORMULATIONS,
+    LEFT,
+    TOLERANCE,
+    TOP,
+    check_agreement,
+    make_load,
+    make_points,
+    make_solver,
+    set_going,
+)
+
+try:
+    from gaussian_swaying.mpm.triton import fused
+except ImportError:
+    fused = None
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_one_solver_within_inference_mode_and_without(kernel_device, formulation):
+    points = make_points(kernel_device, count=12)
+    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    load = make_load(points)
+    with torch.inference_mode():
+        ends = [solver.rollout(set_going(solver, points), DT, 1, load) for solver in solvers]
+    check_agreement([solver.rollout(end, DT, 2, load) for solver, end in zip(solvers, ends, strict=True)])
+
+
+def test_nothing_is_recorded_that_has_not_run(kernel_device):
+    """A single substep of ``updated`` uses no kernel that ends one and starts another; recording would compile it."""
+    points = make_points(kernel_device, count=12)
+    solver = make_solver("triton")
+    state = solver.rollout(set_going(solver, points), DT, 1)
+    assert not solver.fused().repeater._graphs
+    solver.rollout(state, DT, 2)
+    assert solver.fused().repeater._graphs
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_patches_that_change_in_place(kernel_device, formulation):
+    points = make_points(kernel_device, count=12)
+    load = make_load(points)
+    solvers = [make_solver(transfer, formulation) for transfer in ("torch", "triton")]
+    states = [set_going(solver, points) for solver in solvers]
+    check_agreement([solver.rollout(state, DT, 1, load) for solver, state in zip(solvers, states, strict=True)])
+    load.area.mul_(3.0)
+    check_agreement([solver.rollout(state, DT, 1, load) for solver, state in zip(solvers, states, strict=True)])
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_boundaries_that_change(kernel_device, formulation):
+    """A different window, a different buffer and a different object in it, without ``init_state``."""
+    points = make_points(kernel_device, count=12)
+    ends = []
+    for transfer in ("torch", "triton"):
+        pin, plane = PinnedRegion(LEFT), Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
+        box = VelocityBox(Box([0.0, 0.0, 0.2], [1.0] * 3), [0.0, 1.0, 0.0])
+        solver = make_solver(transfer, formulation, boundaries=[pin, plane, box])
+        state = set_going(solver, points)
+        found = [solver.rollout(state, DT, 1)]
+        pin.end = 0.5 * DT
+        found.append(solver.rollout(found[-1], DT, 1))
+        plane.point = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64, device=kernel_device)
+        found.append(solver.rollout(found[-1], DT, 1))
+        box.region = TOP
+        found.append(solver.rollout(found[-1], DT, 1))
+        ends.append(found)
+    check_agreement(ends)
+    assert not torch.allclose(ends[0][1].velocity, ends[0][2].velocity, rtol=1e-2)
+
+
+def test_laws_that_change(kernel_device):
+    ends = []
+    for transfer in ("torch", "triton"):
+        law = Metal(5e2, 1e3)
+        points, solver = make_points(kernel_device, law, count=12), make_solver(transfer)
+        state = set_going(solver, points)
+        solver.rollout(state, DT, 1)
+        law.yield_stress = 2e3
+        ends.append(solver.rollout(state, DT, 1))
+    check_agreement(ends)
+
+
+def test_a_pin_that_opens(kernel_device):
+    """A single pin is applied in the kernels themselves, as long as it has no window."""
+    ends = []
+    for transfer in ("torch", "triton"):
+        pin = PinnedRegion(LEFT)
+        solver, points = make_solver(transfer, "total", boundaries=[pin]), make_points(kernel_device, count=12)
+        state = solver.rollout(set_going(solver, points), DT, 1)
+        pin.end = 0.5 * DT
+        ends.append(solver.rollout(state, DT, 1))
+    check_agreement(ends)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_buffers_end_with_their_solver(kernel_device, formulation):
+    """Immediately: a GPU may need their memory for the next one before Python collects cycles."""
+    points = make_points(kernel_device, count=12)
+    solver = make_solver("triton", formulation)
+    solver.rollout(set_going(solver, points), DT, 1)
+    buffer = weakref.ref(solver.fused().load)
+    gc.disable()
+    try:
+        del solver
+        assert buffer() is None
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_what_is_too_large_for_the_indices_is_refused(kernel_device, formulation, monkeypatch):
+    points = make_points(kernel_device, count=12)
+    monkeypatch.setattr(fused, "MAX_INDEX", 700)
+    solver = make_solver("triton", formulation)
+    state = solver.init_state(points)
+    with pytest.raises(ValueError, match=r"set `solver\.transfer` to torch"):
+        solver.rollout(state, DT, 1)
+
+
+# ---- where the kernels are used
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_gradients_are_left_to_torch_or_to_their_kernels(kernel_device, formulation):
+    points = make_points(kernel_device)
+    auto = make_solver("auto", formulation)
+    state = set_going(auto, points)
+    velocity = state.velocity.clone().requires_grad_()
+    load = make_load(points)
+    name = "node_velocity" if formulation == "total" else "velocity"
+    start = state.replace(**{name: getattr(state, name).clone().requires_grad_()})
+    assert auto.rollout(start, DT, 2, load).position.requires_grad
+    assert auto.step(state, DT, force=velocity).position.requires_grad
+    area = load.area.clone().requires_grad_()
+    assert auto.rollout(state, DT, 1, WindForce(load.aero, load.wind, load.normal, area)).position.requires_grad
+    knock = Impulse(Everything(), [0.0, 0.0, 0.1], end=DT)
+    knock.impulse.requires_grad_()
+    pushed = make_solver("auto", formulation, boundaries=[knock])
+    assert pushed.rollout(set_going(pushed, points), DT, 1).position.requires_grad
+    only = make_solver("triton", formulation)
+    only.init_state(points)
+    attempts = [
+        lambda: only.step(state, DT, force=velocity),
+        lambda: only.rollout(state, DT, 1, WindForce(load.aero, load.wind, load.normal, area)),
+        lambda: only.rollout(start, DT, 1, [load, load]),
+    ]
+    if formulation == "total":  # these have kernels, see test_adjoint.py
+        assert only.rollout(start, DT, 2, load).position.requires_grad
+        assert only.step(start, DT).position.requires_grad
+    else:
+        attempts += [lambda: only.rollout(start, DT, 2, load), lambda: only.step(start, DT)]
+    for attempt in attempts:
+        with pytest.raises(ValueError, match="`transfer: triton` has no gradients here"):
+            attempt()
+    with torch.no_grad():
+        assert not only.rollout(start, DT, 1, load).position.requires_grad
+
+
+class OwnLaw(FixedCorotated):
+    """A custom law, which may do anything."""
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda points: (points.map(torch.Tensor.double), {}), "computes in float32, but the material is float64"),
+        (lambda points: (dataclasses.replace(points, laws=(OwnLaw(),)), {}), "the law OwnLaw has no Triton twin"),
+        (lambda points: (points, {"formulation": "updated", "deterministic": True}), "sums have no fixed order"),
+    ],
+    ids=["float64", "custom law", "deterministic"],
+)
+def test_what_the_kernels_cannot_do(kernel_device, change, reason):
+    """``auto`` uses torch, ``triton`` raises an error with the reason."""
+    points, options = change(make_points(kernel_device))
+    solver = MPMSolver(dx=DX, transfer="auto", **options)
+    state = solver.init_state(points)
+    assert solver.fused() is None
+    assert bool(torch.isfinite(solver.step(state, DT).position).all())
+    if kernel_device.type == "cuda":
+        assert reason in solver._fused_obstacle
+    with pytest.raises(ValueError, match=reason):
+        MPMSolver(dx=DX, transfer="triton", **options).init_state(points)
+
+
+def test_auto_takes_the_kernels_on_a_gpu_only(kernel_device):
+    solver = MPMSolver(dx=DX)
+    solver.init_state(make_points(kernel_device))
+    assert (solver.fused() is not None) == (kernel_device.type == "cuda")
+    assert solver.deterministic is False
+    solver = MPMSolver(dx=DX, deterministic=True)
+    solver.init_state(make_points(kernel_device))
+    assert (solver.fused() is not None) == (kernel_device.type == "cuda")
+
+
+def test_torch_means_torch(kernel_device):
+    solver = MPMSolver(dx=DX, transfer="torch")
+    solver.init_state(make_points(kernel_device))
+    assert solver.fused() is None
+
+
+def test_another_material_needs_other_buffers(kernel_device):
+    solver = make_solver("triton", "total")
+    solver.init_state(make_points(kernel_device))
+    first = solver.fused()
+    assert solver.fused() is first
+    solver.init_state(make_points(kernel_device, count=7))
+    assert solver.fused().count == 7
+
+
+def test_settings_that_contradict():
+    with pytest.raises(ValueError, match=r"transfer.*tritn"):
+        MPMSolver(transfer="tritn")
+
+
+@pytest.mark.skipif(fused is not None and fused.INTERPRETED, reason="the kernels run here without one")
+def test_triton_without_a_gpu_says_so():
+    with pytest.raises(ValueError, match=r"needs a CUDA device|Triton cannot be imported"):
+        MPMSolver(dx=DX, transfer="triton").init_state(make_points("cpu"))
+
+
+class _Waiting(Boundary):
+    """A custom condition that makes the host wait: it cannot be recorded."""
+
+    def forward(self, velocity, nodes):
+        return velocity * (0.5 if float(nodes.time) > 2.5 * DT else 1.0)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_condition_that_waits_is_asked_each_time(formulation):
+    pytest.importorskip("triton")
+    points = make_points(torch.device("cuda"))
+    ends = []
+    for transfer in ("torch", "triton"):
+        solver = MPMSolver(dx=DX, formulation=formulation, transfer=transfer, boundaries=[_Waiting()])
+        state = set_going(solver, points)
+        for _ in range(3):
+            state = solver.rollout(state, DT, 2)
+        ends.append(state.velocity)
+    assert float((ends[1] - ends[0]).abs().max()) < 6 * TOLERANCE * float(ends[0].abs().max())

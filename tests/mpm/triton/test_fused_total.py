@@ -1,0 +1,178 @@
+"""Cells of any size and places of particles in the kernels, and what one batch shares."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gaussian_swaying.aero.wind import FlowKey, WindField
+from gaussian_swaying.aero.wind_force import WindForce
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import GridSpec
+
+from .bodies import (
+    DT,
+    DX,
+    FIELDS,
+    FORMULATIONS,
+    TOLERANCE,
+    check_agreement,
+    make_body,
+    make_load,
+    make_points,
+    make_solver,
+    on_each,
+    run_both,
+    run_in_wind,
+    set_going,
+)
+
+try:
+    from gaussian_swaying.mpm.triton import fused, fused_total
+except ImportError:
+    fused = None
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    [
+        *on_each(
+            ("total", [1]), ("updated", [1]), ("total", [1, 3, 0, 64, 65, 130]), interpreted=[("updated", [3, 0, 64])]
+        ),
+        pytest.param("cuda", ("updated", [1, 3, 0, 64, 65, 130]), marks=pytest.mark.gpu),
+    ],
+    indirect=["kernel_device"],
+    ids=str,
+)
+@pytest.mark.parametrize("programs", [1, 2048])
+def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
+    """Several chunks of lanes, pieces or warps for one cell; cells without a particle between others."""
+    formulation, sizes = case
+    if formulation == "updated" and programs > 1:
+        pytest.skip("only `total` cuts cells")
+    monkeypatch.setattr(fused_total, "_PROGRAMS", programs)
+    if len(sizes) > 2:
+        monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 64)
+    generator = torch.Generator().manual_seed(7)
+    cells = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
+    place = 0.52 + 0.96 * torch.rand(len(cells), 3, generator=generator)  # of a cell, from the first node
+    place[:, 2] += cells
+    place = place[torch.randperm(len(place), generator=generator)]
+    check_agreement(run_in_wind(make_body((place * DX).to(kernel_device)), formulation))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("lanes", [32, 128])
+def test_every_number_of_lanes(lanes, monkeypatch):
+    """The others are used in other tests."""
+    pytest.importorskip("triton")
+    monkeypatch.setattr(fused_total, "_lanes", lambda sizes: lanes)
+    check_agreement(run_in_wind(make_points("cuda", count=300), "total"))
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+def test_crowded_cells_are_cut_only_where_there_are_few(kernel_device, monkeypatch):
+    """200 particles in a cell and 10 in the next, with 32 lanes."""
+    monkeypatch.setattr(fused_total, "_lanes", lambda sizes: 32)
+    generator = torch.Generator().manual_seed(2)
+    place = 0.52 + 0.96 * torch.rand(210, 3, generator=generator)
+    place[200:, 2] += 1
+    for programs, pieces in ((2048, 7 + 1), (3, 3 + 1), (1, 2)):
+        monkeypatch.setattr(fused_total, "_PROGRAMS", programs)
+        solver = MPMSolver(DX, formulation="total", transfer="triton")
+        solver.init_state(make_body((place * DX).to(kernel_device)))
+        assert solver.fused().pieces == pieces
+
+
+def test_the_number_of_lanes_suits_the_cells(monkeypatch):
+    if fused is None:
+        pytest.skip("needs triton, which is available on Linux only")
+    monkeypatch.undo()
+    few, many = (fused_total._lanes(torch.full((100,), size)) for size in (3, 300))
+    assert few < many
+    sizes = torch.tensor([4] * 4000 + [5] * 100)  # no program goes through its cells twice, if all run at once
+    assert fused_total._lanes(sizes) == 8
+    assert fused_total._lanes(sizes.repeat(10)) == 4
+
+
+def test_a_node_adds_only_the_cells_around_it(monkeypatch):
+    """A sheet one cell thick has at most nine cells around a node, and each of a node's rows is that of its place."""
+    if fused is None:
+        pytest.skip("needs triton, which is available on Linux only")
+    cell = torch.full((27, 2), 5)
+    cell[[3, 20], 0] = torch.tensor([4, 2])
+    cell[26, 1] = 0
+    assert fused_total._sources(cell, 5).tolist() == [[3 * 6 + 4, 26 * 6], [20 * 6 + 2, 5]]
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_particles_on_the_borders_of_cells(kernel_device, formulation):
+    steps = torch.tensor([0.05, 0.15, 0.1, 0.25])
+    position = torch.cartesian_prod(steps, steps, steps)[:32]
+    position = torch.cat([position, torch.nextafter(position, torch.zeros(()))[5:13]])
+    check_agreement(run_in_wind(make_body(position.to(kernel_device)), formulation))
+
+
+def test_what_leaves_the_grid_is_lost(kernel_device):
+    """It has no weight, does not affect the far side, and keeps its place; particles too near the edge are lost too."""
+    points = make_points(kernel_device)
+    outside = torch.tensor([[0.13, 0.14, 0.5], [0.5, 0.1, 0.1], [0.13, -0.4, 0.1], [0.15, 0.12, 0.349], [90.0, 0, 0]])
+    count = len(outside)
+    position = torch.cat([points.position[:-count], outside.to(kernel_device)])
+    points = dataclasses.replace(points, position=position)
+    grid = GridSpec(DX, (0, -1, 0), (5, 6, 5))
+
+    def start(solver, points):
+        state = set_going(solver, points).replace(grid=grid)
+        state.velocity[-2, 2] = 60.0  # from within the grid
+        return state
+
+    def run(solver, state):
+        states = [solver.rollout(state, DT, steps, check=False) for steps in (1, 4)]
+        assert states[0].lost.tolist() == [False] * 19 + [True] * 3 + [False, True]
+        assert states[1].lost.tolist() == [False] * 19 + [True] * 5
+        assert float(states[1].velocity[-1].abs().max()) == 0.0
+        assert torch.equal(states[1].position[-5:-2], state.position[-5:-2])
+        roomy = states[1].replace(grid=GridSpec(DX, (-1, -6, -1), (9, 12, 9)))
+        states.append(solver.rollout(roomy, DT, 1, check=False))
+        assert torch.equal(states[2].lost, states[1].lost)  # though most are back
+        return states
+
+    check_agreement(run_both(points, run, start=start, gravity=(0, 0, 0)))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
+    points = make_points(kernel_device, count=10, batch=(2,))
+    winds = [
+        WindField([0.0, -8.0, 0.0]),
+        WindField(schedule=[FlowKey(0.0, [1.0, 0, 0]), FlowKey(DT, [9.0, 0, 0])]),
+    ]
+    load = make_load(points, winds)
+    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2, load), formulation)
+    check_agreement(ends)
+    assert ends[1].work.shape == (2,)
+    solver = make_solver("torch", formulation)
+    whole = set_going(solver, points)
+    for k, wind in enumerate(winds):
+        alone = points.map(lambda value, k=k: value[k])
+        solver = make_solver("triton", formulation)
+        state = solver.init_state(alone)
+        fields = {name: None if getattr(whole, name) is None else getattr(whole, name)[k] for name in FIELDS}
+        if formulation == "total":
+            nodes = state.grid.node_count
+            offset = [a - b for a, b in zip(state.grid.offset, whole.grid.offset, strict=True)]
+            index = torch.arange(whole.grid.node_count).reshape(whole.grid.resolution)
+            for axis, (start, size) in enumerate(zip(offset, state.grid.resolution, strict=True)):
+                index = index.narrow(axis, start, size)
+            index = index.reshape(-1).to(kernel_device)
+            assert len(index) == nodes
+            fields |= {name: fields[name][index] for name in ("node_displacement", "node_velocity")}
+        else:
+            state = state.replace(grid=whole.grid)
+        state = state.replace(**fields)
+        end = solver.rollout(state, DT, 2, WindForce(load.aero, wind, load.normal[k], load.area[k]))
+        for name in ("position", "velocity", "affine", "F_elastic"):
+            error = (getattr(end, name) - getattr(ends[1], name)[k]).abs().max()
+            assert float(error) <= TOLERANCE * float(getattr(end, name).abs().max()), name
+        torch.testing.assert_close(end.work, ends[1].work[k], rtol=1e-4, atol=0)

@@ -1,0 +1,452 @@
+"""Rollouts of the fused substep: changing substeps, looks on the way, graphs and their memory.
+
+Covers: mpm.triton.damping.
+"""
+
+import gc
+import math
+import weakref
+
+import pytest
+import torch
+
+from gaussian_swaying import _graphs
+from gaussian_swaying.aero.wind import FlowKey, GaussianGust, SineSway, WindField
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.boundaries.enclosing_box import EnclosingBox
+from gaussian_swaying.mpm.boundaries.handle import Handle
+from gaussian_swaying.mpm.boundaries.pinned_region import PinnedRegion
+from gaussian_swaying.mpm.boundaries.plane import Plane
+from gaussian_swaying.mpm.boundaries.velocity_box import VelocityBox
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.simulation.diagnostics import SimulationDiverged, check_state
+
+from .bodies import (
+    DT,
+    DX,
+    ELASTIC,
+    FIELDS,
+    FORMULATIONS,
+    LEFT,
+    PLASTIC,
+    TOLERANCE,
+    WIND,
+    check_agreement,
+    make_body,
+    make_load,
+    make_points,
+    make_solver,
+    on_each,
+    run_both,
+    run_in_wind,
+    set_going,
+)
+
+try:
+    from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
+except ImportError:
+    fused = None
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    on_each(("total", False), ("updated", True), interpreted=[("updated", False)]),
+    indirect=["kernel_device"],
+    ids=str,
+)
+def test_gravity_damping_and_viscosity(kernel_device, case):
+    """Also with MLS-MPM."""
+    formulation, mls = case
+    options = {"gravity": (1.0, 2.0, -9.8), "damping": 20.0, "stiffness_damping": 2e-3}
+    check_agreement(run_in_wind(make_points(kernel_device), formulation, steps=2, mls=mls, **options))
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+def test_mls(kernel_device):
+    check_agreement(run_in_wind(make_points(kernel_device), "updated", mls=True))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_without_any_load(kernel_device, formulation):
+    """Also without damping."""
+    points = make_points(kernel_device)
+    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 2), formulation, damping=0.0)
+    check_agreement(ends)
+    assert float(ends[1].work) == 0.0
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_a_substep_that_changes(kernel_device, formulation):
+    """Forces act for the mean of the old and the new one, at most twice the new one."""
+    points = make_points(kernel_device)
+    load = make_load(points)
+
+    def run(solver, state):
+        states = []
+        for dt, steps in ((1e-3, 1), (4e-4, 2), (1e-4, 1)):
+            state = solver.rollout(state, dt, steps, load)
+            states.append(state)
+        return states
+
+    check_agreement(run_both(points, run, formulation))
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
+    """Longer than the schedule and the sorting of the particles; the wind and the work continue."""
+    monkeypatch.setattr(fused, "MAX_STEPS", 4)
+    monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
+    wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
+    points = make_points(kernel_device, count=12, batch=(2,))
+    load = make_load(points, [wind, WIND])
+
+    def start(solver, points):
+        state = set_going(solver, points, strain=0.05)
+        return state if solver.neighbours_fixed else state.replace(velocity=10 * state.velocity)  # across cells
+
+    ends = run_both(points, lambda solver, state: solver.rollout(state, DT, 5, load), formulation, start=start)
+    check_agreement(ends)
+
+
+@pytest.mark.slow(gate=["interpreted-corotated, total", "interpreted-sand, updated"])
+@pytest.mark.parametrize(
+    ("kernel_device", "case"),
+    on_each(
+        *((law, formulation) for law in ("corotated", "springs") for formulation in FORMULATIONS),
+        ("sand", "updated"),
+        interpreted=[("hencky", "total"), ("metal", "updated")],
+    ),
+    indirect=["kernel_device"],
+    ids=lambda value: value if isinstance(value, str) else ", ".join(value),
+)
+def test_looks_on_the_way(kernel_device, case, monkeypatch):
+    """The largest Courant number seen, and the same motion; some checks fall between two sorts of the particles."""
+    monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
+    law, formulation = case
+    points = make_points(kernel_device, (ELASTIC | PLASTIC)[law])
+
+    def run(solver, state):
+        if solver.transfer == "triton":
+            assert solver.bound.longest_substep > DT  # of the material at rest, in torch, once
+            monkeypatch.setattr(solver.laws, "moduli", None)  # the measured values stay in the kernels
+        return solver.watched_rollout(state, DT, 3, make_load(points), 3)
+
+    found = run_both(points, run, formulation)
+    check_agreement([state for state, _ in found])
+    assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=2 * TOLERANCE)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_looks_at_other_laws(kernel_device, formulation):
+    """With several energies, or with one that has no kernel, the checks run in torch, between the kernels' substeps."""
+    index = torch.arange(24) % 2
+    for laws, more in (([*ELASTIC.values()][2:], {"law_index": index}), (ELASTIC["neo-hookean"], {})):
+        points = make_points(kernel_device, laws, **more)
+        found = run_both(points, lambda solver, state: solver.watched_rollout(state, DT, 2, None, 2), formulation)
+        check_agreement([state for state, _ in found])
+        assert float(found[1][1]) == pytest.approx(float(found[0][1]), rel=2 * TOLERANCE)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_many_substeps(formulation):
+    """Round-off grows in fifty substeps, though not by much where the motion is stable."""
+    pytest.importorskip("triton")
+
+    def start(solver, points):
+        return set_going(solver, points, strain=0.02)
+
+    ends = run_in_wind(make_points("cuda", count=2000), formulation, steps=50, start=start)
+    check_agreement(ends, tolerance=2e-4)
+
+
+# ---- rollouts from graphs
+
+
+def _gusty():
+    """A wind that is another in every substep."""
+    gusts = [SineSway(period=0.01), GaussianGust(1.0, interval=2 * DT)]
+    return WindField(schedule=[FlowKey(0.0, [5.0, 0.0, 0.0]), FlowKey(0.004, [0.0, 5.0, 1.0])], modulations=gusts)
+
+
+REPLAYED = {
+    "a hinge": {"boundaries": lambda: [PinnedRegion(LEFT)]},
+    "nodes, crowded cells": {"boundaries": lambda: [PinnedRegion(LEFT, "nodes")], "count": 40},
+    "a handle": {"boundaries": lambda: [Handle(LEFT, [0.5, 0.0, 0.2])]},
+    "a batch": {"boundaries": lambda: [PinnedRegion(LEFT)], "batch": (2,)},
+    "no wind": {"boundaries": lambda: [], "wind": False},
+}
+
+
+@pytest.mark.slow(gate=["interpreted-a hinge", "interpreted-no wind"])
+@pytest.mark.parametrize("case", REPLAYED)
+def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
+    """On a GPU nothing is recorded at first; results stay as they are when another rollout follows."""
+    steps = 37 if kernel_device.type == "cuda" else 5
+    monkeypatch.setattr(fused_total, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
+    given = REPLAYED[case]
+    points = make_points(kernel_device, count=given.get("count", 12), batch=given.get("batch", ()))
+    solver = make_solver("triton", "total", boundaries=given["boundaries"]())
+    wind = [_gusty(), WIND] if "batch" in given else _gusty()
+    forces = [make_load(points, wind)] if given.get("wind", True) else []
+    start = set_going(solver, points, strain=0.05)
+
+    def go(state, count=steps):
+        with torch.no_grad():
+            return solver.watched_rollout(state, DT, count, forces, 3)
+
+    first, cells = go(start)
+    kept = {name: getattr(first, name).clone() for name in (*FIELDS, "work", "impulse", "time") if name != "internal"}
+    for _ in range(2):
+        again, its_cells = go(start)
+        assert float(its_cells) == float(cells)
+        for name, value in kept.items():
+            assert torch.equal(getattr(again, name), value), name
+    go(again, steps - 2)
+    for name, value in kept.items():
+        assert torch.equal(getattr(first, name), value), name
+        assert torch.equal(getattr(again, name), value), name
+
+
+@pytest.mark.slow(gate=["interpreted-played"])
+@pytest.mark.parametrize("graphs", ["as on the device", "played"])
+def test_a_replayed_rollout_follows_what_changes(kernel_device, graphs, monkeypatch):
+    """Numbers of the wind and patches that change in place, and a force that is another one.
+
+    A played graph runs what was recorded, with what the recording knew of its first rollout.
+    """
+    if graphs == "played" and kernel_device.type == "cuda":
+        pytest.skip("on this device graphs are real")
+    points = make_points(kernel_device, count=12)
+    load, other = make_load(points), make_load(points, seed=7)
+    if graphs == "played":
+        monkeypatch.setattr(_graphs, "record", lambda device, work, pool, stream: _Played(work))
+        monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
+        monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+        monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
+
+    def run(solver, state):
+        if graphs == "played" and solver.transfer == "triton":
+            solver.fused().repeater = _graphs.Repeater(torch.device("cuda"), kept=8)
+        states = [solver.rollout(state, DT, 2, load) for _ in range(3)]
+        load.area *= 2
+        load.aero.C_D += 1.0
+        states += [solver.rollout(state, DT, 2, load) for _ in range(2)]
+        load.wind.seed = 3
+        load.wind.flows *= 0.5
+        states += [solver.rollout(state, DT, 2, load) for _ in range(3)]
+        states += [solver.rollout(state, DT, 2, other) for _ in range(3)]
+        states += [solver.rollout(states[-1], 0.7 * DT, steps, load) for steps in (5, 3, 1, 4)]
+        load.area /= 2
+        load.aero.C_D -= 1.0
+        load.wind.seed = 0
+        load.wind.flows *= 2
+        return states
+
+    check_agreement(run_both(points, run, "total"))
+
+
+@pytest.mark.parametrize(
+    ("kernel_device", "boundary"),
+    [*on_each("handle"), pytest.param("cuda", None, marks=pytest.mark.gpu)],
+    indirect=["kernel_device"],
+)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_nothing_is_left_of_former_rollouts(kernel_device, formulation, boundary):
+    """Rollouts of the same kind share a recorded graph: the wind, its coefficients, patches, substep and time are new.
+
+    The second of a kind is recorded, the third is replayed. If nothing is compiled there are buffers but no graphs.
+    """
+    count = 23 if kernel_device.type == "cuda" else 1
+    points = make_points(kernel_device, count=12)
+    turning = Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 9.0, 3.0], [0.1, 0.1, 0.1], start=1e-4, end=2.5e-4 * count)
+    solvers = [
+        make_solver(transfer, formulation, boundaries=[] if boundary is None else [turning])
+        for transfer in ("torch", "triton")
+    ]
+    state = set_going(solvers[0], points, strain=0.02)
+    set_going(solvers[1], points)
+    winds = [WIND, WIND, WIND, WindField([0.0, -40.0, 5.0]), WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])]
+    for k, wind in enumerate(winds):
+        if k in (1, 2) and kernel_device.type == "cpu":
+            continue
+        load = make_load(points, wind, seed=4 if k < 4 else 11, C_D=0.5 + k)
+        dt = [1e-4, 1e-4, 5e-5, 1e-4, 7e-5][k]
+        if formulation == "updated":
+            state = state.replace(grid=GridSpec(DX, (-2, -2, -2), (8, 8, 8 if k < 4 else 9)))
+        expected, found = (solver.rollout(state, dt, count, load) for solver in solvers)
+        check_agreement([expected, found], tolerance=1e-4)
+        state = expected  # or the errors add up
+        if k == 3 and kernel_device.type == "cuda":
+            assert any(solvers[1].fused().repeater._graphs.values())
+    # a rollout without wind is another kind
+    check_agreement([solver.rollout(state, 1e-4, 2) for solver in solvers])
+    check_agreement([solver.rollout(state, 1e-4, 2, load) for solver in solvers])
+
+
+def test_a_grid_that_comes_back(kernel_device):
+    """A graph recorded for a grid finds its node positions again, even after another grid was used."""
+    points = make_points(kernel_device)
+    count = 4 if kernel_device.type == "cuda" else 1
+    boundaries = [Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
+    solvers = [make_solver(transfer, boundaries=boundaries) for transfer in ("torch", "triton")]
+    state = set_going(solvers[0], points)
+    set_going(solvers[1], points)
+    load = make_load(points)
+    near, far = GridSpec(DX, (-2, -2, -2), (8, 8, 8)), GridSpec(DX, (-4, -3, -2), (8, 8, 7))
+    for grid in (near, near, far, far, near, far) if kernel_device.type == "cuda" else (near, far):
+        filler = [torch.full((512, 3), 1e3, device=kernel_device) for _ in range(20)]  # over the freed memory
+        expected, found = (solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers)
+        check_agreement([expected, found])
+        del filler
+    larger = GridSpec(DX, (-8, -8, -8), (20, 20, 20))  # needs other buffers
+    for grid in (larger, near):
+        check_agreement([solver.rollout(state.replace(grid=grid), DT, count, load) for solver in solvers])
+
+
+class _Played:
+    """Recorded work that can be replayed without a GPU."""
+
+    def __init__(self, work):
+        self.replay = work
+
+    def pool(self):
+        return None
+
+    def reset(self):
+        del self.replay
+
+
+@pytest.mark.parametrize("kernel_device", ["interpreted"], indirect=True)
+def test_graphs_go_with_their_grid(kernel_device, monkeypatch):
+    """Over a hundred grids, with substeps that only count themselves."""
+    alive, substeps = weakref.WeakSet(), []
+
+    def record(device, work, pool, stream):
+        graph = _Played(work)
+        alive.add(graph)
+        return graph
+
+    for place, name, value in (
+        (_graphs, "record", record),
+        (torch.cuda, "Stream", lambda device: None),
+        (torch.cuda, "synchronize", lambda device: None),
+        (torch.cuda, "empty_cache", lambda: None),
+        (fused_updated.FusedUpdated, "_load", lambda self, state: None),
+        (fused_updated.FusedUpdated, "_particles", lambda self, *more, **options: None),
+        (fused_updated.FusedUpdated, "_nodes", lambda self, offset, options: substeps.append(offset)),
+        (fused_updated.FusedUpdated, "_read", lambda self, state: {}),
+    ):
+        monkeypatch.setattr(place, name, value)
+    points, solver = make_points(kernel_device, count=4), make_solver("triton")
+    state = solver.init_state(points)
+    solver.fused().repeater = _graphs.Repeater(torch.device("cuda"))
+    for k in range(100):  # some of one size, some that need other buffers
+        grid = GridSpec(DX, (-2, -2, -2 - k % 3), (8, 8, 8 + k))
+        for recorded in (0, 3, 3):
+            solver.rollout(state.replace(grid=grid), DT, 22)
+            assert len(alive) == recorded
+    assert len(substeps) == 100 * 3 * 22
+
+
+def _cloud(count, seed=8):
+    """Particles of a box of half a metre."""
+    return make_body(
+        0.5 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)).cuda(), youngs_modulus=0.01
+    )
+
+
+@pytest.mark.gpu
+def test_grids_that_grow_take_the_memory_of_the_largest():
+    """Two hundred grids of up to 2.7 million nodes, each with graphs of its own.
+
+    The most memory in use is the buffers and graphs of the largest grid, those of the grid before, and the temporaries
+    of the substeps that were not recorded: three times the memory of the largest grid alone.
+    """
+    pytest.importorskip("triton")
+    points = _cloud(500)
+    far = VelocityBox(Box([8.0] * 3, [9.0] * 3), [0.0, 1.0, 0.0])  # in torch, which takes the most memory
+    planes = [Plane([0.0, 0.0, -0.2], [0.0, 0.0, 1.0]), EnclosingBox([-9.0] * 3, [9.0] * 3), far]
+
+    def most_reserved(sizes):
+        solver = MPMSolver(dx=0.02, formulation="updated", transfer="triton", boundaries=planes)
+        state, most = solver.init_state(points), 0
+        for size in sizes:
+            state = state.replace(grid=GridSpec(0.02, (-20, -20, -20), (size, size, size)))
+            for _ in range(2):
+                state = solver.rollout(state, 1e-5, 7)
+                most = max(most, torch.cuda.memory_reserved())
+            assert sum(map(len, solver.fused().repeater._graphs.values())) == 2  # of four substeps and of one
+        assert not state.lost.any()
+        return most
+
+    gc.collect()
+    torch.cuda.empty_cache()
+    before = torch.cuda.memory_reserved()
+    alone = most_reserved([140]) - before
+    torch.cuda.empty_cache()
+    assert alone > 2.7e6 * 60  # bytes; otherwise the test would show nothing
+    assert most_reserved([*range(60, 140), *range(140, 60, -1), *range(101, 141)]) - before < 3 * alone
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("flight", ["drifts", "expands"])
+def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
+    """Its grid moves or grows over a hundred frames, but much less often than once per frame."""
+    pytest.importorskip("triton")
+    points = _cloud(500)
+    solver = MPMSolver(
+        dx=0.02, formulation="updated", transfer="triton", gravity=(0, 0, 0),
+        boundaries=[Plane([0.0, 0.0, -99.0], [0.0, 0.0, 1.0])],
+    )  # fmt: skip
+    centre = points.position.mean(0)
+    velocity = torch.ones_like(points.position) if flight == "drifts" else 3 * (points.position - centre)
+    state = solver.init_state(points, velocity)
+    torch.cuda.empty_cache()
+    before, grids, most = torch.cuda.memory_reserved(), [], 0
+    for _ in range(100):
+        state = solver.fit_grid(state, 0.02)
+        grids.append(state.grid)
+        state = solver.rollout(state, 1e-3, 20)
+        most = max(most, torch.cuda.memory_reserved() - before)
+        # three sizes, for both buffers between which a sort moves the particles
+        assert sum(map(len, solver.fused().repeater._graphs.values())) <= 6
+    assert not state.lost.any()
+    assert 1 < len(set(grids)) < 40
+    # some fifty numbers of four bytes a node in buffers and temporaries, three times over, and PyTorch's blocks
+    assert most < 600 * max(grid.node_count for grid in grids) + 2e8
+
+
+BROKEN = [("position", math.nan), ("position", math.inf), ("position", 1e30), ("velocity", math.nan)]
+BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
+
+
+@pytest.mark.slow(
+    gate=["interpreted-torch-velocity-nan", "interpreted-triton-velocity-nan", "interpreted-triton-position-1e+30"]
+)
+@pytest.mark.parametrize(("name", "value"), BROKEN)
+@pytest.mark.parametrize("transfer", ["torch", "triton"])
+def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
+    """Also within recorded substeps, and the device stays usable."""
+    points, steps = make_points(kernel_device), 9 if kernel_device.type == "cuda" else 2
+    solver = make_solver(transfer, boundaries=[Plane([0.0, 0.0, -0.1], [0.0, 0.0, 1.0])])
+    start = solver.fit_grid(set_going(solver, points, strain=0.02), 0.04)
+    end = good = solver.rollout(start, DT, steps)  # as it is, then recorded
+    broken = getattr(start, name).clone()
+    broken[5, 1] = value
+    with torch.no_grad():
+        for _ in range(2):
+            end = solver.rollout(start.replace(**{name: broken}), DT, steps, check=False)
+    with pytest.raises((FloatingPointError, ValueError), match=r"NaN or infinite|left the grid"):
+        solver.rollout(start.replace(**{name: broken}), DT, steps)
+    with pytest.raises(SimulationDiverged, match=r"particle .* (NaN or infinite|left the grid|object sizes)") as found:
+        check_state(solver, end)
+    if name == "position":  # it has affected no other particle
+        assert found.value.particle == 5
+        assert end.lost.tolist() == [k == 5 for k in range(24)]
+        assert bool(torch.isfinite(end.velocity).all())
+    with pytest.raises((FloatingPointError, ValueError)):
+        solver.fit_grid(end, 0.04)
+    again = solver.rollout(start, DT, steps)  # nothing remains
+    check_agreement([good, again], tolerance=1e-4 if kernel_device.type == "cuda" else TOLERANCE)
