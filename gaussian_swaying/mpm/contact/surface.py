@@ -1,4 +1,4 @@
-"""Contact samples on the surface of a body, and the settings of its contact."""
+"""Contact samples (``place`` in the code) on the surface of a body, and the settings of its contact."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Places of the surface that touch obstacles and each other: discs around them cover it.
+    """Contact samples of the surface, which touch obstacles and each other: discs around them cover it.
 
     Attributes:
         place: Rest positions [m], shape (C, 3).
         normal: Unit normals at rest, of either sign, shape (C, 3).
         radius: Radii of the discs [m], shape (C,).
         thickness: Distance that two surfaces keep [m], shape (C,).
-        read: Where in the material each is read [m], shape (C, 3): the place itself, or one close to it if some of its
+        read: Where in the material each is read [m], shape (C, 3): the sample itself, or one close to it if some of its
             nodes have no mass.
         contact: Contact of the surface with itself; None if only obstacles count.
     """
