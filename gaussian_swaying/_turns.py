@@ -12,7 +12,7 @@ R = TypeVar("R")
 
 
 class Turn:
-    """A lock that the thread that holds it may take again. A copy of its owner gets a lock of its own."""
+    """A lock that its thread may take again. A copy of the object that owns it gets a lock of its own."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()

@@ -39,7 +39,7 @@ def _corners(x, n, WRAPS: tl.constexpr):
 
 @triton.jit
 def _look_up(table, head, place, X: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr, WIDTH: tl.constexpr):
-    """Three values (or one and two zeros, for a WIDTH of one) of a table; ``head`` holds its three sizes.
+    """Three values (or one and two zeros, for a WIDTH of one) of a table; ``head`` contains its three sizes.
 
     X, Y, Z: whether it repeats along each axis.
     """

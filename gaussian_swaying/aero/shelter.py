@@ -84,7 +84,7 @@ class Shelter(WindEffect):
     every frame, from the shape of the body then, in the direction of the mean flow. Place it last in the list.
 
     Args:
-        cells: Corners of the grid along each axis; its side is the longest of the body's box. A cell should hold
+        cells: Corners of the grid along each axis; its side is the longest of the body's box. A cell should contain
             several leaves.
         strength: Factor of the drag area, for example for leaves that the splat does not show.
     """

@@ -16,7 +16,7 @@ from gaussian_swaying.gaussians.harmonics import sh_degree
 
 @dataclass(frozen=True, slots=True)
 class GaussianCloud:
-    """3D Gaussians in storage form, as a 3DGS .ply file holds them.
+    """3D Gaussians in storage form, as a 3DGS .ply file stores them.
 
     Attributes:
         means: Centres [scene units], shape (N, 3).

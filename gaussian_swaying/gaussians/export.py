@@ -402,7 +402,7 @@ def read_usd_frame(path: str | os.PathLike[str], frame: int) -> dict[str, np.nda
 
     Raises:
         ImportError: If usd-core is not installed.
-        ValueError: If the file cannot be read or holds no Gaussians.
+        ValueError: If the file cannot be read or contains no Gaussians.
     """
     usd, geom = _pxr("Usd"), _pxr("UsdGeom")
     try:

@@ -116,8 +116,8 @@ def _read_obj(file: Path) -> tuple[Tensor, list[list[int]]]:
 def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceGrid:
     """Signed distance to a closed mesh on a grid around it.
 
-    The distance is that to the nearest of the triangles that hold the nearest of many samples of the surface. Inside is
-    where most of the rays along the three axes cross the surface an odd number of times.
+    The distance is that to the nearest of the triangles that contain the nearest of many samples of the surface. Inside
+    is where most of the rays along the three axes cross the surface an odd number of times.
 
     Args:
         vertices: Shape (V, 3).

@@ -14,7 +14,7 @@ _PAIRS = 200_000  # candidate pairs of a chunk: few enough for the cache of a pr
 def nearest_neighbours(points: Tensor, count: int, queries: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Distances and indices of the nearest points, exact and deterministic, computed on the CPU.
 
-    A query is answered on the first grid whose 27 cells around it hold enough points within one cell size. Only the
+    A query is answered on the first grid whose 27 cells around it contain enough points within one cell size. Only the
     remaining queries go on to the grid with twice the cell size. Memory is bounded by chunks of candidate pairs.
 
     Args:

@@ -41,7 +41,7 @@ def load_kernels() -> bool:
         Whether there are kernels: False if gsplat finds no compiler.
 
     Raises:
-        Exception: What the compiler says, if it fails.
+        Exception: The message of the compiler, if it fails.
     """
     from torch.utils.cpp_extension import _get_build_directory
 

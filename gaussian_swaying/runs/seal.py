@@ -70,7 +70,7 @@ def load_sealed(path: Path, map_location: Any = "cpu") -> Any:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: As in :func:`check_seal`, and if the file holds anything but tensors, numbers and text.
+        ValueError: As in :func:`check_seal`, and if the file contains anything but tensors, numbers and text.
     """
     check_seal(path)
     try:

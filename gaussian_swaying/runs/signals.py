@@ -56,5 +56,5 @@ def exit_code(stop: BaseException) -> int:
 
 
 def reason(stop: BaseException) -> str:
-    """Who stopped the run, for its summary."""
+    """The reason why a run was stopped, for its summary."""
     return f"stopped by {stop}" if isinstance(stop, StoppedBySignal) else "stopped by the user"

@@ -91,7 +91,7 @@ def to_cloud(
         opacity: Opacity of every Gaussian, between 0 and 1.
 
     Returns:
-        Gaussians with constant colours; ``normals`` holds the true normals.
+        Gaussians with constant colours; ``normals`` are the true normals.
 
     Raises:
         ValueError: If ``overlap`` is not positive.
@@ -252,7 +252,7 @@ def revolution(
 def ellipsoid(
     center: Sequence[float], radii: Sequence[float], spacing: float, colour: Sequence[float] = (0.8, 0.8, 0.8)
 ) -> Patches:
-    """An ellipsoid with axes along x, y and z; ``spacing`` holds for its longest axis."""
+    """An ellipsoid with axes along x, y and z; ``spacing`` is that of its longest axis."""
     angle = torch.linspace(-math.pi / 2, math.pi / 2, 129, dtype=torch.float64)
     unit = revolution(torch.stack([angle.cos(), angle.sin()], dim=-1), spacing / max(radii), colour)
     return unit.mapped(torch.tensor(radii, dtype=torch.float64).diag(), center)

@@ -63,7 +63,7 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     """Make a scene from settings, a file, Gaussians or a scene made in code.
 
     Args:
-        source: What to simulate.
+        source: The object to simulate.
         up: Direction that points up in it; z if None.
 
     Returns:
@@ -86,8 +86,8 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
 def as_solver(solver: MPMSolver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud) -> MPMSolver:
     """Return the given solver, or make one whose grid suits the size of the scene.
 
-    What is held has no gravity then, as in the starters of the preview: its shape at rest is one in balance with its
-    weight. What is not held falls.
+    A held object then has no gravity, as in the starters of the preview: its captured shape is already in balance with
+    its weight. An object that is not held falls.
 
     Raises:
         ValueError: If ``hold`` is given together with a solver.

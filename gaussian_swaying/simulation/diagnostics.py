@@ -29,8 +29,8 @@ class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way St
     Attributes:
         time: Simulated time [s].
         particle: Index of the first bad particle, or None if no single one is to blame.
-        cause: What went wrong.
-        remedy: What to change.
+        cause: The cause, in words.
+        remedy: The remedy, in words.
     """
 
     def __init__(self, time: float, particle: int | None, cause: str, remedy: str) -> None:
@@ -151,7 +151,7 @@ class TearingGauge:
 
 
 def check_spacing(solver: MPMSolver) -> None:
-    """Raise ValueError if most particles are isolated on the grid, so that no law could hold them together.
+    """Raise ValueError if most particles are isolated on the grid, so that no law could keep them together.
 
     Args:
         solver: A solver with its material.
@@ -312,7 +312,7 @@ def measure(
 
 @dataclass(frozen=True)
 class SceneDiagnostics(FrameDiagnostics):
-    """Those of the first scene of a batch; ``make`` makes those of every one when they are asked for."""
+    """Diagnostics of the first scene of a batch; ``make`` computes those of all scenes when they are needed."""
 
     make: Callable[[], tuple[FrameDiagnostics, ...]] = field(default=tuple, repr=False, compare=False)
 
@@ -418,7 +418,7 @@ class Gauge:
             work: Work of the wind during the frame [J].
             before: The state at the start of the frame.
             more: Function of the state that computes further numbers.
-            same: What it depends on besides; another value is another recording. None if it must not be recorded.
+            same: Key of all else that ``more`` depends on; another key makes another recording. None to record nothing.
         """
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
         fixed = solver.neighbours_fixed and state.F_elastic is state.F_total

@@ -27,7 +27,7 @@ class Edit:
 
     Deformations and velocities stay as they are; stresses follow the new material from then on. Where the law changes,
     its internal variable is reset. The thickness cannot be edited: the points of the material, their layers and the
-    surface that touches are made from it.
+    contact samples depend on it.
 
     Args:
         region: Region at rest, in scene units; it may also contain Gaussians that do not move. Everything that moves if
@@ -201,7 +201,7 @@ class SceneEditor:
         return particles, gaussians
 
     def rebase(self, points: MaterialPoints) -> None:
-        """Make some material that of the scene before its edits, for :meth:`reset`."""
+        """Set the material that the scene has before its edits, for :meth:`reset`."""
         if self._loaded is not None:
             self._loaded = (points, *self._loaded[1:])
 

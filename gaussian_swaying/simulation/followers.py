@@ -14,7 +14,7 @@ from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scat
 
 
 class Followers(nn.Module, ABC):
-    """Places of the material that are read from a state.
+    """Places in the material whose motion is interpolated from a state.
 
     Args:
         arm: From the place that is read to the place that follows, at rest [m], shape (M, 3); it turns and stretches
@@ -46,7 +46,7 @@ class Followers(nn.Module, ABC):
     def nodes(self, grid: GridSpec) -> Tensor:
         """The nodes of a grid that the stencils of the places reach: flat indices in rising order, shape (N,).
 
-        Their order is the same in every grid that holds them.
+        Their order is the same in every grid that contains them.
         """
         return follower_stencil(self.places, grid).node.unique()
 

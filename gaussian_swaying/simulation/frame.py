@@ -26,7 +26,7 @@ class Moving(Protocol):
 
     @property
     def turn(self) -> Turn:
-        """Held by the thread that steps or draws."""
+        """The lock of the thread that steps or draws."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Sums up the diagnostics of a run: whether the object held together, what moved most, what to change."""
+"""Summary of the diagnostics of a run: tears, largest motion and stretch, and advice on what to change."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Painter(nn.Module):
         self.background: Tensor
         self._renderer = renderer
         self.turn = Turn()
-        """Held while a simulation is stepped or drawn, by one thread at a time."""
+        """The lock of the thread that steps or draws the simulation."""
         self._moved, self._coloured = Replayed(), Replayed()
         self._still: dict[str, tuple[tuple[object, ...], Camera]] = {}  # cameras of the last frame that do not move
 

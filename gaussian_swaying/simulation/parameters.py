@@ -229,7 +229,7 @@ def parameter(name: str) -> Parameter:
 
 
 def present(setup: Setup, start: str = "") -> list[str]:
-    """The names of the parameters that a setup has, of those that begin with some letters."""
+    """The names of the parameters of a setup that begin with a prefix."""
     found = []
     for name in names():
         if name.startswith(start) and "*" not in name:

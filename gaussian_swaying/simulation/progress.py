@@ -32,7 +32,7 @@ class RunProgress:
         self._began = self._looked = time.perf_counter()
 
     def begin(self, frame: int) -> None:
-        """A frame begins."""
+        """Note that a frame begins."""
         self._frame, self._steps = frame, 0
 
     def substep(self, done: int, steps: int) -> None:
@@ -70,7 +70,7 @@ class RunProgress:
         tqdm.write(f"note: {text}", file=sys.stderr)
 
     def end(self, substeps: int, moved: float) -> None:
-        """A frame is done.
+        """Note that a frame is done.
 
         Args:
             substeps: Substeps that it took.
@@ -82,7 +82,7 @@ class RunProgress:
         self._bar.set_postfix_str(f"{substeps:,} substeps, {moved:.3f} m from rest on average")
 
     def close(self) -> None:
-        """The run is over."""
+        """Close the bar at the end of the run."""
         self._bar.close()
 
 

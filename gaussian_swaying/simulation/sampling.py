@@ -22,7 +22,7 @@ from gaussian_swaying.simulation.material import Material
 
 _FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
 SHARED = 4
-"""Directions of a group up to which its points share them."""
+"""Largest number of directions in a group whose patches are shared among all its points."""
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness")
@@ -30,7 +30,7 @@ _PROPERTIES = ("E", "nu", "density", "thickness")
 
 @dataclass(frozen=True)
 class Samples:
-    """Places of an object with their share of its material; those on the surface come first.
+    """Samples of an object, each with a share of its material; those on the surface come first.
 
     Attributes:
         position: Rest positions [m], shape (N, 3), float64.
@@ -111,7 +111,7 @@ def sample_object(
         dx: Grid spacing [m], for ``material.volume = "cell"``.
 
     Raises:
-        ValueError: If a region of the material holds nothing.
+        ValueError: If a region of the material contains nothing.
     """
     surface = torch.ones(len(position), dtype=torch.bool)
     if filling is not None:
@@ -252,7 +252,7 @@ def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor
 
 
 def _parted(group: Tensor, parts: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """The groups (N,) and whether each is divided (M,), where the samples of some groups (M,) stay alone."""
+    """Split some groups (M,) into single samples; return the groups (N,), and which of them are divided (M',)."""
     new = torch.where(which[group], len(parts) + torch.arange(len(group)), group)
     kept, group = torch.unique(new, return_inverse=True)
     return group, torch.cat([parts, torch.zeros(len(new), dtype=torch.bool)])[kept]

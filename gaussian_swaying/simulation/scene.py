@@ -1,4 +1,4 @@
-"""The scene of a run: which Gaussians move, what they are made of, and how they follow the material."""
+"""The scene of a run: the Gaussians that move, their material, and how they follow it."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Scene:
         normals: Normals of the patches: ``smallest_axis`` of each Gaussian, as in the paper, or ``neighbours``, of
             planes through neighbouring centres (see
             :func:`~gaussian_swaying.geometry.surface_normals.neighbour_normals`), which are better on large smooth
-            surfaces whose Gaussians lie well but are turned badly.
+            surfaces whose Gaussians have good positions but bad orientations.
     """
 
     def __init__(
@@ -212,8 +212,8 @@ class SimulatedScene(nn.Module):
         all_move: Whether ``moving`` is all Gaussians, in their order.
         rest_facing: Normals at rest of the Gaussians that move, in the z-up frame, shape (M, 3).
         further: Number of extra points on large Gaussians.
-        tracked: Number of places that :meth:`surface` returns.
-        surface_places: The places that touch obstacles and each other, or None.
+        tracked: Number of points that :meth:`surface` returns.
+        surface_places: Contact samples, which touch obstacles and each other, or None.
         source: The .ply file; None for a scene made in code.
     """
 
@@ -352,10 +352,10 @@ class SimulatedScene(nn.Module):
         return self
 
     def take_contact(self, contact: Contact | None, obstacles: Sequence[Obstacle]) -> None:
-        """Find the places that touch, and give obstacles of Gaussians those that stand still.
+        """Make the contact samples, and give obstacles of Gaussians those that stand still.
 
         Args:
-            contact: How the surface touches itself; None if it does not.
+            contact: Contact of the surface with itself; None for none.
             obstacles: Obstacles of the solver.
         """
         samples, self._samples = self._samples, None
@@ -428,7 +428,7 @@ class SimulatedScene(nn.Module):
         return replace(rest, **parts)
 
     def surface(self, state: MPMState) -> tuple[Tensor, Tensor]:
-        """Position [m], shape (S, 3), and F, shape (S, 3, 3), of the places that a trajectory records.
+        """Position [m], shape (S, 3), and F, shape (S, 3, 3), of the points that a trajectory records.
 
         These are all particles, or with ``points: grid`` the simulated Gaussians and their extra points.
         """

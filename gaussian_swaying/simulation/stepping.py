@@ -92,7 +92,7 @@ class Stepping(nn.Module):
 
     @property
     def turn(self) -> Turn:
-        """Held by the thread that steps or draws."""
+        """The lock of the thread that steps or draws."""
         return self.painter.turn
 
     @property

@@ -38,7 +38,7 @@ def variant(first: Simulation, values: Mapping[str, Any], recorder: Recorder, co
     """A simulation of the same scene with other numbers.
 
     Args:
-        first: A simulation whose :meth:`~Simulation.start` was called; it lends all its other parts.
+        first: A simulation whose :meth:`~Simulation.start` was called; all its other parts are shared.
         values: Values of parameters that may differ within a batch, see
             :mod:`gaussian_swaying.simulation.parameters`.
         recorder: What a run of it writes.

@@ -19,16 +19,16 @@ from gaussian_swaying.simulation.followers import on_material
 from gaussian_swaying.simulation.sampling import Samples
 
 PER_CELL = 2
-"""Places along the side of a cell: the nodes carry no finer shape."""
+"""Contact samples along the side of a cell: the nodes cannot represent a finer shape."""
 
 DISC = 0.75
-"""Least radius of a disc, in distances of the places: discs on a square lattice overlap from 0.71 on."""
+"""Least radius of a disc, in spacings of the contact samples: discs on a square lattice overlap from 0.71 on."""
 
 BAND = 4
 """Distance up to which the distance from Gaussians is computed [cells]; beyond it is constant."""
 
 FACING = 0.8
-"""Two places are of different layers if at least this share of their distance is along a normal."""
+"""Two contact samples belong to different layers if at least this share of their distance is along a normal."""
 
 
 @torch.no_grad()
@@ -40,7 +40,7 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
         owner: A material point close to each, shape (N,).
         points: The material.
         dx: Grid spacing [m].
-        contact: How the surface touches itself; None if only obstacles count.
+        contact: Contact of the surface with itself; None if only obstacles count.
 
     Returns:
         The surface, in the precision of the points.

@@ -25,9 +25,9 @@ STEPS = 12
 def streaks(simulation: Stepping, state: MPMState, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pieces of the lines along which the air flows at one moment, near a plane through the object.
 
-    The plane holds the direction of the flow, and is upright or level, whichever the camera sees better. They start at
-    the points of a lattice that drifts with the mean flow, so that they move from frame to frame as the air does, and
-    are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
+    The plane contains the direction of the flow, and is upright or level, whichever the camera sees better. They start
+    at the points of a lattice that drifts with the mean flow, so that they move from frame to frame as the air does,
+    and are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
 
     Args:
         simulation: The simulation.

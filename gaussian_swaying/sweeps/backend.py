@@ -45,7 +45,7 @@ class Backend(Protocol):
         """Begin a job."""
 
     def wait(self, seconds: float) -> list[tuple[Job, Outcome]]:
-        """The jobs that have ended; waits for one, at most so long [s]."""
+        """Return the jobs that have ended; wait for one, at most so many seconds."""
 
     def pack(self, share: float) -> None:
         """Learn the share of a GPU's memory that a job needs."""
@@ -54,7 +54,7 @@ class Backend(Protocol):
         """Let all jobs end in order, at a frame."""
 
     def close(self) -> None:
-        """There is nothing more to do."""
+        """Release all resources; no more jobs follow."""
 
 
 def drive(
@@ -71,7 +71,7 @@ def drive(
 
     Args:
         jobs: The jobs.
-        backend: What does them.
+        backend: Does them.
         ended: Called with the name and the result of each run, in the order in which they end.
         retries: How often a failed job is tried again; three times as often if its process was killed.
         tick: Called about once a second with the number of runs that are being done.

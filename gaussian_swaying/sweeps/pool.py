@@ -22,7 +22,7 @@ PATIENCE_S = 300.0  # how long a worker may take to write what it has when the s
 
 @dataclass
 class _Worker:
-    """A process, the way to it, and what it does."""
+    """A process, the connection to it, and its job."""
 
     process: SpawnProcess
     connection: Connection
@@ -80,7 +80,7 @@ class Pool:
         return found
 
     def pack(self, share: float) -> None:
-        """See ``Backend.pack``: as many processes to a GPU as its memory holds, by the largest job so far."""
+        """See ``Backend.pack``: as many processes to a GPU as fit into its memory, by the largest job so far."""
         if self.most is not None and self.gpus and share > self._share:
             self._share = share
             self.workers = min(self.most, len(self.gpus) * max(1, int(PACKED / share)))

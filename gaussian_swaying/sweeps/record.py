@@ -1,7 +1,7 @@
-"""The folder of a sweep: what it is, the result of every run, and the table of all.
+"""The folder of a sweep: its description, the result of every run, and the table of all.
 
-``sweep.json`` says what is swept. ``results/00000.json`` is written when a run has ended and all its files are on disk;
-with it the run counts as done. ``sweep.csv`` is made from the results, so it is the same however they came about.
+``sweep.json`` describes the sweep. ``results/00000.json`` is written when a run has ended and all its files are on
+disk; with it the run counts as done. ``sweep.csv`` is made from the results, so it is the same however they came about.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def open_folder(
 
     Raises:
         FolderLocked: If another sweep writes there.
-        ValueError: If the folder cannot be written, holds something else, or a sweep with other settings.
+        ValueError: If the folder cannot be written, contains something else, or a sweep with other settings.
     """
     foreign = [name for name in OURS if os.path.lexists(folder / name)]  # before `held`, as another part may begin
     held = (folder / SWEEP).exists()

@@ -1,4 +1,4 @@
-"""A whole sweep: what is missing is done by a backend, and the table and the contact sheet show all."""
+"""A whole sweep: a backend does the missing runs, and the table and the contact sheet show all."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def run_sweep(
         progress: Show a bar of runs, and a line for each failure.
         started: Called when the folder is locked and the first run is about to begin.
         together: Largest number of runs of equal shape that are simulated together, as one job.
-        per_gpu: Jobs per GPU; None for as many as its memory holds, by what the first ones took.
+        per_gpu: Jobs per GPU; None for as many as fit into its memory, by what the first ones took.
         ray: Address of a Ray cluster, or ``local`` to start Ray here; None for processes of this machine.
         part: Number of the part to do, from 1, and how many parts there are; None for all. The others may be done at
             the same time in the same folder. The part that ends last writes the table and the contact sheet.
@@ -101,7 +101,7 @@ def run_sweep(
 
     Raises:
         FolderLocked: If another sweep writes to the folder, or to this part of it.
-        ValueError: If the folder holds something else, or a sweep with other settings.
+        ValueError: If the folder contains something else, or a sweep with other settings.
         OSError: If a table could not be written, after all runs.
     """
     folder = Path(output).absolute()
@@ -223,7 +223,7 @@ class _Keeper:
         self.write()
 
     def ended(self, name: str, result: dict[str, Any]) -> None:
-        """A run is complete, or has failed for good."""
+        """Record that a run is complete, or has failed for good."""
         self.results[name] = result
         if result["status"] != "complete":  # a complete run has written its own
             self.unwritten[name] = result
@@ -238,7 +238,7 @@ class _Keeper:
                     tqdm.write(f"warning: the table could not be written ({error.strerror or error}).", file=sys.stderr)
 
     def tick(self, running: int) -> None:
-        """Show what is going on."""
+        """Show the progress."""
         counts = Counter(result["status"] for result in self.results.values())
         shown = [f"{running} running", *(f"{counts[name]} {name}" for name in ("failed", "diverged") if counts[name])]
         self._bar.set_postfix_str(", ".join(shown), refresh=self._terminal)
@@ -253,7 +253,7 @@ class _Keeper:
             write_tables(self.folder, self.plan.names, self.plan.runs, self.results)
 
     def close(self) -> None:
-        """The sweep is over, or was stopped."""
+        """Write the last results when the sweep is over or was stopped."""
         self._bar.close()
         for name in self.names:  # runs that were completed while the sweep was being stopped
             result = read_result(self.folder, name)

@@ -81,4 +81,4 @@ class CsvLog(Logger):
         )
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
-        """Nothing: the configuration is in ``config.yaml``."""
+        """Do nothing: the configuration is in ``config.yaml``."""

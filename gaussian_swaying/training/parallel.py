@@ -67,7 +67,7 @@ def this_device() -> tuple[int, int]:
 
 
 def check_alike(parameters: Sequence[Tensor]) -> None:
-    """Raise RuntimeError if the devices do not hold the same parameters any more."""
+    """Raise RuntimeError if the devices do not have the same parameters any more."""
     if not several_devices():
         return
     flat = [parameter.detach().double().flatten() for parameter in parameters]

@@ -1,4 +1,4 @@
-"""Changes of a configuration while its simulation runs: what can be changed in motion, and what needs a new one."""
+"""Changes of a configuration while its simulation runs: those possible in motion, and those that need a new one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The controls of the live page, and what they do to the session."""
+"""The controls of the live page, and their effect on the session."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ class Controls(Panel):
         self.draw_handles()
 
     def other_scene(self) -> None:
-        """Another scene is there: what belongs to the old one goes, and the controls show its values."""
+        """Adapt to another scene: remove what belongs to the old one, and show the new values."""
         self.holding.forget_box()
         self._dx = float(self.session.settings.solver.dx)
         self.page.force_end = self.session.simulation.force_scale()
@@ -303,7 +303,7 @@ class Controls(Panel):
         self._tip.position = tuple(tail)
 
     def _tip_moved(self) -> None:
-        """The tail of the arrow was dragged: another wind."""
+        """Change the wind after the tail of the arrow was dragged."""
         scene = self.session.simulation.scene
         along = torch.tensor(self._anchor() - np.array(self._tip.position), dtype=torch.float64)
         flow = scene.frame.direction_to_sim(along / (ARROW * scene.size)).tolist()

@@ -40,7 +40,7 @@ class Door:
         names: Names of this computer that a browser may ask for, besides those that it has.
 
     Attributes:
-        token: What a link needs; None if the server listens on this computer only.
+        token: The token that a link needs; None if the server listens on this computer only.
     """
 
     def __init__(self, host: str, names: Sequence[str] = ()) -> None:

@@ -126,7 +126,7 @@ class Files:
         return settings
 
     def _there(self, folder: Folder) -> None:
-        """Another scene is there; called in the thread of the session."""
+        """Adapt to another scene; called in the thread of the session."""
         if str(self.session.settings.scene.ply).startswith(folder.name):
             self._upload = folder  # and the one before goes
         self.page.turns.ask("loaded", self._loaded)

@@ -1,4 +1,4 @@
-"""The controls of sway and gusts: whatever modulations the wind has."""
+"""The controls of the modulations of the wind: sway and gusts."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Holding:
-    """Takes hold of the object where it is clicked, and pins what lies in a box.
+    """Grabs the object where it is clicked, and pins the material in a box.
 
     Args:
         controls: The panel; a folder of it is open.
@@ -62,7 +62,7 @@ class Holding:
             self.session.drag([float(x) for x in self._handle.position])
 
     def let_go(self) -> None:
-        """Let go of what the mouse holds."""
+        """Release the material that the mouse pulls."""
         handle, self._handle = self._handle, None
         if handle is not None:
             handle.remove()
@@ -89,7 +89,7 @@ class Holding:
         return self.session.simulation.scene.size * self.pin_size.value / 100
 
     def _hold_box(self) -> None:
-        """Add a pin that holds what is in the box at rest."""
+        """Add a pin that holds the material in the box at rest."""
         if self.session.settings.normalisation is not None:
             self.page.tell("Pins of this configuration are in normalised coordinates: write them into its file.")
             return
@@ -103,13 +103,13 @@ class Holding:
         self.session.change({"solver.boundaries": [*known, pin]})
 
     def follow(self) -> None:
-        """Put the handle of the mouse away if the session has let go."""
+        """Remove the handle of the mouse if the session has released the material."""
         if self._handle is not None and self._grabbed and not self.session.pulls:
             self.let_go()
         self._grabbed = self._handle is not None and self.session.pulls
 
     def forget_box(self) -> None:
-        """Put the box for pins away, as another scene is there."""
+        """Remove the box for pins, as there is another scene."""
         if self._pin is not None:
             self._pin.remove()
             self._pin = None

@@ -1,4 +1,4 @@
-"""Legends of what the live page colours."""
+"""Legends of the colours on the live page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def legend(name: str, unit: str, largest: float) -> str:
     """A colour scale from zero to a largest value, as HTML.
 
     Args:
-        name: What is coloured.
+        name: Name of the quantity.
         unit: Its unit.
         largest: End of the scale.
     """

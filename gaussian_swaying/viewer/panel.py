@@ -20,7 +20,7 @@ class Panel:
         self.page, self.session, self.server = page, page.session, page.server
 
     def on(self, subscribe: Callable[[Any], Any], what: Callable[..., None], tell_event: bool = False) -> None:
-        """Do something in its turn when a browser uses a control; not when the program sets its value."""
+        """Call a function in its turn when a browser uses a control; not when the program sets its value."""
         key = object()
 
         async def asked(event: Any) -> None:  # awaited, and not in one of viser's threads, so that the order stays

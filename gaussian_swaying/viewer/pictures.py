@@ -49,8 +49,8 @@ def draw(
     """The picture of a snapshot, uint8, shape (H, W, 3).
 
     Args:
-        snapshot: What there is to see.
-        camera: From where.
+        snapshot: The snapshot to draw.
+        camera: The camera.
         shown: One of :data:`SHOWN`.
         force_end: End of the colour scale of the wind force [Pa].
         streaks: Whether streaks of air are drawn over it, as in the render ``wind``.
@@ -89,7 +89,7 @@ def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequenc
     """The place of the first Gaussian that a ray meets [scene units]; None if it meets nothing that can be seen.
 
     Args:
-        snapshot: What there is to see.
+        snapshot: The snapshot to draw.
         origin: Start of the ray [scene units].
         direction: Its direction, of any length.
     """
@@ -116,7 +116,7 @@ class PictureSize:
     Args:
         seconds: Time that a picture may take [s].
         largest: Most pixels of the longer side.
-        level: Where it starts in :data:`SIZES`.
+        level: First index in :data:`SIZES`.
     """
 
     def __init__(self, seconds: float = 0.08, largest: int = 1920, level: int = 0) -> None:

@@ -21,9 +21,9 @@ class Pull(Force):
     """Pulls some particles towards a place, with a spring and a damper that stops it from swinging.
 
     Args:
-        share: How strongly each particle is held, from 0 to 1, shape (P,).
+        share: Strength with which each particle is pulled, from 0 to 1, shape (P,).
         mass: Mass of each particle [kg], shape (P,).
-        offset: From the mean of what is held to each particle [m], shape (P, 3).
+        offset: From the mean of the pulled particles to each particle [m], shape (P, 3).
         target: Where its mean should be [m], shape (3,).
         frame: Transform between the scene and metres.
     """
@@ -42,7 +42,7 @@ class Pull(Force):
 
     @classmethod
     def at(cls, scene: SimulatedScene, state: MPMState, place: Sequence[float]) -> Pull:
-        """Hold the particles around a place.
+        """Make a pull on the particles around a place.
 
         Args:
             scene: The simulated scene.

@@ -34,7 +34,7 @@ def settings_of_splat(
         path: The splat.
         device: Where it will be simulated.
         further: Options that replace what is suggested.
-        tell: Told how much is done, from 0 to 1, and what is done next.
+        tell: Called with the share that is done, from 0 to 1, and the name of the next task.
 
     Raises:
         ValueError: If the file is not a splat, or nothing in it can move.

@@ -87,8 +87,9 @@ def share_cores() -> None:
 class Session:
     """Runs a simulation in a thread; every method may be called from any thread, and none waits for a step.
 
-    A step is one frame of the configuration, or a part of it where the machine needs longer. What would diverge, and
-    values that cannot be, are told in :attr:`problem`; the session then waits for :meth:`reset`, or keeps what it had.
+    A step is one frame of the configuration, or a part of it where the machine needs longer. If the simulation
+    diverges, :attr:`problem` says so and the session waits for :meth:`reset`; if a value is not possible,
+    :attr:`problem` says so and the session keeps the old one.
 
     Args:
         parser: From :meth:`Simulation.parser`.
@@ -101,7 +102,7 @@ class Session:
         revision: Counts how often the settings became others than those asked for: by :meth:`undo`, :meth:`restore`,
             another scene, or a change that was refused.
         speed: Simulated seconds per second that are wanted; 1 is real time.
-        lock: Held while the simulation is changed; whoever draws holds it, too.
+        lock: Taken while the simulation is changed, and while it is drawn.
     """
 
     def __init__(self, parser: ArgumentParser, settings: Namespace, simulation: Simulation | None = None) -> None:
@@ -142,7 +143,7 @@ class Session:
     def change(self, values: Mapping[str, Any]) -> None:
         """Change fields of the configuration, for example ``{"wind.flow": [4, 0, 0], "material.E": 2e4}``.
 
-        What can be changed in motion is; for the rest the simulation is made anew, see :func:`.changes.take`.
+        Some fields change in motion; for others the simulation is made anew, see :func:`.changes.take`.
         """
         with self._wake:
             self._changes.update(values)
@@ -204,7 +205,7 @@ class Session:
             self._wake.notify_all()
 
     def grab(self, place: Sequence[float]) -> None:
-        """Take hold of the material around a place; :meth:`drag` pulls it, until :meth:`let_go`.
+        """Grab the material around a place; :meth:`drag` pulls it, until :meth:`let_go`.
 
         Args:
             place: Place in the scene now [scene units].
@@ -212,11 +213,11 @@ class Session:
         self._ask(lambda: self._grab(place))
 
     def drag(self, place: Sequence[float]) -> None:
-        """Pull what was grabbed towards a place [scene units]."""
+        """Pull the grabbed material towards a place [scene units]."""
         self._ask(lambda: None if self._pull is None else self._pull.aim(place))
 
     def let_go(self) -> None:
-        """Let go of what was grabbed."""
+        """Release the material that was grabbed."""
         self._ask(self._let_go)
 
     @property
@@ -280,7 +281,7 @@ class Session:
         return not self.paused and not self._broken
 
     def _safely(self, what: Callable[[], None]) -> None:
-        """Do what was asked; if it is not possible, keep what there was and say why."""
+        """Call a function; if it fails because a request is not possible, keep the old settings and say why."""
         try:
             with self.lock:
                 what()

@@ -8,15 +8,15 @@ from collections.abc import Callable, Hashable
 
 
 class Turns:
-    """Does what is asked in order, and something else regularly.
+    """Calls requested functions in order, and another function regularly.
 
-    What is asked again before its turn replaces what was asked: of a fast drag, the last place counts, and however
-    many browsers ask, no more waits than there are controls.
+    A request replaces an earlier one with the same key that still waits: of a fast drag, the last place counts, and no
+    more requests wait than there are controls, however many browsers send them.
 
     Args:
-        regularly: Done every ``seconds``, and after what was asked.
+        regularly: Called every ``seconds``, after the requests that wait then.
         seconds: See there [s].
-        failed: Told what went wrong.
+        failed: Called with the error of a request.
     """
 
     def __init__(self, regularly: Callable[[], None], seconds: float, failed: Callable[[Exception], None]) -> None:
@@ -27,11 +27,11 @@ class Turns:
         self._thread.start()
 
     def ask(self, key: Hashable, what: Callable[[], None]) -> None:
-        """Do something soon.
+        """Queue a request.
 
         Args:
-            key: What of the same key has not had its turn yet is not done.
-            what: What to do.
+            key: A request with the same key that still waits is dropped.
+            what: The function to call.
         """
         with self._wake:
             self._asked[key] = what

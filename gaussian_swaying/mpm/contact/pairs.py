@@ -1,4 +1,4 @@
-"""Pairs of places that are close now but were not at rest, from a sorted grid."""
+"""Pairs of contact samples that are close now but were not at rest, from a sorted grid."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _AHEAD = ((0, 1), (1, -1), (1, 0), (1, 1))
 
 @torch.no_grad()
 def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tuple[Tensor, Tensor]:
-    """All pairs of places closer than ``reach`` that were at least ``apart`` from each other at rest.
+    """All pairs of samples closer than ``reach`` that were at least ``apart`` from each other at rest.
 
-    Places are sorted by the cells of a grid as wide as ``reach``. Each looks at the places after it in its own column
+    Samples are sorted by the cells of a grid as wide as ``reach``. Each looks at the samples after it in its own column
     of cells, and at four columns beside it, so that every pair is found once. The cost grows with the pairs.
 
     Args:
-        place: Places now [m], shape (C, 3).
+        place: Positions of the samples now [m], shape (C, 3).
         reach: Distance [m].
-        rest: The same places at rest [m], shape (C, 3).
+        rest: Positions of the same samples at rest [m], shape (C, 3).
         apart: Least distance at rest [m].
 
     Returns:
-        Indices of the two places of each pair, the smaller first, in rising order, shape (M,) each.
+        Indices of the two samples of each pair, the smaller first, in rising order, shape (M,) each.
 
     Raises:
         ValueError: If there are too many pairs.
@@ -42,7 +42,7 @@ def close_pairs(place: Tensor, reach: float, rest: Tensor, apart: float) -> tupl
     extent = float((place.amax(0) - low).amax())
     if not extent < float("inf"):
         raise FloatingPointError("The position of a place of the surface is NaN or infinite.")
-    size = max(reach, extent / 2.0**19)  # so that float32 rounds a place by a small part of a cell, and keys fit
+    size = max(reach, extent / 2.0**19)  # so that float32 rounds a position by a small part of a cell, and keys fit
     cell = ((place - low) / size).long() + 1
     _, ny, nz = (cell.amax(0) + 2).tolist()
     key, order = ((cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2]).sort(stable=True)

@@ -1,9 +1,9 @@
-r"""Impulses that keep places of a surface apart, as functions of tensors.
+r"""Impulses that keep contact samples of a surface apart, as functions of tensors.
 
-A place is a row :math:`w` of constant weights on the nodes, of mass :math:`m_i`: it is at :math:`X + \sum_i w_i u_i`
-and moves with :math:`\sum_i w_i v_i`. An impulse :math:`j` at it changes the nodes by :math:`w_i j / m_i`. A constraint
-:math:`k` has a normal :math:`n`, a gap :math:`d` and two places, or one place and an obstacle. Its relative velocity
-along the normal after the substep must satisfy
+A contact sample (``place`` in the code) is a row :math:`w` of constant weights on the nodes, of mass :math:`m_i`: it is
+at :math:`X + \sum_i w_i u_i` and moves with :math:`\sum_i w_i v_i`. An impulse :math:`j` at it changes the nodes by
+:math:`w_i j / m_i`. A constraint :math:`k` has a normal :math:`n`, a gap :math:`d` and two samples, or one sample and
+an obstacle. Its relative velocity along the normal after the substep must satisfy
 
 .. math:: v_n \ge -d / \Delta t \quad (d > 0), \qquad v_n \ge \min(0.01\,|d| / \Delta t,\; 0.004\,\Delta x / \Delta t)
           \quad (d \le 0),
@@ -14,10 +14,10 @@ per cent of the wave speed (the substep is 0.4 of the time in which a wave cross
 
 The impulses are found by Jacobi's iteration, all at once, with Nesterov's momentum (Mazhar et al. 2015, "Using
 Nesterov's method to accelerate multibody dynamics with friction and contact"), so that a pile of n layers takes of
-order n iterations. The step of a constraint is one over the sum of the absolute
-values of its row in :math:`A = J M^{-1} J^T`, so the iteration cannot overshoot (Gershgorin): for a lone place it is
-the mass that the place really has, and for a whole area in contact the mass of the area. With :math:`c` constraints at
-each place the sum is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, without forming A.
+order n iterations. The step of a constraint is one over the sum of the absolute values of its row in
+:math:`A = J M^{-1} J^T`, so the iteration cannot overshoot (Gershgorin): for a lone sample it is the mass that the
+sample really has, and for a whole area in contact the mass of the area. With :math:`c` constraints at each sample the sum
+is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, without forming A.
 
 Friction that sticks yields a little: with step :math:`\alpha` and friction :math:`j_t` it leaves the slip
 :math:`v_t = -c\,j_t / \alpha`, c = ``CREEP`` (Todorov 2014, "Convex and analytically-invertible dynamics with contacts
@@ -27,8 +27,8 @@ negative, friction has pushed the material instead of holding it, in every subst
 :math:`(c + \lambda\,r_k(\lambda + c)) / (c + \lambda)`. From c = 0.01 on it is nowhere negative, after any number of
 iterations.
 
-The two places of a pair get opposite impulses, so momentum is conserved to round-off; angular momentum up to the torque
-of an impulse times the shift of the two places along the surface.
+The two samples of a pair get opposite impulses, so momentum is conserved to round-off; angular momentum up to the
+torque of an impulse times the shift of the two samples along the surface.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def weighted(field: Tensor, node: Tensor, weight: Tensor, start: Tensor | None =
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Places as rows on some nodes; the last one has no weight: it stands for obstacles.
+    """Contact samples as rows of weights on some nodes; the last one has no weight: it stands for obstacles.
 
     Attributes:
         node: Nodes of each, shape (A + 1, 27).
@@ -82,7 +82,7 @@ class Rows:
 
     @classmethod
     def of(cls, node: Tensor, weight: Tensor, inverse_mass: Tensor) -> Rows:
-        """Rows from the nodes and weights (A, 27) of the places, and the inverse mass (G,) of the nodes."""
+        """Rows from the nodes and weights (A, 27) of the samples, and the inverse mass (G,) of the nodes."""
         node = torch.cat([node, node.new_zeros(1, 27)])
         weight = torch.cat([weight, weight.new_zeros(1, 27)])
         order = node.reshape(-1).argsort(stable=True)
@@ -91,18 +91,18 @@ class Rows:
         return cls(node, weight, inverse_mass, place, weight.reshape(-1)[order], sizes.cumsum(0) - sizes)
 
     def read(self, field: Tensor) -> Tensor:
-        """A field of the nodes (G, n) at the places, shape (A + 1, n)."""
+        """A field of the nodes (G, n) at the samples, shape (A + 1, n)."""
         return weighted(field, self.node, self.weight)
 
     def push(self, velocity: Tensor, impulse: Tensor) -> Tensor:
-        """The velocity of the nodes (G, 3) after impulses at the places (A + 1, 3)."""
+        """The velocity of the nodes (G, 3) after impulses at the samples (A + 1, 3)."""
         return velocity + self.inverse_mass[:, None] * weighted(impulse, self.place, self.share, self.start)
 
     def mobility(self, count: Tensor) -> Tensor:
-        """Bound of how much unit impulses at the constraints of all places move each place [1/kg], shape (A + 1,).
+        """Bound of how much unit impulses at the constraints of all samples move each sample [1/kg], shape (A + 1,).
 
         Args:
-            count: Constraints of each place, shape (A + 1,).
+            count: Constraints of each sample, shape (A + 1,).
         """
         total = self.inverse_mass[:, None] * weighted(count[:, None], self.place, self.share.abs(), self.start)
         return weighted(total, self.node, self.weight.abs())[:, 0]
@@ -110,10 +110,10 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class Constraints:
-    """Pairs of places that must not come closer, M in all.
+    """Pairs of samples that must not come closer, M in all.
 
     Attributes:
-        first: The place that is pushed along the normal, shape (M,).
+        first: The sample that is pushed along the normal, shape (M,).
         second: The one that is pushed against it; the last row for an obstacle, shape (M,).
         normal: Unit normals, shape (M, 3).
         gap: Distance along the normal less the thickness [m], shape (M,).
@@ -140,7 +140,7 @@ def acting(moving: Tensor, held: Constraints, dt: float | Tensor, dx: float) -> 
     """Return a mask of the constraints whose gap comes close to zero in this substep, bool, shape (M,).
 
     Args:
-        moving: Velocity of the places, and of the one that stands for obstacles [m/s], shape (A + 1, 3).
+        moving: Velocity of the samples, and of the one that stands for obstacles [m/s], shape (A + 1, 3).
         held: The constraints.
         dt: Substep [s].
         dx: Grid spacing [m].
@@ -175,7 +175,7 @@ def resolve(
             make all iterations.
 
     Returns:
-        The velocity, shape (G, 3), and the impulse on the first place of each constraint [N s], shape (M, 3).
+        The velocity, shape (G, 3), and the impulse on the first sample of each constraint [N s], shape (M, 3).
     """
     dt_ = torch.as_tensor(dt, device=velocity.device).to(velocity)
     valid = held.valid.to(velocity)
@@ -214,7 +214,7 @@ def resolve(
 
 
 def _push(velocity: Tensor, rows: Rows, held: Constraints, impulse: Tensor) -> Tensor:
-    """The velocity after impulses (M, 3) on the first places, and the opposite on the second."""
+    """The velocity after impulses (M, 3) on the first samples, and the opposite on the second."""
     total = velocity.new_zeros(len(rows.node), 3).index_add(0, held.first, impulse)
     return rows.push(velocity, total.index_add(0, held.second, -impulse))
 
@@ -229,7 +229,7 @@ def pair_gaps(
     the second to the first, and for an edge that meets a face it is the normal of the face.
 
     Args:
-        arm: From the second place to the first [m], shape (M, 3).
+        arm: From the second sample to the first [m], shape (M, 3).
         normals: Unit normals of the first and the second, of either sign, shape (M, 3) each.
         radii: Radii of their discs [m], shape (M,) each.
         thickness: Distance that they keep [m], shape (M,).

@@ -31,7 +31,7 @@ AHEAD = 3.0
 """Substeps by which the motion of points is extrapolated, to make the lists again before they are incomplete."""
 
 APART = 2.0
-"""Places closer than this at rest [cells] are neighbours: they share nodes, and a fold cannot be sharper."""
+"""Samples closer than this at rest [cells] are neighbours: they share nodes, and a fold cannot be sharper."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +39,12 @@ class Lists:
     """Candidates for contact: all pairs that may touch before the nodes have moved half the margin.
 
     Attributes:
-        place: The places that occur, shape (A,).
+        place: The samples that occur, shape (A,).
         touched: The nodes around them, shape (T,).
-        rows: Those places on those nodes.
+        rows: Those samples on those nodes.
         slope: Derivatives of their weights along the axes [1/m], shape (3, A, 27), or none without pairs.
-        walls: For each obstacle, the rows of the places near it, shape (N,).
-        first: Rows of the first place of each pair, shape (M,).
+        walls: For each obstacle, the rows of the samples near it, shape (N,).
+        first: Rows of the first sample of each pair, shape (M,).
         second: Rows of the second.
         before: Positions of the material points when the lists were made [m], shape (P, 3).
         time: That time [s].
@@ -84,7 +84,7 @@ class ContactStage:
     The lists of what may touch are only a cache: the result of a substep depends on its state, not on earlier substeps.
 
     Args:
-        surface: The places that touch.
+        surface: The contact samples.
         boundaries: The boundaries of the body; those that are obstacles act here.
         kinds: What each acts on (``Boundary.hold_kind``).
         grid: The nodes.
@@ -92,7 +92,7 @@ class ContactStage:
         deterministic: Whether sums on a GPU have a fixed order.
 
     Raises:
-        ValueError: If a place has no material.
+        ValueError: If a sample has no material.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class ContactStage:
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)
-        self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # place in its cell
+        self.first, self.fraction = stencil.first, 1.5 + stencil.factors[1, :, 0] * grid.dx  # position in its cell
         self.slope = basis[:, 1:4]
         self.weight = basis[:, 0] + (arm[:, :, None] * self.slope).sum(1)
         self.scene = torch.arange(len(self.weight), device=read.device) // max(each, 1)
@@ -243,8 +243,8 @@ class ContactStage:
 
         Args:
             lists: What may touch.
-            displacement: Of the nodes around the listed places [m], shape (T, 3).
-            moving: Velocity of the listed places [m/s], shape (A + 1, 3).
+            displacement: Of the nodes around the listed samples [m], shape (T, 3).
+            moving: Velocity of the listed samples [m/s], shape (A + 1, 3).
             time: Time now [s].
             dt: Substep [s].
         """
@@ -296,7 +296,7 @@ class ContactStage:
         return self.surface.place + weighted(displacement.reshape(-1, 3), self.node, self.weight)
 
     def normals(self, place: Tensor, displacement: Tensor) -> Tensor:
-        """Unit normals of some places (A,) now, shape (A, 3), from the node displacement (G, 3)."""
+        """Unit normals of some samples (A,) now, shape (A, 3), from the node displacement (G, 3)."""
         return self._normals(self.node[place], self.slope[place].transpose(0, 1), place, displacement)
 
     def _normals(self, node: Tensor, slope: Tensor, place: Tensor, displacement: Tensor) -> Tensor:

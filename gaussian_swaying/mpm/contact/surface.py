@@ -1,4 +1,4 @@
-"""Contact samples on the surface of a body, and the settings of its contact."""
+"""Contact samples (``place`` in the code) on the surface of a body, and the settings of its contact."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Places of the surface that touch obstacles and each other: discs around them cover it.
+    """Contact samples of the surface, which touch obstacles and each other: discs around them cover it.
 
     Attributes:
         place: Rest positions [m], shape (C, 3).
         normal: Unit normals at rest, of either sign, shape (C, 3).
         radius: Radii of the discs [m], shape (C,).
         thickness: Distance that two surfaces keep [m], shape (C,).
-        read: Where in the material each is read [m], shape (C, 3): the place itself, or one close to it if some of its
+        read: Where in the material each is read [m], shape (C, 3): the sample itself, or one close to it if some of its
             nodes have no mass.
-        contact: How the surface touches itself; None if only obstacles count.
+        contact: Contact of the surface with itself; None if only obstacles count.
     """
 
     place: Tensor
@@ -86,7 +86,7 @@ class Surface:
             normal: Normals of the sheet at its points, shape (P, 3); needed for contact with itself.
             spacing: Distance of neighbouring points [m]; discs reach 0.75 of it.
             thickness: Distance that two surfaces keep [m], unless ``contact`` has one.
-            contact: How the surface touches itself.
+            contact: Contact of the surface with itself.
 
         Raises:
             ValueError: If there is a contact but no normal or no spacing.

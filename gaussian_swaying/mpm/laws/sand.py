@@ -16,7 +16,7 @@ def cone_slope(friction_angle: float) -> float:
     r"""Slope :math:`\alpha = \sqrt{2/3} \, 2 \sin \phi / (3 - \sin \phi)` of the Drucker-Prager cone.
 
     It meets the Mohr-Coulomb pyramid of the friction angle in triaxial compression (Klar et al. 2016); in simple shear
-    the material holds a steeper angle, 34.7 degrees for 30.
+    the material sustains a steeper angle, 34.7 degrees for 30.
 
     Args:
         friction_angle: Angle phi [degrees].

@@ -1,8 +1,8 @@
 """Kernels of contact; the reference is :mod:`~gaussian_swaying.mpm.contact.solve`.
 
 One launch does a whole substep: its programs run all at once and wait for each other between the parts, so that the
-number of iterations is not fixed when it is recorded. Each place has its own constraints, so a pair is kept at both of
-its places; the sums at places and nodes have the same order in every run.
+number of iterations is not fixed when it is recorded. Each contact sample has its own constraints, so a pair is kept at
+both of its samples; the sums at samples and nodes have the same order in every run.
 """
 
 import triton
@@ -37,7 +37,7 @@ def _place(
     fields, base, fraction, arm, rest, facing, radius, thickness, places, row, p, mask, sx, sy, inverse_dx,
     ARMS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Position, thickness, normal and radius of places now."""
+    """Position, thickness, normal and radius of samples now."""
     x, a, b, c = place_now(fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, ARMS, BLOCK)
     f = load3(facing, places, p, mask)
     a0 = 1 + a[0]
@@ -97,7 +97,7 @@ def _constrain_pairs(
 ):  # fmt: skip
     """Write the constraints of pairs of samples that come close in this substep, as ``pair_gaps`` and ``acting``.
 
-    Returns how many there are for each place, and how many slots it needed.
+    Returns how many there are for each sample, and how many slots it needed.
     """
     length = tl.load(near + p, mask, 0)
     wide = tl.arange(0, WIDE)[None, :]
@@ -122,7 +122,7 @@ def _constrain_pairs(
     for s in range(0, tl.max(tl.minimum(close, slots))):
         real = (s < close) & mask
         q = tl.load(other + s * places + p, real, 0)
-        # in the order of their numbers, so that both places of a pair find the same, to the last bit
+        # in the order of their numbers, so that both samples of a pair find the same, to the last bit
         low = row + tl.minimum(p, q) * 8
         high = row + tl.maximum(p, q) * 8
         d0 = tl.load(low, real, 0.0) - tl.load(high, real, 0.0)
@@ -187,7 +187,7 @@ def _mark_nodes(base, marked, p, mask, sx, sy):
 
 @triton.jit
 def _mobility(base, fraction, arm, total, moving, places, p, mask, sx, sy, inverse_dx, ARMS: tl.constexpr):
-    """Bound of how much unit impulses at all constraints move each place, as ``Rows.mobility``."""
+    """Bound of how much unit impulses at all constraints move each sample, as ``Rows.mobility``."""
     f = load3(fraction, places, p, mask)
     node = tl.load(base + p, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
@@ -213,7 +213,7 @@ def _impulses(
     friction, later, final,
     WALLS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One iteration of ``resolve``: the impulses of the constraints of each place, and their change summed there.
+    """One iteration of ``resolve``: the impulses of the constraints of each sample, and their change summed there.
 
     It also sums the change that applies if the iterations end here: from the point extrapolated by the momentum back to
     the last iterate.
@@ -342,7 +342,7 @@ def _push_nodes(
     entry_start, entry_place, entry_weight, total, touched, nodes, impulse, fields, programs,
     TALL: tl.constexpr,
 ):  # fmt: skip
-    """Give the impulses of the places to the nodes."""
+    """Give the impulses of the samples to the nodes."""
     entry = tl.arange(0, 32)[None, :]
     for first in range(tl.program_id(0) * TALL, nodes, programs * TALL):
         n = first + tl.arange(0, TALL)

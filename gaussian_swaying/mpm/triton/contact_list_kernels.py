@@ -1,7 +1,7 @@
-"""Kernel that lists which places of a surface are close, without the host; it does nothing while the lists are good.
+"""Kernel that lists the contact samples that are close, without the host; it does nothing while the lists are good.
 
 The programs of a kernel here run all at once and wait for each other (:func:`meet`), so a substep needs few launches.
-Places are sorted by the cells of a grid that is stored as a hash table, and each looks at the 27 cells around it. Sums
+Samples are sorted by the cells of a grid that is stored as a hash table, and each looks at the 27 cells around it. Sums
 and lists have the same order in every run: the counts are atomic, but each cell is sorted afterwards.
 """
 
@@ -17,7 +17,7 @@ MOST_PROGRAMS = tl.constexpr(1024)
 """Most programs that meet; a row of ``peak`` has as many entries."""
 
 LISTED, NEEDED_ROOM, NEEDED_SLOTS, MADE, ROUNDS, ACTING, WITHIN = (tl.constexpr(k) for k in range(7))
-"""Entries of ``status``: candidates of all places; room that is needed for the candidates of a place, and for its
+"""Entries of ``status``: candidates of all samples; room that is needed for the candidates of a sample, and for its
 constraints; how often lists were made; iterations of all substeps; constraints of this substep; whether an obstacle is
 within reach in it."""
 
@@ -49,7 +49,7 @@ def largest_of(peak, programs):
 def interpolate(
     field, base, fraction, places, p, mask, sx, sy, inverse_dx, DERIVATIVES: tl.constexpr, BLOCK: tl.constexpr
 ):
-    """Four columns of the nodes at places, and their derivatives along the axes [1/m], of shape (BLOCK, 4) each.
+    """Four columns of the nodes at samples, and their derivatives along the axes [1/m], of shape (BLOCK, 4) each.
 
     As ``total_kernels.gather``, but a row of four columns is one load.
     """
@@ -164,7 +164,7 @@ def _sort_places(
     position, counts, start, rank, item, ordered, sorted_, places, sums, gate, inverse_size, last, chunk,
     programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Sort the places by cell, and those of a cell by their number; ``chunk`` cells to a program."""
+    """Sort the samples by cell, and those of a cell by their number; ``chunk`` cells to a program."""
     pid = tl.program_id(0)
     lane = tl.arange(0, BLOCK)
     for first in range(pid * BLOCK, places, programs * BLOCK):
@@ -217,7 +217,7 @@ def _search(
     position, rest, start, ordered, sorted_, candidates, near, places, room, status, limit, apart, inverse_size, last,
     programs, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """The places closer than ``limit`` to each that were at least ``apart`` from it at rest."""
+    """The samples closer than ``limit`` to each that were at least ``apart`` from it at rest."""
     lane = tl.arange(0, BLOCK)
     wide = tl.arange(0, WIDE)[None, :]
     for first in range(tl.program_id(0) * BLOCK, places, programs * BLOCK):
@@ -283,8 +283,8 @@ def contact_lists(
 ):  # fmt: skip
     """Make the lists again if a node may have moved too far since they were made.
 
-    Places that come close in this substep must be listed. No place moves farther than the largest motion of a node
-    times its entry of ``carries``, so lists of places closer than the reach of a contact and a margin are complete
+    Samples that come close in this substep must be listed. No sample moves farther than the largest motion of a node
+    times its entry of ``carries``, so lists of samples closer than the reach of a contact and a margin are complete
     while twice that, with the motion of this substep, is less than the margin.
     """
     dt = tl.load(schedule + (tl.load(first_step) + step_offset + 1) * 4 + 1)

@@ -32,7 +32,7 @@ AHEAD = 8.0
 """Substeps of the fastest node for which lists stay complete, unless that is more than the reach of contact."""
 
 BLOCK, TALL = 128, 32
-"""Places, and nodes, of a program at a time."""
+"""Samples, and nodes, of a program at a time."""
 
 WIDE, WIDE_SEARCH = 8, 4
 """Candidates of a contact sample that are tested together, in a substep and when lists are made (8 there would spill).
@@ -42,7 +42,7 @@ PER_PROCESSOR = 4
 """Programs on each multiprocessor; all of them must run at once."""
 
 LIGHT = 0.01
-"""A node of a smaller weight hardly moves any place, however far it moves itself: see :func:`_carries`."""
+"""A node of a smaller weight hardly moves any sample, however far it moves itself: see :func:`_carries`."""
 
 _LAUNCH: dict[str, Any] = {"num_warps": 4, "maxnreg": 128}
 
@@ -77,7 +77,7 @@ class FusedContact:
         arm = surface.place - surface.read
         self.arms = bool((arm != 0).any())
         self.arm = arm.T.contiguous()
-        # all weights of a node are together, in the order of the places
+        # all weights of a node are together, in the order of the samples
         real = stage.inverse_mass[stage.node] > 0
         node, order = stage.node[real].sort(stable=True)
         self.touched, sizes = (part.int() for part in torch.unique_consecutive(node, return_counts=True))
@@ -254,12 +254,12 @@ def _carries(node: Tensor, weight: Tensor, nodes: int) -> Tensor:
     r"""Return a factor for each node; no contact sample moves farther than the largest factor times the node's motion.
 
     A node whose support barely reaches the material has almost no mass, and stress may move it by metres, which moves
-    no sample. With :math:`s_i` the largest weight of a node at any place, and :math:`r_i = \min(1, s_i /` LIGHT
-    :math:`)`, a place moves by at most :math:`\sum_i |w_i| |u_i| \le \max_i (C r_i |u_i|)`, where C is the largest sum
+    no sample. With :math:`s_i` the largest weight of a node at any sample, and :math:`r_i = \min(1, s_i /` LIGHT
+    :math:`)`, a sample moves by at most :math:`\sum_i |w_i| |u_i| \le \max_i (C r_i |u_i|)`, where C is the largest sum
     of :math:`|w_i| / r_i` of a place: at most 1.27 if no weight is negative.
 
     Args:
-        node: Nodes of each place, shape (C, 27).
+        node: Nodes of each sample, shape (C, 27).
         weight: Their weights, shape (C, 27).
         nodes: Number of all nodes.
 

@@ -256,7 +256,7 @@ class FusedTotal(Fused):
         )  # fmt: skip
 
     def _impulse(self) -> Tensor:
-        """Reaction impulse on each boundary in this part of the rollout, as ``impulse``; summed in a fixed order."""
+        """Reaction impulse on each boundary in this part of the rollout, shape of ``impulse``; in a fixed order."""
         total = self.impulse.reshape(self.scenes, -1, 3).clone()
         if any(self.bound.on_nodes) and self.plain:
             for k, nodes in enumerate(self.own_nodes):
@@ -285,7 +285,7 @@ class FusedTotal(Fused):
         self.displacement.addcmul_(self.velocity, self.dt.float())
 
     def _read(self, found: Tensor, part: Part) -> None:
-        """Write all fields of the state into ``found``, and the reaction impulses and the work of the load."""
+        """Write all fields of the state into ``found``; also the reaction impulses and the work of the load."""
         to = self._views(found)
         kick, implicit = self.schedule[0, 3:], part.options["IMPLICIT"]
         self._read_into(to["position"], to["velocity"], to["affine"], to["F"], kick, part.loaded, implicit)

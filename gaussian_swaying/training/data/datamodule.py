@@ -28,7 +28,7 @@ from gaussian_swaying.training.parallel import this_device
 class TrainingImage:
     """One batch: an image and the camera that took it.
 
-    It holds bytes and computes colours where they are used, so that little is copied to a GPU. Fields and properties
+    It stores bytes and computes colours where they are used, so that little is copied to a GPU. Fields and properties
     are also available as items: ``batch["image"]``.
 
     Attributes:
