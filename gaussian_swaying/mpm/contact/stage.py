@@ -116,7 +116,7 @@ class ContactStage:
         snap = torch.finfo(read.dtype).eps ** 0.5
         stencil = bspline_stencil(read, grid, False, snap)
         if not bool(stencil.inside.all()):
-            raise ValueError("A place of the surface lies outside the material: give places on the simulated points.")
+            raise ValueError("A contact sample lies outside the material: give samples on the simulated points.")
         basis = stencil.basis  # (C, 4, 27)
         arm = surface.place - surface.read
         self.node = stencil.node.reshape(-1, 27)

@@ -135,7 +135,7 @@ class FusedContact:
         self.margin.fill_(-1.0)
         if max(room, planes * slots) * places > MOST_ENTRIES:
             raise ValueError(
-                f"A place of the surface is close to {max(room, slots):,} others: the material has collapsed; lower "
+                f"A contact sample is close to {max(room, slots):,} others: the material has collapsed; lower "
                 "`contact.thickness`, or coarsen `solver.dx`."
             )
         self.room, self.slots = room, slots
